@@ -20,18 +20,18 @@ from tyro.conf import arg
 from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import PathspaceError, check_name
 from pathspace_graph.estimators import DEFAULT, make_online
-from pathspace_graph.eval.experiment.drives import NamedTrack, load_tracks
+from pathspace_graph.eval.experiment.cells import NamedTrack, load_tracks
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.io.files import atomic_folder, check_target
 from pathspace_graph.io.log import Detections, Log, Odometry, write_log
+from pathspace_graph.io.overrides import Overrides, override
 from pathspace_graph.labels import LEFT
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.plausibility.reading import read_plausible_log
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
-from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.mistakes import MISTAKES
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -45,7 +45,6 @@ MARKER: Final = "hints.csv"
 AS_SIMULATED: Final = "as simulated"
 """Kind of good logs with nothing unusual."""
 CONFIDENCE: Final = 0.95
-"""Confidence of the intervals."""
 MISSED: Final = 0.05
 """A map that misses a larger share of the cones is bad."""
 WORSE: Final = 2.0
@@ -88,32 +87,12 @@ class Good:
     """Whether the track is open: its second half is not there."""
 
     def log(self, track: NamedTrack, seed: int, laps: int) -> Log:
-        """Return a log of this kind."""
         cones = track.track
         if self.open_road:
             left, right = cones.left[: len(cones.left) // 2], cones.right[: len(cones.right) // 2]
             cones = replace(cones, left=left, right=right, closed=False)
         log = simulate(cones, replace(self.simulation, laps=laps), seed)
         return log if self.edit is None else self.edit(log)
-
-
-def _sensor(**values: float) -> Good:
-    return Good(SimulationSettings(sensor=SensorSettings(**values)))  # type: ignore[arg-type]
-
-
-def _faulty(*faults: OdometryFaults | SensorFaults | VehicleFaults) -> Good:
-    names = {OdometryFaults: "odometry", SensorFaults: "sensor", VehicleFaults: "vehicle"}
-    return Good(SimulationSettings(faults=Faults(**{names[type(fault)]: fault for fault in faults})))  # type: ignore[arg-type]
-
-
-def _noisy() -> Good:
-    sensor, odometry = SensorSettings(), OdometryNoise()
-    louder = {
-        name: NOISE * getattr(sensor, name) for name in ("range_sigma", "range_sigma_growth", "bearing_sigma")
-    }
-    vx, vy, wz = (NOISE * sigma for sigma in odometry.white)
-    drift = OdometryNoise((vx, vy, wz), scale=NOISE * odometry.scale, gyro_bias=NOISE * odometry.gyro_bias)
-    return Good(SimulationSettings(sensor=replace(sensor, **louder), odometry=drift))
 
 
 def one_boundary(log: Log) -> Log:
@@ -136,13 +115,10 @@ def stands_first(log: Log) -> Log:
     rng, odometry, first = np.random.default_rng(0), log.odometry, log.cycles[0]
     before = np.arange(0.0, STANDING, 0.02)
     twists = rng.normal(0.0, log.odometry_sigma, (len(before), 3))
-    roots, points = np.linalg.cholesky(first.covariances), first.points_vehicle
-    standing = [
-        replace(
-            first, t=t, points_vehicle=points + np.einsum("mij,mj->mi", roots, rng.normal(size=points.shape))
-        )
-        for t in np.arange(0.0, STANDING, 0.1).tolist()
-    ]
+    roots, points, standing = np.linalg.cholesky(first.covariances), first.points_vehicle, []
+    for t in np.arange(0.0, STANDING, 0.1).tolist():
+        noise = np.einsum("mij,mj->mi", roots, rng.normal(size=points.shape))
+        standing.append(replace(first, t=t, points_vehicle=points + noise))
     driving = [replace(cycle, t=cycle.t + STANDING) for cycle in log.cycles]
     stamps = np.append(before, odometry.t - odometry.t[0] + STANDING)
     whole = Odometry(stamps, np.vstack([twists, odometry.twist]))
@@ -158,41 +134,51 @@ def backs_up(log: Log) -> Log:
 
 
 def slow_odometry(log: Log) -> Log:
-    """Return the log with every fifth twist."""
     return replace(log, odometry=Odometry(log.odometry.t[::5], log.odometry.twist[::5]))
 
 
 def in_unix_time(log: Log) -> Log:
-    """Return the log with stamps since 1970."""
     odometry = replace(log.odometry, t=log.odometry.t + 1.7e9)
     cycles = tuple(replace(cycle, t=cycle.t + 1.7e9) for cycle in log.cycles)
     return replace(log, odometry=odometry, cycles=cycles, truth=None)
 
 
-GOOD: Final[dict[str, Good]] = {
-    AS_SIMULATED: Good(),
-    "field of view of 180 degrees": _sensor(fov=np.pi),
-    "field of view of 360 degrees": _sensor(fov=2.0 * np.pi),
-    "range of 5 m": _sensor(range_max=5.0),
-    "range of 8 m": _sensor(range_max=8.0),
-    "range of 20 m": _sensor(range_max=20.0),
-    "noise times 3": _noisy(),
-    "2 cycles per second": _sensor(rate=2.0),
-    "5 cycles per second": _sensor(rate=5.0),
-    "20 cycles per second": _sensor(rate=20.0),
-    "30 % of the cones missed": _sensor(detection_probability=0.7, blind_fraction=0.15),
-    "5 false positives in a cycle": _sensor(false_positives=5.0),
-    "30 % wrong colours": _sensor(wrong_colour=0.3),
-    "without colours": _faulty(SensorFaults(colourless=1.0)),
-    "yaw-rate bias of 0.02 rad/s": _faulty(OdometryFaults(yaw_rate_bias=0.02)),
-    "wheel slip of 50 %": _faulty(OdometryFaults(slip=0.5)),
-    "latency of 100 ms": _faulty(SensorFaults(latency=0.1)),
-    "sensor turned by 2 degrees": _faulty(SensorFaults(yaw=0.0349)),
-    "sensor 0.2 m to the left": _faulty(SensorFaults(lateral=0.2)),
-    "ranges 4 % too long": _faulty(SensorFaults(range_scale=0.04)),
-    "odometry missing for 2 s": _faulty(OdometryFaults(gap=2.0)),
-    "no detections for 5 s": _faulty(SensorFaults(dropout=5.0)),
-    "driven the other way round": _faulty(VehicleFaults(wrong_way=True)),
+_SENSOR, _ODOMETRY = SensorSettings(), OdometryNoise()
+_DRIVES: Final[dict[str, Overrides]] = {
+    AS_SIMULATED: {},
+    "field of view of 180 degrees": {"sensor.fov": np.pi},
+    "field of view of 360 degrees": {"sensor.fov": 2.0 * np.pi},
+    "range of 5 m": {"sensor.range_max": 5.0},
+    "range of 8 m": {"sensor.range_max": 8.0},
+    "range of 20 m": {"sensor.range_max": 20.0},
+    "noise times 3": {
+        "sensor.range_sigma": NOISE * _SENSOR.range_sigma,
+        "sensor.range_sigma_growth": NOISE * _SENSOR.range_sigma_growth,
+        "sensor.bearing_sigma": NOISE * _SENSOR.bearing_sigma,
+        "odometry.white": tuple(NOISE * sigma for sigma in _ODOMETRY.white),
+        "odometry.scale": NOISE * _ODOMETRY.scale,
+        "odometry.gyro_bias": NOISE * _ODOMETRY.gyro_bias,
+    },
+    "2 cycles per second": {"sensor.rate": 2.0},
+    "5 cycles per second": {"sensor.rate": 5.0},
+    "20 cycles per second": {"sensor.rate": 20.0},
+    "30 % of the cones missed": {"sensor.detection_probability": 0.7, "sensor.blind_fraction": 0.15},
+    "5 false positives in a cycle": {"sensor.false_positives": 5.0},
+    "30 % wrong colours": {"sensor.wrong_colour": 0.3},
+    "without colours": {"faults.sensor.colourless": 1.0},
+    "yaw-rate bias of 0.02 rad/s": {"faults.odometry.yaw_rate_bias": 0.02},
+    "wheel slip of 50 %": {"faults.odometry.slip": 0.5},
+    "latency of 100 ms": {"faults.sensor.latency": 0.1},
+    "sensor turned by 2 degrees": {"faults.sensor.yaw": 0.0349},
+    "sensor 0.2 m to the left": {"faults.sensor.lateral": 0.2},
+    "ranges 4 % too long": {"faults.sensor.range_scale": 0.04},
+    "odometry missing for 2 s": {"faults.odometry.gap": 2.0},
+    "no detections for 5 s": {"faults.sensor.dropout": 5.0},
+    "driven the other way round": {"faults.vehicle.wrong_way": True},
+}
+"""Overrides of the simulation by the kind of good log."""
+GOOD: Final = {
+    **{name: Good(override(SimulationSettings(), changes, name)) for name, changes in _DRIVES.items()},
     "one boundary": Good(edit=one_boundary),
     "three cones in a cycle": Good(edit=few_cones),
     "stands for 10 s first": Good(edit=stands_first),
@@ -201,7 +187,6 @@ GOOD: Final[dict[str, Good]] = {
     "stamps since 1970": Good(edit=in_unix_time),
     "open road": Good(open_road=True),
 }
-"""Kinds of good logs by name."""
 
 
 # --- the measurement -------------------------------------------------------------------------------------
@@ -274,16 +259,10 @@ def judged(log: Log, causes: Sequence[str] = ()) -> Row:
     """Return what is said of a log, and whether one of the causes is named."""
     begin = time.perf_counter()
     with threadpool_limits(limits=1):
-        found = hints(log)
-    seconds = time.perf_counter() - begin
-    named = [hint.cause for hint in found]
-    return {
-        "said": bool(found),
-        "told": any(cause in named for cause in causes),
-        "causes": "; ".join(named),
-        "seconds": seconds,
-        "text": " | ".join(hint.line for hint in found),
-    }
+        said = hints(log)
+    seconds, named = time.perf_counter() - begin, [hint.cause for hint in said]
+    told, text = any(cause in named for cause in causes), " | ".join(hint.line for hint in said)
+    return {"said": bool(said), "told": told, "causes": "; ".join(named), "seconds": seconds, "text": text}
 
 
 def mapped(log: Log) -> Row:
@@ -315,14 +294,12 @@ def summary(rows: pd.DataFrame) -> TextTable:
     """Return the table: for each kind of log how many were told or accused, with exact intervals."""
     lines: list[tuple[str, ...]] = []
     groups = []
-    for kind, title, column in (("spoiled", "told", "told"), ("good", "accused", "said")):
+    for kind, verb, column in (("spoiled", "told", "told"), ("good", "accused", "said")):
         of_kind = rows[rows["kind"] == kind]
         if len(of_kind):
             groups.append(len(lines))
-            lines += [
-                _line(f"{title}: {name}", of, column) for name, of in of_kind.groupby("name", sort=False)
-            ]
-            lines.append(_line(f"{title}: all", of_kind, column))
+            by_name = (*of_kind.groupby("name", sort=False), ("all", of_kind))
+            lines += [_line(f"{verb}: {name}", logs, column) for name, logs in by_name]
     title = (
         "Spoiled logs that are told by their cause, and good logs that are accused of anything, with the "
         f"{100.0 * CONFIDENCE:.0f} % interval of Clopper and Pearson."

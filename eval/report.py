@@ -8,7 +8,7 @@ under the table says so.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from hashlib import sha256
 from importlib.util import find_spec
@@ -18,15 +18,16 @@ from typing import Any, Final, Self
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError, check_name
-from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.parsing import read_json, read_text
 
 from .benchmark.measurement import measure_drive, metrics
+from .experiment.faults import kinds, of_middle_strength, only, outcomes, suite
 from .experiment.frame import RUN_OF, estimate, last_laps
 from .experiment.run import run_study
-from .experiment.study import Study
+from .experiment.study import DEFAULT, Study, find_study, read_study
 from .experiment.tables import TextTable
 from .metrics.metric import METRICS
 
@@ -38,7 +39,10 @@ PAGES: Final = {
     "readme-accuracy": "README.md",
     "readme-compared": "README.md",
     "readme-speed": "README.md",
-} | {"skidpad": "docs/closing.md"}
+    "skidpad": "docs/closing.md",
+    "camera": "docs/studies.md",
+    "faults": "docs/reliability.md",
+}
 """Page of each table, from the root of the project."""
 ROOMS: Final = (
     *("batch", "centerline", "ckf", "factors", "front_end", "graph", "landmark", "loop", "mapping", "online"),
@@ -47,6 +51,8 @@ ROOMS: Final = (
 """Rooms whose sources the figures depend on."""
 ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
 ONLINE, BATCH = ESTIMATORS[:2]
+STATED: Final = {DEFAULT: "stated"}
+"""Name of the default noise, since a simulated log states its own."""
 GENERATED: Final = (0, 1, 2)
 """Seeds of the generated tracks."""
 SPEED: Final = {
@@ -58,6 +64,18 @@ SPEED: Final = {
     "closing": "the update that closes the loop [ms]",
 }
 """Figures of the benchmark, each with its label."""
+FAULTS: Final = {
+    "rmse by clean": ("ratio_mean", 2),
+    "least": ("ratio_min", 2),
+    "most": ("ratio_max", 2),
+    "missed [%]": ("missed", 1),
+    "closed [%]": ("closed", 0),
+    "lost at the end [%]": ("lost", 0),
+    "largest error [m]": ("error_max", 1),
+    "called degraded [%]": ("told_degraded", 1),
+    "said so [%]": ("told", 0),
+}
+"""Columns of the table of faults, each with its value and digits."""
 BENCHMARK_SEEDS: Final = (0, 1, 2)
 _MARKED: Final = re.compile(r"(<!-- report: ([\w-]+) -->\n)(.*?)(<!-- end report -->)", re.DOTALL)
 
@@ -72,9 +90,10 @@ class Figure:
     digits: int = 3
 
     @classmethod
-    def of(cls, values: Array, digits: int = 3, factor: float = 1.0) -> Self:
+    def of(cls, values: ArrayLike, digits: int = 3, factor: float = 1.0) -> Self:
         """Return the mean of the known values (n,), times a factor."""
-        mean = estimate(factor * values[np.isfinite(values)])
+        array = np.asarray(values, float)
+        mean = estimate(factor * array[np.isfinite(array)])
         value, half = (round(x, 6) if isfinite(x) else None for x in (mean.mean, mean.half))
         return cls(value, half, digits)
 
@@ -122,8 +141,9 @@ class MeasuredTable:
 
 
 Tables = dict[str, MeasuredTable]
-Rows = dict[str, tuple[tuple[str, ...], tuple[tuple[str, tuple[Figure, ...]], ...]]]
-"""Header and rows of tables by name."""
+View = tuple[tuple[str, ...], tuple[tuple[str, tuple[Figure, ...]], ...]]
+"""Header and rows of a table."""
+Views = dict[str, View]
 
 
 # --- experiments -----------------------------------------------------------------------------------------
@@ -131,7 +151,7 @@ Rows = dict[str, tuple[tuple[str, ...], tuple[tuple[str, tuple[Figure, ...]], ..
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What is driven."""
+    """What is driven; each experiment keeps its runs in a folder, and returns the tables that it measures."""
 
     quick: bool = False
     """Drive little, to see that everything works."""
@@ -141,45 +161,59 @@ class Plan:
     on_cell: Callable[[int, int], None] | None = None
     """Observer of the progress of a study."""
 
-    def accuracy(self, folder: Path) -> Rows:
-        """Return all estimators on all tracks."""
-        own = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
+    def accuracy(self, folder: Path) -> Views:
+        """Drive all estimators on all tracks."""
+        tracks: tuple[Path | int, ...] = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
         estimators, seeds, laps = (ESTIMATORS[:3], (0, 1), 2) if self.quick else (ESTIMATORS, (0, 1, 2), 5)
-        frame = self._run("accuracy", folder, tracks=own, estimators=estimators, seeds=seeds, laps=laps)
+        study = Study(name="accuracy", tracks=tracks, estimators=estimators, seeds=seeds, laps=laps)
+        frame = self._run(study, folder)
         return {"readme-accuracy": accuracy_table(frame, laps), "readme-compared": compared_table(frame)}
 
-    def skidpad(self, folder: Path) -> Rows:
-        """Return what becomes of a drive without a lap."""
+    def skidpad(self, folder: Path) -> Views:
+        """Drive the skidpad, which has no lap."""
         seeds, estimators = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
         tracks = (Path("skidpad"),)
-        frame = self._run("skidpad", folder, tracks=tracks, estimators=estimators, seeds=seeds, laps=1)
-        return {"skidpad": skidpad_table(frame)}
+        study = Study(name="skidpad", tracks=tracks, estimators=estimators, seeds=seeds, laps=1)
+        return {"skidpad": skidpad_table(self._run(study, folder))}
 
-    def speed(self, _: Path) -> Rows:
-        """Return the times of the benchmark."""
+    def camera(self, folder: Path) -> Views:
+        """Drive the study `camera` with one seed, whose noise is another one on each track."""
+        small: dict[str, Any] = {"tracks": (0,), "laps": 1} if self.quick else {}
+        study = replace(read_study(find_study(Path("camera"))), seeds=(0,), **small)
+        return {"camera": camera_table(self._run(study, folder))}
+
+    def faults(self, folder: Path) -> Views:
+        """Drive the suite of faults at the middle strengths with one seed."""
+        study = replace(of_middle_strength(suite()), seeds=(0,))
+        if self.quick:
+            study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
+        return {"faults": faults_table(study, self._run(study, folder))}
+
+    def speed(self, _: Path) -> Views:
+        """Time the benchmark's drives."""
         seeds, laps = (BENCHMARK_SEEDS[:1], 1) if self.quick else (BENCHMARK_SEEDS, 5)
-        found: list[dict[str, float]] = []
-        for seed in seeds:
-            found.append({figure.key: figure.value for figure in metrics(measure_drive(seed, laps))})
-        values = {key: np.array([figures.get(key, np.nan) for figures in found]) for key in SPEED}
+        runs = [{m.key: m.value for m in metrics(measure_drive(seed, laps))} for seed in seeds]
+        values = pd.DataFrame(runs).reindex(columns=[*SPEED])
         rows = tuple(
             (label, (Figure.of(values[key], 2 if key.endswith(("isam2", "landmark")) else 1),))
             for key, label in SPEED.items()
         )
         return {"readme-speed": (("figure", "measured"), rows)}
 
-    def _run(self, name: str, folder: Path, **given: Any) -> pd.DataFrame:
-        return run_study(Study(name=name, **given), folder, jobs=self.jobs, on_cell=self.on_cell)
+    def _run(self, study: Study, folder: Path) -> pd.DataFrame:
+        return run_study(study, folder, jobs=self.jobs, on_cell=self.on_cell)
 
 
-EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Rows]]] = {
+EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "accuracy": Plan.accuracy,
     "skidpad": Plan.skidpad,
+    "camera": Plan.camera,
+    "faults": Plan.faults,
     "speed": Plan.speed,
 }
 
 
-def accuracy_table(frame: pd.DataFrame, laps: int) -> tuple[tuple[str, ...], Any]:
+def accuracy_table(frame: pd.DataFrame, laps: int) -> View:
     """Return the online map after laps 1, 2 and the last, and the batch."""
     shown = dict.fromkeys([1, 2, laps])
     online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
@@ -193,17 +227,44 @@ def accuracy_table(frame: pd.DataFrame, laps: int) -> tuple[tuple[str, ...], Any
     return header, rows
 
 
-def compared_table(frame: pd.DataFrame) -> tuple[tuple[str, ...], Any]:
+def compared_table(frame: pd.DataFrame) -> View:
     """Return every estimator at the end of its last lap."""
     keys = {"rmse": "rmse [m]", "missed": "missed [%]", "size": "size", "ate": "trajectory error [m]"}
     return ("estimator, last lap", *keys.values()), _by_estimator(frame, tuple(keys))
 
 
-def skidpad_table(frame: pd.DataFrame) -> tuple[tuple[str, ...], Any]:
+def skidpad_table(frame: pd.DataFrame) -> View:
     """Return every estimator: its trajectory error over the whole drive, and its map at the end."""
     keys = {"ate": "trajectory error [m]", "rmse": "rmse [m]", "missed": "missed [%]"}
     square = (frame["ate"] ** 2).groupby([frame[name] for name in RUN_OF]).transform("mean")
     return ("estimator", *keys.values()), _by_estimator(frame.assign(ate=square**0.5), tuple(keys))
+
+
+def camera_table(frame: pd.DataFrame) -> View:
+    """Return the map of each estimator at stated and at measured noise, and the limit of its landmarks."""
+    keys = {"rmse": "rmse [m]", "missed": "missed [%]", "nees": "NEES of the map"}
+    keys |= {"turn_nees": "NEES of the turn", "told_degraded": "degraded [%]"}
+    last = last_laps(frame)
+    rows = [
+        (f"`{estimator}`, {STATED.get(variant, variant)}", tuple(_figure(key, part) for key in keys))
+        for (estimator, variant), part in last.groupby(["estimator", "variant"], sort=False)
+    ]
+    oracle = (_figure("l", last[last["estimator"] == BATCH]), *[Figure(None)] * (len(keys) - 1))
+    return ("estimator, noise", *keys.values()), (*rows, ("landmarks, told all", oracle))
+
+
+def faults_table(study: Study, frame: pd.DataFrame) -> View:
+    """Return what each fault costs by the clean run on the same track, and whether anything was said."""
+    rows = []
+    for outcome in outcomes(study, frame):
+        values, runs = outcome.values(), max(len(outcome.runs), 1)
+        values |= {name: values[name] / runs for name in ("closed", "lost", "told")}
+        figures = tuple(
+            Figure.of([values[key]], digits, 100.0 if "%" in title else 1.0)
+            for title, (key, digits) in FAULTS.items()
+        )
+        rows.append((f"{outcome.fault.kind}: {outcome.fault.strength}".removesuffix(": "), figures))
+    return ("fault", *FAULTS), tuple(rows)
 
 
 def _by_estimator(frame: pd.DataFrame, keys: Sequence[str]) -> tuple[tuple[str, tuple[Figure, ...]], ...]:
@@ -216,7 +277,7 @@ def _by_estimator(frame: pd.DataFrame, keys: Sequence[str]) -> tuple[tuple[str, 
 
 def _figure(key: str, part: pd.DataFrame) -> Figure:
     metric, values = METRICS[key], part[key] if key in part else pd.Series(dtype=float)
-    return Figure.of(values.to_numpy(float), metric.digits, metric.factor)
+    return Figure.of(values, metric.digits, metric.factor)
 
 
 # --- files -----------------------------------------------------------------------------------------------

@@ -145,10 +145,10 @@ def library(name, *rest, **named):
 ctypes.CDLL = library
 import pathspace_graph as package
 [getattr(package, name) for name in package.__all__]
-import pathspace_graph.eval.metrics.accuracy, pathspace_graph.eval.figures.pictures
+import pathspace_graph.eval.metrics.accuracy, pathspace_graph.eval.figures.map_plot
 import pathspace_graph.eval.benchmark.scaling_output
 """
-    assert "pathspace_graph.eval.figures.pictures" in modules_after(code)
+    assert "pathspace_graph.eval.figures.map_plot" in modules_after(code)
 
 
 # --- README ----------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ EXTRAS = {"distributed", "rerun", "rosbags"}
 """Optional packages, which are imported only where they are needed."""
 
 LATE = {"commands.online": {"eval.view.recording"}, "factors.kernels": {"factors._kernels"}}
-LATE["io.brief"] = {"eval.figures.pictures", "frames"}
+LATE["io.brief"] = {"eval.figures.map_plot", "frames"}
 """Modules that are imported by name when needed: matplotlib is slow, and kernels may not be built."""
 ASKED = {"io.brief"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""

@@ -48,7 +48,6 @@ def _is_of_cycle(factor: gtsam.GaussianFactor) -> bool:
 
 
 def _damping(mapper: FixedLagMapper) -> gtsam.GaussianFactor:
-    """Return the damping of the control points in a step as a factor."""
     keys, variables = mapper.smoother.map.state.map_keys, mapper.smoother.variables
     now, sigma = variables.change(variables.layout.entries(keys)), mapper.settings.sigma_step
     return jacobian_factor(keys, np.eye(len(now)) / sigma, now / sigma)

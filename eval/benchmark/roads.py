@@ -8,8 +8,8 @@ from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.summary import lap_times
-from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.io.log import Detections, Log
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.io.log import Log
 from pathspace_graph.settings.checked import Positive
 from pathspace_graph.sim.curves import along_polyline, arc_lengths, left_normals, unit
 from pathspace_graph.sim.sensor import SensorSettings
@@ -94,7 +94,6 @@ QUICK: Final = ScalingSettings(
     budget=0.1,
 )
 """Preset that takes less than a minute and shows that everything works; its slopes mean little."""
-
 
 STEP: Final = 0.25
 """Distance of the samples of a road's middle (m)."""
@@ -183,11 +182,8 @@ def _with_rows(middle: Array, gap: float, settings: RoadSettings, closed: bool) 
 
 def drive_log(track: Track, settings: RoadSettings, seed: int, laps: int = 1, dense: bool = False) -> Log:
     """Simulate a drive along a road at full speed from the start on."""
-    vehicle = VehicleSettings(
-        speed_max=settings.speed,
-        speed_start=settings.speed,
-        acceleration_lateral=settings.acceleration_lateral,
-    )
+    speed, lateral = settings.speed, settings.acceleration_lateral
+    vehicle = VehicleSettings(speed_max=speed, speed_start=speed, acceleration_lateral=lateral)
     sensor = SensorSettings(range_max=settings.dense_range) if dense else SensorSettings()
     return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, sensor=sensor), seed)
 
@@ -208,10 +204,9 @@ def first_cycles(log: Log, count: int) -> Log:
 
 def thinned(log: Log, count: int, rng: Generator) -> Log:
     """Return the drive with `count` detections a cycle, chosen at random, or all where there are fewer."""
-    return replace(log, cycles=tuple(_chosen(cycle, count, rng) for cycle in log.cycles), truth=None)
 
+    def chosen(size: int) -> BoolArray:
+        return np.isin(np.arange(size), rng.choice(size, min(count, size), replace=False))
 
-def _chosen(cycle: Detections, count: int, rng: Generator) -> Detections:
-    size = len(cycle.labels)
-    kept = np.sort(rng.choice(size, min(count, size), replace=False))
-    return Detections(cycle.t, cycle.points_vehicle[kept], cycle.covariances[kept], cycle.labels[kept])
+    cycles = tuple(cycle.where(chosen(len(cycle.labels))) for cycle in log.cycles)
+    return replace(log, cycles=cycles, truth=None)

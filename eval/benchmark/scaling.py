@@ -156,15 +156,12 @@ class Scaling:
 
 def binned(sweep: Sweep, times: LaneTimes, at: Array, edges: Array) -> pd.DataFrame:
     """Return a point for each interval between two `edges` that holds cycles; `at` (n,): their abscissas."""
-    at = at[: len(times.seconds)]
-    seconds, sizes = np.array(times.seconds), np.array(times.sizes, dtype=float)
-    bins = np.searchsorted(edges, at, side="right") - 1
-    chosen = [bins == number for number in range(len(edges) - 1) if np.any(bins == number)]
-    means = [
-        [np.mean(at[of]), np.mean(seconds[of]), of.sum(), np.mean(sizes[of])] for of in chosen if of.any()
-    ]
-    rows = [[sweep, times.lane.estimator, *values] for values in means]
-    return pd.DataFrame(rows, columns=["sweep", "estimator", "at", "seconds", "cycles", "size"])
+    frame = pd.DataFrame({"at": at[: len(times.seconds)], "seconds": times.seconds, "size": times.sizes})
+    bins = np.searchsorted(edges, frame["at"], side="right") - 1
+    inside = (bins >= 0) & (bins < len(edges) - 1)
+    points = frame[inside].groupby(bins[inside])
+    means = points.mean().assign(sweep=sweep, estimator=times.lane.estimator, cycles=points.size())
+    return means[["sweep", "estimator", "at", "seconds", "cycles", "size"]].reset_index(drop=True)
 
 
 def fit_slope(
@@ -175,19 +172,14 @@ def fit_slope(
     The standard `error` is that of the exponent; both are NaN where there are too few `points`, which lie
     from `low` to `high`.
     """
-    kept = points[points["at"] >= fit_from]
-    at, seconds = (kept[name].to_numpy(float) for name in ("at", "seconds"))
-    line = linregress(np.log(at), np.log(seconds)) if len(at) >= LEAST_POINTS else None
-    return {
-        "sweep": sweep,
-        "estimator": estimator,
-        "slope": float("nan") if line is None else float(line.slope),
-        "error": float("nan") if line is None else float(line.stderr),
-        "points": len(at),
-        "low": float(min(at, default=np.nan)),
-        "high": float(max(at, default=np.nan)),
-        "stopped": stopped,
-    }
+    kept = points[points["at"] >= fit_from].astype({"at": float, "seconds": float})
+    slope = error = float("nan")
+    if len(kept) >= LEAST_POINTS:
+        line = linregress(np.log(kept["at"]), np.log(kept["seconds"]))
+        slope, error = float(line.slope), float(line.stderr)
+    fitted = {"slope": slope, "error": error, "points": len(kept)}
+    ends = {"low": float(kept["at"].min()), "high": float(kept["at"].max())}
+    return {"sweep": sweep, "estimator": estimator, **fitted, **ends, "stopped": stopped}
 
 
 # --- the measurement -------------------------------------------------------------------------------------

@@ -18,15 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, ScalarFormatter
 
 from pathspace_graph.eval.experiment.tables import TextTable
-from pathspace_graph.eval.figures.style import (
-    MARKERS,
-    PALETTE,
-    WIDTH,
-    figure_context,
-    label_logarithms,
-    save_figures,
-    shared_legend,
-)
+from pathspace_graph.eval.figures import style
+from pathspace_graph.eval.figures.style import MARKERS, PALETTE, WIDTH
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import atomic_folder, write_json
 
@@ -38,10 +31,8 @@ MARKER: Final = "scaling.json"
 COMPARED_AT: Final = 200.0
 """Number of cones at which estimators are compared, that of an ordinary track."""
 
-_HEIGHT: Final = 3.1
-"""Height of a figure (in)."""
-_MARKER_SIZE: Final = 3.6
-"""Size of the estimators' points (pt)."""
+_HEIGHT, _MARKER_SIZE = 3.1, 3.6
+"""Height of a figure (in), and size of the estimators' points (pt)."""
 _CONES_TICKS: Final = (50, 100, 200, 500, 1000, 2000)
 """Labels of the axis of cones, as far as it reaches."""
 _TITLES: Final[dict[Sweep, tuple[str, str]]] = {
@@ -58,16 +49,9 @@ _TITLES: Final[dict[Sweep, tuple[str, str]]] = {
 def scaling_table(scaling: Scaling) -> TextTable:
     """Return a row for each estimator: slopes, times, the ratio to the first, laps and memory."""
     settings = scaling.settings
-    header = (
-        "estimator",
-        f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})",
-        "slope, readings",
-        f"ms at {COMPARED_AT:g} cones",
-        f"{scaling.estimators[0]} / this",
-        "most cones",
-        f"ms, lap 2 and {settings.laps}",
-        "peak MB",
-    )
+    slopes = f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})", "slope, readings"
+    at = f"ms at {COMPARED_AT:g} cones", f"{scaling.estimators[0]} / this", "most cones"
+    header = ("estimator", *slopes, *at, f"ms, lap 2 and {settings.laps}", "peak MB")
     rows = tuple(_row(scaling, name) for name in scaling.estimators)
     return TextTable("Time per update: slopes of the logarithms, +- standard error", header, rows)
 
@@ -100,11 +84,12 @@ def _number(value: float, form: str) -> str:
 
 def stops(scaling: Scaling) -> list[str]:
     """Return a line for each estimator and sweep that did not reach the end."""
+    stopped = (s for s in scaling.slopes.to_dict("records") if s["stopped"])
+    slope = " (slope to {high:.0f})"
     return [
         f"{s['estimator']}, {s['sweep']}: stopped, {s['stopped']}"
-        + (f" (slope to {s['high']:.0f})" if s["points"] else "")
-        for s in scaling.slopes.to_dict("records")
-        if s["stopped"]
+        + (slope.format(**s) if s["points"] else "")
+        for s in stopped
     ]
 
 
@@ -114,7 +99,7 @@ def write_scaling(out: Path, scaling: Scaling) -> None:
         scaling.points.to_csv(folder / "points.csv", index=False, lineterminator="\n")
         (folder / "table.md").write_text(scaling_table(scaling).markdown(), encoding="utf-8")
         write_json(folder / MARKER, _content(scaling))
-        save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
+        style.save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
 
 
 def _content(scaling: Scaling) -> dict[str, Any]:
@@ -146,7 +131,7 @@ def _process_megabytes() -> float | None:
 
 def plot_scaling(scaling: Scaling) -> Figure:
     """Draw two sweeps on logarithmic axes, with fitted lines, and a cross where an estimator was stopped."""
-    with figure_context():
+    with style.figure_context():
         figure = Figure(figsize=(WIDTH, _HEIGHT), layout="constrained")
         cones, detections = figure.subplots(1, 2, sharey=True)
         for axes, sweep in ((cones, CONES), (detections, READINGS)):
@@ -160,24 +145,23 @@ def plot_scaling(scaling: Scaling) -> Figure:
         cones.set_ylabel("mean update (ms)")
         _label_ticks(cones, tuple(t for t in _CONES_TICKS if t <= scaling.settings.cones_max))
         _label_ticks(detections, scaling.settings.readings)
-        shared_legend(figure, columns=min(len(scaling.estimators), 4))
+        style.shared_legend(figure, columns=min(len(scaling.estimators), 4))
     return figure
 
 
 def plot_laps(scaling: Scaling) -> Figure:
     """Draw the time per update of each lap, from the first on."""
-    with figure_context():
+    with style.figure_context():
         figure = Figure(figsize=(WIDTH / 2, _HEIGHT), layout="constrained")
         axes = figure.subplots()
         _draw_sweep(axes, scaling, LAPS, linestyle="-")
         axes.set_ylabel("mean update (ms)")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        shared_legend(figure, columns=2)
+        style.shared_legend(figure, columns=2)
     return figure
 
 
 def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "none") -> dict[str, str]:
-    """Draw the points of every estimator that has some, and return the colours by name."""
     drawn: dict[str, str] = {}
     for name, color, marker in zip(scaling.estimators, cycle(PALETTE), cycle(MARKERS), strict=False):
         points = scaling.of(sweep, name)
@@ -186,24 +170,20 @@ def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "no
             milliseconds = 1e3 * points["seconds"]
             axes.plot(points["at"], milliseconds, linestyle=linestyle, color=color, label=name, **look)
             drawn[name] = color
-    axes.set_yscale("log")
-    label_logarithms(axes)
     abscissa, title = _TITLES[sweep]
-    axes.set_xlabel(abscissa)
-    axes.set_title(title)
+    axes.set(yscale="log", xlabel=abscissa, title=title)
+    style.label_logarithms(axes)
     axes.grid(which="both")
     return drawn
 
 
 def _draw_power_law(axes: Axes, scaling: Scaling, sweep: Sweep, name: str, color: str) -> None:
-    """Draw the fitted power law through the mean of its points' logarithms, over their range."""
     slope = scaling.slope(sweep, name)
     if not np.isfinite(slope["slope"]):
         return
-    points = scaling.of(sweep, name)
-    fitted = points.loc[points["at"].between(slope["low"], slope["high"]), ["at", "seconds"]]
-    at, seconds = np.exp(np.log(fitted).mean())
-    ends = np.array([slope["low"], slope["high"]])
+    ends = slope[["low", "high"]].to_numpy(float)
+    points = scaling.of(sweep, name)[["at", "seconds"]]
+    at, seconds = np.exp(np.log(points[points["at"].between(*ends)]).mean())
     milliseconds = 1e3 * seconds * (ends / at) ** slope["slope"]
     axes.plot(ends, milliseconds, color=color, linewidth=0.9, alpha=0.8)
 

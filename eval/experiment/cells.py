@@ -1,25 +1,25 @@
-"""Cells, each one estimator with one set of settings on one log: how they are run, measured and kept."""
+"""Drives, cells of an estimator with settings on the log of one, and what is measured and kept of them."""
 
-from __future__ import annotations
-
+import hashlib
+import json
 import time
 import traceback
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, Self, TypeVar
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.errors import InputError
+from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.eval.metrics.measures import Row, StageTime, measure, online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times, versions
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
-from pathspace_graph.io.files import replacing, to_plain, write_json
+from pathspace_graph.io.files import to_plain, write_json
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.parsing import read_json
 from pathspace_graph.io.results import RunResult
@@ -27,8 +27,116 @@ from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track import EVENTS, Track
+from pathspace_graph.sim.track_files import read_track
+from pathspace_graph.sim.track_generator import generate_track
 
-from .drives import Drive, identity, read_log_file, write_log_file
+TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
+_IDENTITY_DIGITS: Final = 20
+"""Number of hexadecimal digits of an identity, which are 80 bits."""
+_SEED_DIGITS: Final = 8
+"""Number of hexadecimal digits of a seed."""
+_latest: dict[str, Log] = {}
+"""The log that was simulated last, by its drive."""
+
+
+@dataclass(frozen=True, eq=False)
+class NamedTrack:
+    """A track with the name that it has in the results."""
+
+    name: str
+    track: Track
+
+    @cached_property
+    def digest(self) -> str:
+        """Identity of the geometry, wherever it came from."""
+        track = self.track
+        parts = (track.left, track.right, track.other, track.start, track.cone_labels)
+        cones = b"|".join(np.ascontiguousarray(part, dtype=float).tobytes() for part in parts)
+        return hashlib.sha256(cones + str(self.track.closed).encode()).hexdigest()[:_IDENTITY_DIGITS]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """One lap or more on a track."""
+
+    track: NamedTrack
+    seed: int
+    """Number of the drive on its track."""
+    noise: str
+    simulation: SimulationSettings
+
+    @property
+    def names(self) -> dict[str, Any]:
+        return {"track": self.track.name, "seed": self.seed, "noise": self.noise}
+
+    @cached_property
+    def own_seed(self) -> int:
+        """Seed of the simulation: drives of one seed on several tracks are independent samples."""
+        return int(identity(track=self.track.digest, seed=self.seed)[:_SEED_DIGITS], 16)
+
+    @cached_property
+    def id(self) -> str:
+        """Identity of everything that the log depends on, except the code."""
+        return identity(track=self.track.digest, seed=self.own_seed, simulation=asdict(self.simulation))
+
+    def load(self) -> Log:
+        """Return the log; the last one is kept, since cells are in the order of their logs."""
+        if self.id not in _latest:
+            _latest.clear()
+            _latest[self.id] = self.simulate()
+        return _latest[self.id]
+
+    def simulate(self) -> Log:
+        return simulate(self.track.track, self.simulation, self.own_seed)
+
+
+def identity(**parts: Any) -> str:
+    """Return a text that is the same for the same values, which are JSON's types only."""
+    text = json.dumps(parts, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:_IDENTITY_DIGITS]
+
+
+def load_tracks(tracks: Iterable[Path | int]) -> list[NamedTrack]:
+    """Read or generate tracks and name each of them; a folder stands for every track file in it.
+
+    A number is the seed of a generated track, and the name of an event its track. InputError where a file is
+    no track or a folder has none.
+    """
+    every = [track for entry in tracks for track in _expanded(entry)]
+    stems = [track.stem for track in every if isinstance(track, Path)]
+    return [_load(track, stems) for track in every]
+
+
+def _expanded(entry: Path | int) -> list[Path | int]:
+    if isinstance(entry, int) or not entry.is_dir():
+        return [entry]
+    files = sorted(file for file in entry.iterdir() if file.suffix in TRACK_SUFFIXES)
+    if not files:
+        raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
+    return [*files]
+
+
+def _load(track: Path | int, stems: list[str]) -> NamedTrack:
+    if isinstance(track, int):
+        return NamedTrack(f"generated {track}", generate_track(np.random.default_rng(track)))
+    if track.name in EVENTS and not track.exists():
+        return NamedTrack(track.name, EVENTS[track.name]())
+    _check_file(track)
+    folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
+    return NamedTrack(f"{folder}{track.stem}", read_track(track))
+
+
+def _check_file(file: Path) -> None:
+    """Raise InputError with the nearest name in the folder where there is no such file."""
+    if not file.exists() and file.parent.is_dir():
+        beside = sorted(entry.name for entry in file.parent.iterdir() if entry.suffix == file.suffix)
+        try:
+            check_name(file.name, beside, "expected a track file")
+        except SettingsError as error:
+            raise InputError(file, str(error)) from error
+
 
 FORMAT: Final = "pathspace-cell/3"
 DIGEST: Final = "digest"
@@ -41,24 +149,23 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class NamedLog:
-    """A log with its name."""
+    """A log with the name of its folder, and the mistakes that are likely in it."""
 
     name: str
-    """Name of the log's folder."""
     log: Log
-    """The log."""
     hints: tuple[Hint, ...] = ()
-    """Mistakes that are likely in it."""
 
     @property
     def names(self) -> dict[str, Any]:
-        """Name that distinguishes the log from others in the results."""
         return {"log": self.name}
 
     @cached_property
     def id(self) -> str:
         """Identity among the logs of one experiment."""
         return identity(log=self.name)
+
+    def load(self) -> Log:
+        return self.log
 
 
 D = TypeVar("D", Drive, NamedLog)
@@ -69,11 +176,8 @@ class Cell(Generic[D]):
     """One run of an experiment."""
 
     drive: D
-    """Drive or log that is mapped."""
     estimator: str
-    """Name of the estimator."""
     settings: MapperSettings
-    """Settings of the estimator."""
     variant: str | None = None
     """Name of the settings, where there are several."""
     measured: Mapping[str, Any] = field(default_factory=dict)
@@ -82,15 +186,13 @@ class Cell(Generic[D]):
     @cached_property
     def id(self) -> str:
         """Identity of everything that the result depends on, except the code."""
-        yardsticks = self.measured.get("yardsticks", False)
-        settings = asdict(self.settings)
+        yardsticks, settings = self.measured.get("yardsticks", False), asdict(self.settings)
         return identity(
             drive=self.drive.id, estimator=self.estimator, settings=settings, yardsticks=yardsticks
         )
 
     @property
     def names(self) -> dict[str, Any]:
-        """Names that distinguish the cell from the others of its experiment."""
         names = self.drive.names | {"estimator": self.estimator}
         return names if self.variant is None else names | {"variant": self.variant}
 
@@ -100,7 +202,6 @@ class Outcome:
     """What came of a cell; a failure is a result as well."""
 
     names: Mapping[str, Any]
-    """Names of the cell."""
     rows: Sequence[Row] = ()
     """Metrics of each lap and, as the last row, of the whole run; none where the cell failed."""
     times: Sequence[StageTime] = ()
@@ -110,7 +211,6 @@ class Outcome:
     failure: str = ""
     """Line that names the error, if there was one."""
     trace: str = ""
-    """Traceback of the error."""
 
     @property
     def laps(self) -> int:
@@ -118,7 +218,7 @@ class Outcome:
         return 0 if self.result is None else self.result.laps
 
     @classmethod
-    def failed(cls, cell: Cell[Any], error: BaseException) -> Outcome:
+    def failed(cls, cell: Cell[Any], error: BaseException) -> Self:
         """Make the outcome of a cell that ended with an error."""
         failure = " ".join(f"{type(error).__name__}: {error}".split())
         return cls(cell.names, failure=failure, trace="".join(traceback.format_exception(error)))
@@ -127,10 +227,11 @@ class Outcome:
 # --- runs ------------------------------------------------------------------------------------------------
 
 
-def run_cell(cell: Cell[Any], log: Log) -> Outcome:
+def run_cell(cell: Cell[Any]) -> Outcome:
     """Run and measure a cell with one thread of BLAS; never raise."""
     try:
         with threadpool_limits(limits=1):
+            log = cell.drive.load()
             begin = time.perf_counter()
             result = run_estimator(cell.estimator, cell.settings, log)
             seconds = time.perf_counter() - begin - result.observing
@@ -158,13 +259,11 @@ def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
 # --- records ---------------------------------------------------------------------------------------------
 
 
-def record_cell(cell: Cell[Drive], log: Log) -> Record:
-    """Run a cell and return its record."""
-    return record_of(cell, run_cell(cell, log))
+def record_cell(cell: Cell[Drive]) -> Record:
+    return record_of(cell, run_cell(cell))
 
 
 def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
-    """Return the record of a cell's outcome."""
     return {
         "format": FORMAT,
         "id": cell.id,
@@ -172,13 +271,12 @@ def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
         "versions": versions(),
         "failure": outcome.failure,
         "traceback": outcome.trace,
-        "said": said(outcome.result),
+        "said": _said(outcome.result),
         "laps": lap_rows(outcome.rows),
     }
 
 
-def said(run: RunResult | None) -> str:
-    """Return the notices of a run's cycles and its diagnosis, each once, or an empty text."""
+def _said(run: RunResult | None) -> str:
     if run is None:
         return ""
     state = run.vehicle
@@ -199,65 +297,26 @@ def lap_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return [{"lap": row.lap, **row.values, **shared} for row in laps] or [{"lap": 1, **whole.values}]
 
 
-@dataclass(frozen=True)
-class Store:
-    """Records of a study in a file each, and its logs while cells are missing.
-
-    All of them are data. A folder that comes from elsewhere can be resumed without running anything in it.
-    """
-
-    folder: Path
-    """Folder of the study."""
-
-    def read(self, cell: Cell[Drive]) -> Record | None:
-        """Return the cell's record, or None if there is none that is as it was written."""
-        try:
-            record = read_json(self._file(cell), "a cell")
-        except InputError:
-            return None
-        return record if _is_record(record) and record["id"] == cell.id else None
-
-    def write(self, cell: Cell[Drive], record: Record) -> None:
-        """Write the record as a file of its own, whole or not at all."""
-        write_json(self._file(cell), {**record, DIGEST: _digest(record)}, indent=1)
-
-    def has_log(self, drive: Drive) -> bool:
-        """Return whether the drive has been simulated."""
-        return self._log(drive).is_file()
-
-    def read_log(self, drive: Drive) -> Log:
-        """Return the log of a drive, simulated again where it can't be read."""
-        try:
-            return read_log_file(self._log(drive))
-        except InputError:
-            return drive.simulate()
-
-    def write_log(self, drive: Drive, log: Log) -> None:
-        """Write a simulated log, whole or not at all."""
-        with replacing(self._log(drive)) as temporary:
-            write_log_file(temporary, log)
-
-    def drop_logs(self) -> None:
-        """Remove the logs, since they can be simulated again."""
-        logs = self.folder / "logs"
-        for file in (*logs.glob("*.log"), *logs.glob("*.pickle")):  # pickles of older versions
-            file.unlink()
-        with suppress(OSError):  # there is none, or it holds something else
-            logs.rmdir()
-
-    def _file(self, cell: Cell[Drive]) -> Path:
-        return self.folder / "cells" / f"{cell.id}.json"
-
-    def _log(self, drive: Drive) -> Path:
-        return self.folder / "logs" / f"{drive.id}.log"
-
-
-def _is_record(record: Any) -> bool:
-    """Return whether this is a whole record with the right digest; older ones have none."""
+def read_record(folder: Path, cell: Cell[Drive]) -> Record | None:
+    """Return the cell's record in a study's folder, or None if there is none that is as it was written."""
+    try:
+        record = read_json(_file(folder, cell), "a cell")
+    except InputError:
+        return None
     if not isinstance(record, dict) or record.get("format") != FORMAT:
-        return False
-    digest = record.pop(DIGEST, None)
-    return record.keys() == _KEYS and digest in (None, _digest(record))
+        return None
+    digest = record.pop(DIGEST, None)  # older records have none
+    whole = record.keys() == _KEYS and digest in (None, _digest(record)) and record["id"] == cell.id
+    return record if whole else None
+
+
+def write_record(folder: Path, cell: Cell[Drive], record: Record) -> None:
+    """Write the record as a file of its own, whole or not at all."""
+    write_json(_file(folder, cell), {**record, DIGEST: _digest(record)}, indent=1)
+
+
+def _file(folder: Path, cell: Cell[Drive]) -> Path:
+    return folder / "cells" / f"{cell.id}.json"
 
 
 def _digest(record: Record) -> str:

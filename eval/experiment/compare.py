@@ -1,8 +1,9 @@
 """Every estimator on the same logs: their frame, the paper's Table 1, all metrics, and paired differences."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,11 +27,10 @@ from pathspace_graph.settings.online import LimitSettings
 from .cells import Cell, NamedLog, Outcome, run_cell
 from .frame import add_batch, difference
 from .study import known_estimators
-from .tables import TextTable
+from .tables import TextTable, group_starts
 from .workers import check_jobs, outcomes, workers
 
 RUN: Final = ("log", "estimator")
-"""Columns that identify a run."""
 NO_TRUTH: Final = "the log has no true cones, which rmse, missed and most other metrics need"
 """Part of a title where the columns of the paper are missing."""
 FAILED: Final = "failed"
@@ -38,10 +38,9 @@ FAILED: Final = "failed"
 AT_END: Final = "end"
 """Text in place of a lap for an estimator that completed no lap."""
 _SPACE: Final = "   "
-"""Space between figures that share a column."""
 _PRINTED: Final = (
-    *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m"),
-    *("two_way", "ghost_share", "size", "ate", "ms_mean"),
+    *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "two_way", "ghost_share", "size", "ate"),
+    "ms_mean",
 )
 """Metrics whose differences are in the table; the file has those of all."""
 _NOT_PAIRED: Final = ("nees_low", "nees_high")
@@ -56,13 +55,10 @@ class Comparison:
     """All outcomes, log by log, in the order of the estimators."""
 
     logs: tuple[NamedLog, ...]
-    """Logs that were mapped."""
     estimators: tuple[str, ...]
-    """Estimators that mapped them."""
     reference: str
     """Estimator that the others are compared with."""
     outcomes: tuple[Outcome, ...] = ()
-    """Outcome of each estimator on each log."""
 
     @cached_property
     def frame(self) -> pd.DataFrame:
@@ -72,32 +68,25 @@ class Comparison:
         return pd.DataFrame(rows, columns=None if rows else [*RUN, "scope", "lap"])
 
     def _rows(self, outcome: Outcome) -> list[dict[str, Any]]:
-        rows: list[dict[str, Any]] = [
-            {
-                **outcome.names,
-                "scope": "lap" if row.lap else "log",
-                "lap": row.lap or outcome.laps,
-                **row.values,
-            }
-            for row in outcome.rows
-        ]
+        rows: list[dict[str, Any]] = []
+        for row in outcome.rows:
+            about = {"scope": "lap" if row.lap else "log", "lap": row.lap or outcome.laps}
+            rows.append({**outcome.names, **about, **row.values})
         batch = self.result(outcome.names["log"], registry.DEFAULT_BATCH)
         if outcome.result is not None and batch is not None and outcome.result is not batch:
             rows[-1] |= gap_columns(outcome.result, batch)
         return rows
 
+    @property
+    def final(self) -> pd.DataFrame:
+        return self.frame[self.frame["scope"] == "log"]
+
     def times(self) -> pd.DataFrame:
         """Return a tidy row per run and stage, in s."""
-        names = ["stage", "mean", "median", "p99", "share"]
-        found = [
-            [*o.names.values(), *(getattr(stage, name) for name in names)]
-            for o in self.outcomes
-            for stage in o.times
-        ]
-        return pd.DataFrame(found, columns=[*RUN, *names])
+        rows = [{**outcome.names, **asdict(stage)} for outcome in self.outcomes for stage in outcome.times]
+        return pd.DataFrame(rows, columns=[*RUN, "stage", "mean", "median", "p99", "share"])
 
     def of(self, log: str) -> list[Outcome]:
-        """Return the outcomes on one log."""
         return [outcome for outcome in self.outcomes if outcome.names["log"] == log]
 
     def result(self, log: str, estimator: str) -> RunResult | None:
@@ -106,7 +95,6 @@ class Comparison:
 
     @property
     def has_truth(self) -> bool:
-        """Whether any log has true cones."""
         return any(n.log.truth is not None and has_cones(n.log.truth) for n in self.logs)
 
     @property
@@ -116,7 +104,6 @@ class Comparison:
 
     @property
     def failures(self) -> list[Outcome]:
-        """Outcomes that failed."""
         return [outcome for outcome in self.outcomes if outcome.failure]
 
     @property
@@ -131,10 +118,10 @@ def gap_columns(result: RunResult, batch: RunResult) -> dict[str, float]:
 
     Landmarks are no curves, so a landmark map has the distance of the poses only.
     """
-    found = gap(result, batch)
-    row = {"gap_trajectory": float(np.hypot(found.along, found.across))}
-    if found.curves and all(isinstance(b, SplineBoundary) for b in result.map.boundaries.values()):
-        row["gap_curves"] = float(np.mean(list(found.curves.values())))
+    by = gap(result, batch)
+    row = {"gap_trajectory": float(np.hypot(by.along, by.across))}
+    if by.curves and all(isinstance(b, SplineBoundary) for b in result.map.boundaries.values()):
+        row["gap_curves"] = float(np.mean(list(by.curves.values())))
     return row
 
 
@@ -143,11 +130,11 @@ def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedL
     are none, or if a cycle of one cannot be used."""
     folders = {folder.resolve().name: folder}
     if folder.is_dir() and not (folder / LOG_FILE).exists():
-        entries = (entry for entry in folder.iterdir() if not is_temporary(entry.name))
-        folders = {entry.name: entry for entry in sorted(entries) if (entry / LOG_FILE).is_file()}
+        entries = sorted(entry for entry in folder.iterdir() if not is_temporary(entry.name))
+        folders = {entry.name: entry for entry in entries if (entry / LOG_FILE).is_file()}
     if not folders:
         raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
-    read = {name: read_plausible_log(own, limits or LimitSettings()) for name, own in folders.items()}
+    read = {name: read_plausible_log(entry, limits or LimitSettings()) for name, entry in folders.items()}
     return tuple(NamedLog(name, log, tuple(hints)) for name, (log, hints) in read.items())
 
 
@@ -190,8 +177,8 @@ def compare(
     cells = [Cell(log, name, settings, measured=measured) for log in logs for name in estimators]
     done: dict[Cell[NamedLog], Outcome] = {}
     with workers(jobs, None):
-        for cell, found in outcomes(run_cell, cells, lambda cell: (cell.drive.log,)):
-            done[cell] = found if isinstance(found, Outcome) else Outcome.failed(cell, found)
+        for cell, outcome in outcomes(run_cell, cells):
+            done[cell] = outcome if isinstance(outcome, Outcome) else Outcome.failed(cell, outcome)
             if on_run is not None:
                 on_run()
     chosen = choose_reference(reference, estimators)
@@ -216,33 +203,30 @@ def paper_frame(comparison: Comparison) -> pd.DataFrame:
     frame = comparison.frame.reindex(columns=[*RUN, "scope", "lap", *keys])
     rows = []
     for estimator in comparison.estimators:
-        own = frame[frame["estimator"] == estimator]
-        laps = own[own["scope"] == "lap"]
-        for lap, over_logs in laps.groupby("lap") if len(laps) else [(np.nan, own)]:
-            means = {key: over_logs[key].astype(float).mean() for key in keys}
+        runs = frame[frame["estimator"] == estimator]
+        laps = runs[runs["scope"] == "lap"]
+        for lap, over_logs in laps.groupby("lap") if len(laps) else [(np.nan, runs)]:
+            means = over_logs[keys].astype(float).mean().to_dict()
             rows.append({"estimator": estimator, "lap": lap, "logs": len(over_logs)} | means)
     return pd.DataFrame(rows).astype({"lap": "Int64"})
 
 
 def paper_table(comparison: Comparison) -> TextTable:
     """Return the paper's Table 1, lap by lap; without truth it has the sizes only."""
-    frame = paper_frame(comparison)
     shown = PAPER if comparison.has_truth else (METRICS["size"],)
     logs = ["logs"] if len(comparison.logs) > 1 else []
-    rows = [
+    rows = tuple(
         (row["estimator"], _lap(row), *(str(row[key]) for key in logs), *(_cell(m, row) for m in shown))
-        for row in frame.to_dict("records")
-    ]
-    groups = tuple(i for i in range(1, len(rows)) if rows[i][0] != rows[i - 1][0])
+        for row in paper_frame(comparison).to_dict("records")
+    )
     header = ("estimator", "lap", *logs, *(metric.heading for metric in shown))
-    return TextTable(_title(comparison, "at the end of each lap"), header, tuple(rows), groups)
+    return TextTable(_title(comparison, "at the end of each lap"), header, rows, group_starts(rows))
 
 
 def final_table(comparison: Comparison) -> TextTable:
     """Return the means over the logs of every metric of whole logs, with a column for each estimator."""
-    frame, names = comparison.frame, comparison.estimators
-    final = frame[frame["scope"] == "log"]
-    known = [m for m in METRICS.values() if m.key in frame and not final[m.key].astype(float).isna().all()]
+    final, names = comparison.final, comparison.estimators
+    known = [m for m in METRICS.values() if m.key in final and not final[m.key].astype(float).isna().all()]
     rows = tuple(
         (m.heading, *(m.text(m.over(final.loc[final["estimator"] == name, m.key])) for name in names))
         for m in known
@@ -252,17 +236,17 @@ def final_table(comparison: Comparison) -> TextTable:
 
 def paired_frame(comparison: Comparison) -> pd.DataFrame:
     """Return a tidy row for each estimator and metric of whole logs: its difference from the reference."""
-    frame, reference = comparison.frame, comparison.reference
-    final = frame[frame["scope"] == "log"].set_index([*RUN])
-    keys = [key for key in METRICS if key in frame and key not in _NOT_PAIRED]
+    reference, logs = comparison.reference, [named.name for named in comparison.logs]
+    final = comparison.final.set_index([*RUN])
+    keys = [key for key in METRICS if key in final and key not in _NOT_PAIRED]
     rows = []
     for estimator in comparison.estimators:
         for key in keys if estimator != reference else ():
-            own, others = (
-                final[key].astype(float).reindex([(named.name, name) for named in comparison.logs]).to_numpy()
+            values, others = (
+                final[key].astype(float).reindex([(log, name) for log in logs]).to_numpy()
                 for name in (estimator, reference)
             )
-            d = difference(own, others)
+            d = difference(values, others)
             rows.append([estimator, reference, key, d.mean, d.low, d.high, d.count])
     return pd.DataFrame(rows, columns=["estimator", "reference", "metric", "mean", "low", "high", "pairs"])
 
@@ -274,7 +258,7 @@ def paired_table(comparison: Comparison) -> TextTable:
     rows = []
     for metric in (METRICS[key] for key in _PRINTED):
         by_estimator = paired[paired["metric"] == metric.key].set_index("estimator")
-        if len(by_estimator) and by_estimator["mean"].notna().any():
+        if by_estimator["mean"].notna().any():
             rows.append((metric.heading, *(_interval(metric, by_estimator.loc[name]) for name in others)))
     title = (
         f"Difference from {comparison.reference}, mean [95 % interval] over {len(comparison.logs)} logs, "
@@ -284,7 +268,6 @@ def paired_table(comparison: Comparison) -> TextTable:
 
 
 def _interval(metric: Metric, row: Any) -> str:
-    """Return `mean [low, high]` in the metric's unit, with * where it excludes 0."""
     mean, low, high = (metric.factor * float(row[name]) for name in ("mean", "low", "high"))
     if np.isnan(mean):
         return UNKNOWN
@@ -300,17 +283,13 @@ def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
     """
     titles = _SPACE.join(metric.heading for metric in PAPER)
     header = ("lap", *(f"{name}\n{titles}" for name in laps))
-    count = max((len(rows) for rows in laps.values()), default=0)
-    rows = (
-        (str(lap + 1), *(_three(own[lap] if lap < len(own) else None) for own in laps.values()))
-        for lap in range(count)
-    )
-    return TextTable("", header, tuple(rows), names=0)
+    beside = zip_longest(*laps.values())
+    rows = tuple((str(lap), *map(_three, of)) for lap, of in enumerate(beside, start=1))
+    return TextTable("", header, rows, names=0)
 
 
 def _three(row: LapMetrics | None) -> str:
-    """Return the paper's three figures of a lap, each as wide as its title."""
-    values = {} if row is None else {metric.key: getattr(row, metric.key) for metric in PAPER}
+    values = {} if row is None else asdict(row)
     return _SPACE.join(_cell(metric, values).rjust(len(metric.heading)) for metric in PAPER)
 
 

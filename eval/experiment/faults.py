@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ from pathspace_graph.plausibility.diagnosis import LIMIT
 
 from .frame import RUN, last_laps
 from .study import Study, find_study, read_study
-from .tables import TextTable
+from .tables import TextTable, group_starts
 
 SUITE: Final = Path("faults")
 """Name of the shipped study that is the suite."""
@@ -25,7 +26,6 @@ CLEAN: Final = "clean"
 BY_PRIOR: Final = "_by_prior"
 """Suffix of metrics that are estimates of a calibration by the sigma of its prior."""
 TITLE_BY_PRIOR: Final = " by its prior's sigma"
-"""End of the titles of these metrics."""
 HEADER: Final = (
     "fault",
     "strength",
@@ -60,36 +60,34 @@ class Fault:
     """A fault of a kind and a strength."""
 
     kind: str
-    """Kind of the fault in plain words; `clean` where there is no fault."""
+    """Kind in plain words; `clean` where there is no fault."""
     strength: str
-    """Strength as it is written."""
+    """Strength as it is written, a number and a unit."""
     value: float
-    """Number of the strength."""
     unit: str
-    """Unit of the number; empty for counts."""
+    """Unit; empty for counts."""
 
 
 def fault_of(noise: str) -> Fault:
     """Return the fault of a noise such as `latency: 20 ms`; SettingsError for any other name."""
     if noise == CLEAN:
         return Fault(CLEAN, "", 0.0, "")
-    found = _NAME.fullmatch(noise)
+    match = _NAME.fullmatch(noise)
     try:
-        assert found is not None
-        return Fault(found["kind"], found["strength"], float(found["value"]), found["unit"] or "")
-    except (AssertionError, ValueError) as error:
+        value = float(match["value"] if match else "")
+    except ValueError as error:
         raise SettingsError(f"noise: expected a name such as 'latency: 20 ms', found '{noise}'") from error
+    assert match is not None
+    return Fault(match["kind"], match["strength"], value, match["unit"] or "")
 
 
 def suite() -> Study:
-    """Return the suite that ships with the package."""
     return read_study(find_study(SUITE))
 
 
 def kinds(study: Study) -> list[str]:
-    """Return the kinds of faults of a suite, in its order."""
-    found = (fault_of(noise).kind for noise in study.noise)
-    return [kind for kind in dict.fromkeys(found) if kind != CLEAN]
+    every = dict.fromkeys(fault_of(noise).kind for noise in study.noise)
+    return [kind for kind in every if kind != CLEAN]
 
 
 def only(study: Study, wanted: Sequence[str]) -> Study:
@@ -102,7 +100,16 @@ def only(study: Study, wanted: Sequence[str]) -> Study:
 
 def strongest(study: Study) -> Study:
     """Return the suite with the clean run and each fault at the last of its strengths."""
-    return _with(study, list({fault_of(noise).kind: noise for noise in study.noise}.values()))
+    return _with(study, [noises[-1] for noises in _by_kind(study)])
+
+
+def of_middle_strength(study: Study) -> Study:
+    """Return the suite with the clean run and each fault at the middle one of its strengths."""
+    return _with(study, [noises[len(noises) // 2] for noises in _by_kind(study)])
+
+
+def _by_kind(study: Study) -> list[list[str]]:
+    return [list(noises) for _, noises in groupby(study.noise, lambda noise: fault_of(noise).kind)]
 
 
 def _with(study: Study, noises: Sequence[str]) -> Study:
@@ -117,16 +124,14 @@ class FaultOutcome:
     """What came of one fault of one strength."""
 
     fault: Fault
-    """The fault."""
     runs: pd.DataFrame
     """Runs that finished, with the `ratio` of the rmse and the `size_ratio` to those of the clean run, NaN
     where either has no map, and whether anything was `told`."""
     failed: int
-    """Number of runs that ended with an error."""
 
     def values(self) -> dict[str, Any]:
         """Return the outcome as a row of plain values; what is not known is NaN."""
-        runs, ratios = self.runs, known(self.runs["ratio"])
+        runs, ratios = self.runs, self.runs["ratio"].dropna()
         return {
             "fault": self.fault.kind,
             "strength": self.fault.value,
@@ -134,42 +139,30 @@ class FaultOutcome:
             "runs": len(runs),
             "failed": self.failed,
             "with_map": len(ratios),
-            "ratio_mean": mean(ratios),
-            "ratio_min": float(ratios.min()) if len(ratios) else np.nan,
-            "ratio_max": float(ratios.max()) if len(ratios) else np.nan,
-            "size_ratio": mean(known(runs["size_ratio"])),
-            "missed": mean(known(runs["missed"])),
+            "ratio_mean": float(ratios.mean()),
+            "ratio_min": float(ratios.min()),
+            "ratio_max": float(ratios.max()),
+            "size_ratio": float(runs["size_ratio"].mean()),
+            "missed": float(runs["missed"].mean()),
             "closed": int((runs["closed_at_end"] == 1.0).sum()),
             "lost": int((runs["lost_at_end"] == 1.0).sum()),
-            "error_max": max(runs["error_max"].tolist(), default=np.nan),
-            "error_end": max(runs["error_end"].tolist(), default=np.nan),
-            "astray_time": float(max(known(runs["astray_time"]), default=np.nan)),
-            "astray_way": float(max(known(runs["astray_way"]), default=np.nan)),
+            **{
+                name: float(runs[name].max())
+                for name in ("error_max", "error_end", "astray_time", "astray_way")
+            },
             "told": int(runs["told"].sum()),
-            "told_degraded": mean(known(runs["told_degraded"])),
-            "told_lost": mean(known(runs["told_lost"])),
+            "told_degraded": float(runs["told_degraded"].mean()),
+            "told_lost": float(runs["told_lost"].mean()),
             "calibration": self._calibration(),
             "said": dict(Counter(text for text in runs["said"] if text).most_common()),
         }
 
     def _calibration(self) -> dict[str, float]:
-        """Return the mean of each estimate by its prior's sigma, where it is conspicuous."""
-        keys = [name for name in self.runs if name.endswith(BY_PRIOR)]
         means = {
-            METRICS[key].title.removesuffix(TITLE_BY_PRIOR): mean(known(self.runs[key].astype(float)))
-            for key in keys
+            key: float(self.runs[key].astype(float).mean()) for key in self.runs if key.endswith(BY_PRIOR)
         }
-        return {name: value for name, value in means.items() if abs(value) > LIMIT}
-
-
-def known(values: pd.Series) -> np.ndarray:
-    """Return the values that are known."""
-    return np.asarray(values.dropna())
-
-
-def mean(values: np.ndarray) -> float:
-    """Return the mean of the values, and NaN if there are none."""
-    return float(values.mean()) if len(values) else float("nan")
+        titles = {key: METRICS[key].title.removesuffix(TITLE_BY_PRIOR) for key in means}
+        return {titles[key]: value for key, value in means.items() if abs(value) > LIMIT}
 
 
 def outcomes(study: Study, frame: pd.DataFrame) -> list[FaultOutcome]:
@@ -207,9 +200,8 @@ def fault_table(study: Study, found: Sequence[FaultOutcome]) -> TextTable:
         "of the clean run on the same track and with the same seed, as its mean and its range. "
         "Lost means more than 5 m off in the last second."
     )
-    groups = tuple(k for k in range(1, len(rows)) if rows[k][0] != rows[k - 1][0])
     shown = tuple(tuple(row[k] for k in kept) for row in rows)
-    return TextTable(title, tuple(HEADER[k] for k in kept), shown, groups, names=2)
+    return TextTable(title, tuple(HEADER[k] for k in kept), shown, group_starts(rows), names=2)
 
 
 def _row(outcome: FaultOutcome) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -16,8 +17,7 @@ from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.overrides import leaves
 
-from .cells import Cell, Record
-from .drives import Drive
+from .cells import Cell, Drive, Record
 from .study import Study
 
 COMBINATION: Final = ("noise", "estimator", "variant")
@@ -25,7 +25,6 @@ COMBINATION: Final = ("noise", "estimator", "variant")
 RUN: Final = ("track", "seed")
 """Columns that name a drive; combinations are paired on the same drive and noise."""
 RUN_OF: Final = (*RUN, *COMBINATION)
-"""Columns that name a run."""
 SIMULATION: Final = "simulation."
 """Prefix of columns with settings of the simulation."""
 SETTING: Final = "settings."
@@ -104,7 +103,7 @@ class Estimate:
     """Mean and its 95 % interval by Student's t over runs."""
 
     mean: float
-    """Mean; NaN without runs."""
+    """NaN without runs."""
     half: float
     """Half the width of the interval; NaN for fewer than two runs."""
     count: int
@@ -112,12 +111,10 @@ class Estimate:
 
     @property
     def low(self) -> float:
-        """Lower end of the interval."""
         return self.mean - self.half
 
     @property
     def high(self) -> float:
-        """Upper end of the interval."""
         return self.mean + self.half
 
 
@@ -168,11 +165,8 @@ class Contrast:
     """One metric of one combination, and its difference from the baseline, run by run."""
 
     noise: str
-    """Name of the noise."""
     estimator: str
-    """Name of the estimator."""
     variant: str
-    """Name of the settings."""
     metric: str
     """Key of the metric."""
     value: Estimate
@@ -180,7 +174,6 @@ class Contrast:
     difference: Estimate | None
     """Mean over the pairs; None for the baseline itself."""
     differences: tuple[float, ...] = ()
-    """Difference of each pair of runs."""
     p: float = float("nan")
     """P of the paired t-test, corrected for all comparisons of the metric."""
 
@@ -198,25 +191,16 @@ def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
     last = last_laps(frame)
     known = last.assign(**{metric: last[metric].astype(float)}).dropna(subset=[metric])
     runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
-    found = []
-    for noise in study.noise:
-        for estimator in study.estimators:
-            base = (noise, study.baseline.estimator or estimator, study.baseline_variant)
-            for variant in study.points:
-                key = (noise, estimator, variant)
-                found.append(_contrast(key, metric, runs, None if key == base else base))
-    corrected = holm(np.array([contrast.p for contrast in found]))
-    return [replace(contrast, p=float(p)) for contrast, p in zip(found, corrected, strict=True)]
-
-
-def _contrast(
-    key: tuple[str, str, str], metric: str, runs: dict[Any, pd.Series], base: tuple[str, str, str] | None
-) -> Contrast:
-    own = runs.get(key, pd.Series(dtype=float))
-    value = estimate(own.to_numpy())
-    if base is None:
-        return Contrast(*key, metric, value, None)
-    against = runs.get(base, pd.Series(dtype=float))
-    shared = own.index[own.index.isin(against.index)]
-    pairs = own[shared].to_numpy() - against[shared].to_numpy()
-    return Contrast(*key, metric, value, estimate(pairs), tuple(pairs.tolist()), paired_p(pairs))
+    nothing, contrasted = pd.Series(dtype=float), []
+    for key in product(study.noise, study.estimators, study.points):
+        base = (key[0], study.baseline.estimator or key[1], study.baseline_variant)
+        values, against = runs.get(key, nothing), runs.get(base, nothing)
+        contrast = Contrast(*key, metric, estimate(values.to_numpy()), None)
+        if key != base:
+            shared = values.index[values.index.isin(against.index)]
+            d = values[shared].to_numpy() - against[shared].to_numpy()
+            pairs = tuple(d.tolist())
+            contrast = replace(contrast, difference=estimate(d), differences=pairs, p=paired_p(d))
+        contrasted.append(contrast)
+    corrected = holm(np.array([contrast.p for contrast in contrasted]))
+    return [replace(contrast, p=float(p)) for contrast, p in zip(contrasted, corrected, strict=True)]

@@ -2,30 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 
-from pathspace_graph.eval.figures.map_plot import (
-    MARGIN,
-    WHOLE_TRACK,
-    MapStyle,
-    draw_boundary,
-    draw_start,
-    draw_truth,
-)
-from pathspace_graph.eval.figures.style import (
-    RED,
-    WIDTH,
-    draw_points,
-    figure_context,
-    fit_height,
-    grouped_legend,
-    set_frame,
-)
+from pathspace_graph.eval.figures import map_plot, style
+from pathspace_graph.eval.figures.map_plot import MARGIN, WHOLE_TRACK, MapStyle
+from pathspace_graph.eval.figures.style import RED, WIDTH
 from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
 from pathspace_graph.eval.metrics.metric import PAPER
 from pathspace_graph.factors.arrays import Array
@@ -54,7 +40,6 @@ class BlindSpot:
     distance: float
     """Distance (m) within which nothing is mapped at a missed cone."""
     cones: int
-    """Number of true cones in the stretch."""
     missed: tuple[Array, ...]
     """Positions (k, 2) of the cones that each map misses in the stretch."""
 
@@ -75,7 +60,9 @@ def find_blind_spot(
         bridged = (distances[0] <= distance) & (distances[1] > distance)
         if bridged.any():
             centre = _densest(cones[bridged], np.minimum(distances[1][bridged], _MAX_WEIGHT), half_size)
-            spot = _spot(cones, distances, centre, half_size, distance)
+            inside = (np.abs(cones - centre) <= half_size).all(axis=1)
+            missed = tuple(cones[inside & (d > distance)] for d in distances)
+            spot = BlindSpot(centre, half_size, distance, int(inside.sum()), missed)
             if len(spot.missed[1]) >= _MIN_CONES:
                 return spot
             best = best or spot
@@ -91,14 +78,6 @@ def _densest(points: Array, weights: Array, half_size: tuple[float, float]) -> A
     return np.asarray(0.5 * (chosen.min(axis=0) + chosen.max(axis=0)))
 
 
-def _spot(
-    cones: Array, distances: list[Array], centre: Array, half_size: tuple[float, float], distance: float
-) -> BlindSpot:
-    inside = (np.abs(cones - centre) <= half_size).all(axis=1)
-    missed = tuple(cones[inside & (d > distance)] for d in distances)
-    return BlindSpot(centre, half_size, distance, int(inside.sum()), missed)
-
-
 COLUMNS: Final = (2, 3, 4)
 """Numbers of panels side by side; the first with which the figure fits a page is taken."""
 MAX_HEIGHT: Final = 10.0
@@ -106,29 +85,22 @@ MAX_HEIGHT: Final = 10.0
 CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
 """Style of a panel that shows a short stretch of a track."""
 
-_TITLE_HEIGHT: Final = 0.6
-"""Height of a panel's title and its free space (in)."""
-_TICK_LABELS: Final = 0.48
-"""Width and height of the outer tick labels and axis titles (in)."""
-_LEGEND_HEIGHT: Final = 2.0
-"""More than enough height for the legend (in); what it doesn't take is cut off."""
-_GAP: Final = 0.12
-"""Space between panels (in)."""
+# heights (in): a panel's title, the outer tick labels with axis titles, more than any legend, gaps
+_TITLE_HEIGHT, _TICK_LABELS, _LEGEND_HEIGHT, _GAP = 0.6, 0.48, 2.0, 0.12
 _RING_SIZE: Final = 8.0
-"""Size of the ring around a missed cone (pt)."""
 
 
 def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:
     """Draw a panel for each map over the truth, all of the same area; failures have no panel."""
     drawn = [(outcome, outcome.result.map) for outcome in outcomes if outcome.result is not None]
     low, high = _extent([track for _, track in drawn], log.truth)
-    with figure_context():
+    with style.figure_context():
         figure, panels, columns = _panels(len(drawn), (high - low) / 2.0)
         for axes, (outcome, track) in zip(panels, drawn, strict=False):
             _draw_map(axes, track, log.truth, WHOLE_TRACK)
-            draw_start(axes, WHOLE_TRACK)
+            map_plot.draw_start(axes, WHOLE_TRACK)
             axes.set_title(_caption(outcome))
-            set_frame(axes, low, high)
+            style.set_frame(axes, low, high)
         _finish(figure, panels, len(drawn), columns)
     return figure
 
@@ -137,15 +109,17 @@ def plot_blind_spot(spot: BlindSpot, maps: Sequence[tuple[str, Map]], truth: Tru
     """Draw the same area of several maps side by side, with rings around the cones that a map misses."""
     half_size = np.array(spot.half_size)
     shows_start = bool((np.abs(spot.centre) < half_size).all())
-    with figure_context():
+    with style.figure_context():
         figure, panels, columns = _panels(len(maps), half_size)
         for axes, (name, track), missed in zip(panels, maps, spot.missed, strict=False):
             _draw_map(axes, track, truth, CLOSE_UP)
             if shows_start:
-                draw_start(axes, CLOSE_UP)
-            _draw_missed(axes, missed, spot.distance)
+                map_plot.draw_start(axes, CLOSE_UP)
+            ring = {"markersize": _RING_SIZE, "markerfacecolor": "none", "markeredgewidth": 1.0, "zorder": 8}
+            text = f"missed: nothing within {spot.distance:g} m"
+            style.draw_points(axes, missed, "o", RED, text, **ring)
             axes.set_title(f"{name}\n{len(missed)} of {spot.cones} true cones missed here")
-            set_frame(axes, spot.centre - half_size, spot.centre + half_size)
+            style.set_frame(axes, spot.centre - half_size, spot.centre + half_size)
         _finish(figure, panels, len(maps), columns)
     return figure
 
@@ -173,46 +147,27 @@ def _finish(figure: Figure, panels: list[Axes], used: int, columns: int) -> None
         if number + columns >= used:
             axes.set_xlabel("x [m]")
             axes.tick_params(labelbottom=True)
-    grouped_legend(figure)
-    fit_height(figure)
+    style.grouped_legend(figure)
+    style.fit_height(figure)
 
 
-def _draw_missed(axes: Axes, missed: Array, distance: float) -> None:
-    """Draw rings around the cones (k, 2) that a map misses."""
-    ring: dict[str, Any] = {
-        "markersize": _RING_SIZE,
-        "markerfacecolor": "none",
-        "markeredgewidth": 1.0,
-        "zorder": 8,
-    }
-    draw_points(axes, missed, "o", RED, f"missed: nothing within {distance:g} m", **ring)
-
-
-def _draw_map(axes: Axes, track: Map, truth: Truth | None, style: MapStyle) -> None:
+def _draw_map(axes: Axes, track: Map, truth: Truth | None, look: MapStyle) -> None:
     for label, boundary in sorted(track.boundaries.items()):
-        draw_boundary(axes, boundary, label, style)
+        map_plot.draw_boundary(axes, boundary, label, look)
     if truth is not None:
-        draw_truth(axes, truth, style)
+        map_plot.draw_truth(axes, truth, look)
 
 
 def _caption(outcome: Outcome) -> str:
-    """Return the estimator's name and the paper's metrics, where they are known."""
     row = outcome.rows[-1].values
-    words = {
-        metric.key: f"{metric.title} {metric.text(float(row[metric.key]))} {metric.unit}".strip()
-        for metric in PAPER
-        if metric.key in row
-    }
-    size = words.pop("size")
-    return "\n".join([outcome.names["estimator"], ", ".join(words.values()), size])
+    *words, size = (f"{m.title} {m.text(float(row[m.key]))} {m.unit}".strip() for m in PAPER if m.key in row)
+    return "\n".join([outcome.names["estimator"], ", ".join(words), size])
 
 
 def _extent(maps: Sequence[Map], truth: Truth | None) -> tuple[Array, Array]:
     """Return two corners (2,) around the true cones and a margin, or around all maps without true cones."""
-    points = [np.zeros((1, 2))]
-    if truth is not None and len(truth.cones):
-        points.append(truth.cones)
-    else:
-        points += [mapped_points(boundary) for track in maps for boundary in track.boundaries.values()]
-    together = np.concatenate(points)
+    points = [truth.cones] if truth is not None and len(truth.cones) else []
+    if not points:
+        points = [mapped_points(boundary) for track in maps for boundary in track.boundaries.values()]
+    together = np.concatenate([np.zeros((1, 2)), *points])
     return together.min(axis=0) - MARGIN, together.max(axis=0) + MARGIN

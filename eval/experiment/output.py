@@ -17,7 +17,8 @@ from pathspace_graph.io.results import write_result
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .cells import NamedLog, Outcome
-from .compare import Comparison, paired_frame, paper_frame, tables
+from .compare import Comparison, paired_frame, paper_frame
+from .compare import tables as comparison_tables
 from .faults import fault_table, outcomes
 from .frame import times_of, without_times
 from .map_panels import find_blind_spot, plot_blind_spot, plot_maps
@@ -50,16 +51,13 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
 def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write `results.csv`, `times.csv` and the summary in three forms, and return its text."""
     write_results(frame, out)
-    found, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
-    text = as_text(found, note)
-    write_text(out / "summary.txt", text)
-    write_text(out / "summary.md", as_markdown(found, note))
-    write_text(out / "summary.tex", as_latex(found, note))
-    return text
+    tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
+    for suffix, form in (("txt", as_text), ("md", as_markdown), ("tex", as_latex)):
+        write_text(out / f"summary.{suffix}", form(tables, note))
+    return as_text(tables, note)
 
 
 def write_results(frame: pd.DataFrame, out: Path) -> None:
-    """Write `results.csv` and `times.csv`."""
     write_csv(out / "results.csv", without_times(frame))
     write_csv(out / "times.csv", times_of(frame))
 
@@ -69,28 +67,25 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
 
     `faults.csv` has calibration and notices as JSON texts.
     """
-    found = outcomes(study, frame)
-    table = fault_table(study, found)
+    faults = outcomes(study, frame)
+    table = fault_table(study, faults)
     text = f"{table.title}\n\n{table.text()}\n"
     write_results(frame, out)
-    write_text(out / "faults.txt", text)
-    write_text(out / "faults.md", table.markdown())
-    write_text(out / "faults.tex", table.latex())
-    rows = [{name: _known(value) for name, value in outcome.values().items()} for outcome in found]
+    for suffix, content in (("txt", text), ("md", table.markdown()), ("tex", table.latex())):
+        write_text(out / f"faults.{suffix}", content)
+    rows = [{name: _known(value) for name, value in outcome.values().items()} for outcome in faults]
     about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
     write_json(out / "faults.json", {"format": FAULTS_FORMAT, **about, "faults": rows}, indent=1)
-    flat = [{name: _flat(value) for name, value in row.items()} for row in rows]
-    write_csv(out / "faults.csv", pd.DataFrame(flat))
-    save_figures(out, {"faults": plot_faults(found)})
+    texts = {
+        key: [json.dumps(row[key], ensure_ascii=False) for row in rows] for key in ("calibration", "said")
+    }
+    write_csv(out / "faults.csv", pd.DataFrame(rows).assign(**texts))
+    save_figures(out, {"faults": plot_faults(faults)})
     return text
 
 
 def _known(value: Any) -> Any:
     return None if isinstance(value, float) and np.isnan(value) else value
-
-
-def _flat(value: Any) -> Any:
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, dict) else value
 
 
 # --- comparisons -----------------------------------------------------------------------------------------
@@ -108,7 +103,7 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
     if comparison.paired:
         frames["paired"] = paired_frame(comparison)
     with atomic_folder(out, MARKER) as folder:
-        for name, table in tables(comparison).items():
+        for name, table in comparison_tables(comparison).items():
             (folder / f"{name}.md").write_text(table.markdown(), encoding="utf-8")
             (folder / f"{name}.tex").write_text(table.latex(), encoding="utf-8")
         for name, frame in frames.items():
@@ -121,7 +116,6 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
 
 
 def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
-    """Write the maps and figures of one log."""
     found = comparison.of(named.name)
     for outcome in found:
         if outcome.result is not None:
@@ -140,12 +134,12 @@ def blind_spot_figure(found: list[Outcome], named: NamedLog, reference: str) -> 
     It is None without truth, or where no landmark map misses cones that the reference passes.
     """
     maps = {o.names["estimator"]: o.result.map for o in found if o.result is not None}
-    truth = named.log.truth
     points = [
         name
         for name, track in maps.items()
         if any(isinstance(boundary, PointBoundary) for boundary in track.boundaries.values())
     ]
+    truth = named.log.truth
     if truth is None or reference not in maps or reference in points:
         return None
     for name in points:

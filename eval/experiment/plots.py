@@ -9,23 +9,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pathspace_graph.eval.figures.style import (
-    BLUE,
-    DARK,
-    GREEN,
-    GREY,
-    MARKERS,
-    ORANGE,
-    PALETTE,
-    WIDTH,
-    figure_context,
-    label_logarithms,
-    shared_legend,
-)
+from pathspace_graph.eval.figures import style
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, MARKERS, ORANGE, PALETTE, WIDTH
 from pathspace_graph.eval.metrics.metric import METRICS
 
-from .faults import CLEAN, FaultOutcome, known
-from .frame import Contrast, contrasts
+from .faults import CLEAN, FaultOutcome
+from .frame import COMBINATION, Contrast, contrasts
 from .study import Study
 
 ACCURACY: Final = "rmse"
@@ -40,26 +29,19 @@ _LABELS_HEIGHT: Final = 1.1
 """Height of titles and tick labels there (in)."""
 _SCATTER_HEIGHT: Final = 3.6
 """Height of each noise in the figures of accuracy (in)."""
-_MEAN_SIZE: Final = 4.5
-"""Size of the marker of a mean (pt)."""
-_PAIR_SIZE: Final = 3.5
-"""Size of the marker of a single pair (pt)."""
+_MEAN_SIZE, _PAIR_SIZE, _MARKER_SIZE = 4.5, 3.5, 4.0
+"""Size of the markers of a mean, a single pair and a faulty run (pt)."""
 _JITTER: Final = 0.22
-"""Share of a row by which single pairs are scattered vertically, so that they can be told apart."""
-_JITTER_SEED: Final = 0
+"""Share of a row by which single pairs are scattered vertically, so that they can be seen apart."""
 
 _FAULT_COLUMNS: Final = 4
 """Number of panels side by side in the figure of faults."""
-_PANEL_HEIGHT: Final = 1.45
-"""Height of a panel there (in)."""
-_LEGEND_HEIGHT: Final = 0.5
-"""Height of the legend and the title of the axis there (in)."""
+_PANEL_HEIGHT, _LEGEND_HEIGHT = 1.45, 0.5
+"""Heights there of a panel, and of the legend and the title of the axis (in)."""
 _LEGEND_COLUMNS: Final = 6
 """Every look of a mark, and the mean, stand in one row of that legend."""
 _SPREAD: Final = 0.15
-"""Spread of the runs of one strength to both sides, so that they can be told apart."""
-_MARKER_SIZE: Final = 4.0
-"""Size of the marker of a faulty run (pt)."""
+"""Spread of the runs of one strength to both sides, so that they can be seen apart."""
 _ROOM: Final = 1.15
 """Factor by which the axis reaches beyond the smallest and the largest ratio."""
 _TITLE_LENGTH: Final = 30
@@ -68,7 +50,7 @@ _TITLE_LENGTH: Final = 30
 
 def figures(study: Study, frame: pd.DataFrame) -> dict[str, Figure]:
     """Draw every figure that the study has runs for, by the name of its file."""
-    with figure_context():
+    with style.figure_context():
         drawn = {
             "differences": plot_differences(study, frame),
             "accuracy_size": plot_against(study, frame, SIZE),
@@ -86,7 +68,8 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
     Only the first metrics of the study have a panel, and there is none where no run differs.
     """
     panels = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
-    panels = [panel for panel in panels if _differs(panel)][:_MAX_PANELS]
+    panels = [p for p in panels if any(d != 0.0 for contrast in p for d in contrast.differences)]
+    panels = panels[:_MAX_PANELS]
     if not panels:
         return None
     rows = [i for i in range(len(panels[0])) if any(_is_known(panel[i]) for panel in panels)]
@@ -94,26 +77,22 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
     all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, panel in zip(all_axes, panels, strict=True):
         _draw_differences(axes, [panel[i] for i in rows])
-    all_axes[0].set_yticks(range(len(rows)), [_row_name(study, panels[0][i]) for i in rows])
+    names = [_name(study, panels[0][i], COMBINATION) for i in rows]
+    all_axes[0].set_yticks(range(len(rows)), names)
     all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
-    caption = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
-    figure.supxlabel(caption)
+    figure.supxlabel(
+        "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
+    )
     return figure
 
 
 def _is_known(contrast: Contrast) -> bool:
-    """Return whether a combination isn't the baseline itself and has pairs."""
     return contrast.difference is not None and contrast.difference.count > 0
-
-
-def _differs(panel: Sequence[Contrast]) -> bool:
-    """Return whether any run differs from the baseline."""
-    return any(d != 0.0 for contrast in panel for d in contrast.differences)
 
 
 def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
     metric = METRICS[rows[0].metric]
-    rng = np.random.default_rng(_JITTER_SEED)
+    rng = np.random.default_rng(0)
     axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
     for row, contrast in enumerate(rows):
         if contrast.difference is None or not contrast.difference.count:
@@ -134,22 +113,17 @@ def _bar(half: float) -> float | None:
     return None if np.isnan(half) else half
 
 
-def _row_name(study: Study, contrast: Contrast) -> str:
-    several = [name for name in ("noise", "estimator", "variant") if len(_of(study, name)) > 1]
-    return _brief(study, ", ".join(getattr(contrast, name) for name in several))
-
-
-def _brief(study: Study, name: str) -> str:
-    """Return `sigma_spacing=1` for `gauge.sigma_spacing=1`, unless two groups have a setting of one name."""
+def _name(study: Study, contrast: Contrast, columns: Sequence[str]) -> str:
+    """Return the names of a combination that others have differently, `sigma_spacing=1` for
+    `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
+    counts = {"noise": study.noise, "estimator": study.estimators, "variant": study.points}
+    several = [getattr(contrast, column) for column in columns if len(counts[column]) > 1]
+    name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
     last = {field: field.rpartition(".")[2] for field in study.varied}
     if len(set(last.values())) == len(last):
         for field, short in last.items():
             name = name.replace(f"{field}=", f"{short}=")
     return name
-
-
-def _of(study: Study, name: str) -> Sequence[str]:
-    return {"noise": list(study.noise), "estimator": study.estimators, "variant": list(study.points)}[name]
 
 
 # --- accuracy against ------------------------------------------------------------------------------------
@@ -165,12 +139,11 @@ def plot_against(study: Study, frame: pd.DataFrame, metric: str) -> Figure | Non
     for axes, noise in zip(all_axes, study.noise, strict=True):
         pairs = [(a, b) for a, b in zip(across, up, strict=True) if a.noise == noise and a.value.count]
         for index, (a, b) in enumerate(pairs):
-            _draw_point(axes, a, b, index, _label(study, a))
-        axes.set_xlabel(METRICS[metric].heading)
-        axes.set_ylabel(METRICS[ACCURACY].heading)
+            _draw_point(axes, a, b, index, _name(study, a, COMBINATION[1:]))
+        axes.set(xlabel=METRICS[metric].heading, ylabel=METRICS[ACCURACY].heading)
         axes.set_title(noise if len(study.noise) > 1 else "")
         axes.grid()
-    shared_legend(figure, loc="outside right upper")
+    style.shared_legend(figure, loc="outside right upper")
     return figure
 
 
@@ -189,14 +162,6 @@ def _draw_point(axes: Axes, across: Contrast, up: Contrast, index: int, label: s
     )
 
 
-def _label(study: Study, contrast: Contrast) -> str:
-    several = [name for name in ("estimator", "variant") if len(_of(study, name)) > 1]
-    return _brief(
-        study,
-        ", ".join(getattr(contrast, name) for name in several) or f"{contrast.estimator}: {contrast.variant}",
-    )
-
-
 # --- faults ----------------------------------------------------------------------------------------------
 
 
@@ -204,19 +169,19 @@ def plot_faults(outcomes: Sequence[FaultOutcome]) -> Figure:
     """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said."""
     panels = [(kind, list(of)) for kind, of in groupby(outcomes, key=lambda o: o.fault.kind) if kind != CLEAN]
     rows = max(1, -(-len(panels) // _FAULT_COLUMNS))
-    with figure_context():
+    with style.figure_context():
         figure = Figure(figsize=(WIDTH, _LEGEND_HEIGHT + _PANEL_HEIGHT * rows), layout="constrained")
         every = figure.subplots(rows, _FAULT_COLUMNS, sharey=True, squeeze=False).ravel()
         for axes, (kind, of) in zip(every, panels, strict=False):
             _draw_fault(axes, kind, of)
         for axes in every[len(panels) :]:
             axes.set_visible(False)
-        ratios = np.concatenate([np.ones(1), *(known(o.runs["ratio"]) for o in outcomes)])
+        ratios = np.concatenate([np.ones(1), *(o.runs["ratio"].dropna() for o in outcomes)])
         every[0].set_yscale("log")
         every[0].set_ylim(ratios.min() / _ROOM, ratios.max() * _ROOM)
-        label_logarithms(every[0])
+        style.label_logarithms(every[0])
         figure.supylabel("rmse by that of the clean run")
-        shared_legend(figure, columns=_LEGEND_COLUMNS)
+        style.shared_legend(figure, columns=_LEGEND_COLUMNS)
     return figure
 
 
@@ -228,7 +193,7 @@ def _draw_fault(axes: Axes, kind: str, outcomes: Sequence[FaultOutcome]) -> None
         places = at + np.linspace(-spread, spread, len(runs))
         for place, *run in zip(places, runs["ratio"], runs["lost_at_end"] == 1.0, runs["told"], strict=True):
             _draw_faulty_run(axes, float(place), *run)
-    means = [(at, o.values()["ratio_mean"]) for at, o in enumerate(outcomes) if len(known(o.runs["ratio"]))]
+    means = [(at, o.runs["ratio"].mean()) for at, o in enumerate(outcomes) if o.runs["ratio"].notna().any()]
     if means:
         axes.plot(*np.array(means).T, color=BLUE, linewidth=0.9, label="mean", zorder=1)
     axes.set_xticks(range(len(outcomes)), [f"{outcome.fault.value:g}" for outcome in outcomes])
@@ -251,7 +216,6 @@ def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool
 
 
 def _broken(title: str) -> str:
-    """Return the title in two lines where it is long."""
     if len(title) <= _TITLE_LENGTH:
         return title
     cut = title.rfind(" ", 0, _TITLE_LENGTH)

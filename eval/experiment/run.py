@@ -1,9 +1,10 @@
 """Studies run in parallel; every finished cell is kept at once, so that one that was killed goes on."""
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,16 +12,25 @@ import pandas as pd
 
 from pathspace_graph.errors import InputError, OutputError
 from pathspace_graph.io.files import check_target, remove_manifest, to_plain, write_json
-from pathspace_graph.io.log import Log
 from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.overrides import flatten
 from pathspace_graph.io.parsing import read_json
 
-from .cells import Cell, Outcome, Record, Store, record_cell, record_of
-from .drives import Drive, NamedTrack, load_tracks, try_drive
+from .cells import (
+    Cell,
+    Drive,
+    NamedTrack,
+    Outcome,
+    Record,
+    load_tracks,
+    read_record,
+    record_cell,
+    record_of,
+    write_record,
+)
 from .frame import frame_of
 from .study import Study
-from .workers import check_jobs, outcomes, workers
+from .workers import WorkerDiedError, check_jobs, outcomes, workers
 
 FORMAT: Final = "pathspace-study/1"
 STUDY_FILE: Final = "study.json"
@@ -36,9 +46,7 @@ class Plan:
     """A study with its tracks and all of its cells."""
 
     study: Study
-    """The study."""
     tracks: tuple[NamedTrack, ...]
-    """Tracks of the study."""
     cells: tuple[Cell[Drive], ...]
     """Runs of the study, in the order of the results."""
 
@@ -67,19 +75,13 @@ def make_plan(study: Study) -> Plan:
     """Read and generate the tracks, and return the cells, grouped by the log that they share."""
     tracks, points = tuple(load_tracks(study.tracks)), study.points
     measured = {"marginals": True, "yardsticks": study.yardsticks}
-    drives = [
-        Drive(track, seed, noise, study.simulation(noise))
-        for noise in study.noise
-        for track in tracks
-        for seed in study.seeds
-    ]
-    cells = [
+    drives = product(study.noise, tracks, study.seeds)
+    cells = tuple(
         Cell(drive, estimator, settings, variant, measured)
-        for drive in drives
-        for estimator in study.estimators
-        for variant, settings in points.items()
-    ]
-    return Plan(study, tracks, tuple(cells))
+        for drive in (Drive(track, seed, noise, study.simulation(noise)) for noise, track, seed in drives)
+        for estimator, (variant, settings) in product(study.estimators, points.items())
+    )
+    return Plan(study, tracks, cells)
 
 
 def run_study(
@@ -111,14 +113,22 @@ def run_plan(
     """Do the same for a plan."""
     check_folder(out, plan)
     remove_manifest(out)  # of a study that goes on; the last step writes it again
-    store = Store(out)
-    remaining = [cell for cell in plan.cells if _is_missing(store.read(cell), retry_failed)]
+    remaining = [cell for cell in plan.cells if _is_missing(read_record(out, cell), retry_failed)]
     with workers(jobs, cluster) if remaining else nullcontext():
         write_json(out / STUDY_FILE, plan.resolved(), indent=1)
-        if remaining:
-            _run_cells(remaining, store, on_cell or (lambda done, total: None))
-    store.drop_logs()
-    return frame_of(plan.study, [(cell, store.read(cell)) for cell in plan.cells])
+        on_cell = on_cell or (lambda done, total: None)
+        on_cell(0, len(remaining))
+        for done, (cell, result) in enumerate(outcomes(record_cell, remaining), start=1):
+            if isinstance(result, WorkerDiedError):
+                write_record(out, cell, record_of(cell, Outcome.failed(cell, result)))
+            else:
+                write_record(out, cell, result)
+            on_cell(done, len(remaining))
+    return frame_of(plan.study, [(cell, read_record(out, cell)) for cell in plan.cells])
+
+
+def _is_missing(record: Record | None, retry_failed: bool) -> bool:
+    return record is None or (retry_failed and bool(record["failure"]))
 
 
 def check_folder(out: Path, plan: Plan) -> None:
@@ -144,51 +154,3 @@ def check_folder(out: Path, plan: Plan) -> None:
                 f"{file}: expected the study that is to be run, with {name} = {expected.get(name)}, "
                 f"found another, with {other.get(name)}"
             )
-
-
-def _is_missing(record: Record | None, retry_failed: bool) -> bool:
-    return record is None or (retry_failed and bool(record["failure"]))
-
-
-# --- work ------------------------------------------------------------------------------------------------
-
-
-def _run_cells(cells: Sequence[Cell[Drive]], store: Store, on_cell: OnCell) -> None:
-    """Simulate each log that is needed once, then run the cells; every result is kept at once."""
-    broken = _simulate(cells, store)
-    doomed = [cell for cell in cells if cell.drive.id in broken]
-    for cell in doomed:
-        store.write(cell, record_of(cell, Outcome.failed(cell, broken[cell.drive.id])))
-    on_cell(len(doomed), len(cells))
-    runnable = [cell for cell in cells if cell.drive.id not in broken]
-    work = outcomes(record_cell, runnable, _Logs(store).load)
-    for done, (cell, found) in enumerate(work, start=len(doomed) + 1):
-        record = found if isinstance(found, dict) else record_of(cell, Outcome.failed(cell, found))
-        store.write(cell, record)
-        on_cell(done, len(cells))
-
-
-def _simulate(cells: Sequence[Cell[Drive]], store: Store) -> dict[str, Exception]:
-    """Simulate and keep the missing logs, and return the errors of those that fail."""
-    drives = {cell.drive.id: cell.drive for cell in cells}
-    wanted = [drive for drive in drives.values() if not store.has_log(drive)]
-    broken: dict[str, Exception] = {}
-    for drive, log in outcomes(try_drive, wanted, lambda _: ()):
-        if isinstance(log, Exception):
-            broken[drive.id] = log
-        else:
-            store.write_log(drive, log)
-    return broken
-
-
-class _Logs:
-    """Logs from disk, one in memory at a time: cells are in the order of their logs."""
-
-    def __init__(self, store: Store) -> None:
-        self._store = store
-        self._kept: tuple[Drive, Log] | None = None
-
-    def load(self, cell: Cell[Drive]) -> tuple[Log]:
-        if self._kept is None or self._kept[0] is not cell.drive:
-            self._kept = (cell.drive, self._store.read_log(cell.drive))
-        return (self._kept[1],)

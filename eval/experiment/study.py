@@ -16,7 +16,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
 
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
-"""Folder of the studies that ship with the package."""
 DEFAULT: Final = "default"
 """Variant that overrides nothing, part of every study."""
 PRESET: Final = "preset"
@@ -36,7 +35,6 @@ class Baseline:
     """Combination that every other one is compared with, on the same track, seed and noise."""
 
     variant: str = DEFAULT
-    """Variant of the baseline."""
     estimator: str | None = None
     """Estimator of the baseline; without one, each estimator is compared with itself."""
 
@@ -48,13 +46,9 @@ class Study:
     tracks: tuple[Path | int, ...]
     """Track files, and seeds of generated tracks."""
     seeds: tuple[int, ...] = (0,)
-    """Seeds of the drives and their noise."""
     laps: int = 5
-    """Number of laps of each drive."""
     name: str = "study"
-    """Name of the study."""
     question: str = ""
-    """Question that the study answers."""
     estimators: tuple[str, ...] = (registry.DEFAULT,)
     """Estimators to run, online and batch ones; `all` stands for every one."""
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
@@ -127,11 +121,10 @@ class Study:
     @property
     def points(self) -> dict[str, MapperSettings]:
         """Settings to run by name; of variants with equal settings the first."""
-        distinct: dict[str, MapperSettings] = {}
+        first: dict[MapperSettings, str] = {}
         for name, settings in self._named().items():
-            if settings not in distinct.values():
-                distinct[name] = settings
-        return distinct
+            first.setdefault(settings, name)
+        return {name: settings for settings, name in first.items()}
 
     @property
     def baseline_variant(self) -> str:
@@ -142,9 +135,8 @@ class Study:
     @property
     def varied(self) -> tuple[str, ...]:
         """Dotted settings that any variant overrides."""
-        return tuple(
-            dict.fromkeys(name for group in (*self.variants.values(), *self.grids) for name in group)
-        )
+        groups = (*self.variants.values(), *self.grids)
+        return tuple(dict.fromkeys(name for group in groups for name in group))
 
     @property
     def varied_noise(self) -> tuple[str, ...]:
@@ -153,7 +145,6 @@ class Study:
         return tuple(name for name in names if not name.endswith(f".{PRESET}"))
 
     def _named(self) -> dict[str, MapperSettings]:
-        """Return the settings of every variant, also of those that come to the same."""
         points = {DEFAULT: MapperSettings()}
         for name, overrides in self.variants.items():
             points[name] = override(MapperSettings(), overrides, f"variants.{name}")
@@ -164,7 +155,6 @@ class Study:
 
 
 def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:
-    """Return every combination of the values by its name."""
     for name, values in grid.items():
         if not isinstance(values, list | tuple) or not values:
             raise SettingsError(f"grid.{name}: expected a list of values, found {shown(values)}")
@@ -216,7 +206,6 @@ def read_study(file: Path | str) -> Study:
 
 
 def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Study:
-    """Return the study with the content of a TOML file."""
     known = ["grid" if entry.name == "grids" else entry.name for entry in fields(Study)]
     for key in content:
         check_name(key, known, "expected a known key")
@@ -244,7 +233,6 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:
-    """Return a value of TOML that has to be of a kind."""
     if not isinstance(value, kind):
         expected = "a list" if kind is list else "text" if kind is str else "a table"
         raise SettingsError(f"{key}: expected {expected}, found {shown(value)}")

@@ -1,10 +1,8 @@
 """Tables as text, Markdown and LaTeX, and a study's own: differences from the baseline, columns by track."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 import pandas as pd
@@ -32,7 +30,6 @@ class TextTable:
     title: str
     """Sentence above the table, which may be empty."""
     header: tuple[str, ...]
-    """Title of every column."""
     rows: tuple[tuple[str, ...], ...]
     """Rows, each as long as the header."""
     groups: tuple[int, ...] = ()
@@ -40,7 +37,7 @@ class TextTable:
     names: int = 1
     """Number of first columns that are names."""
 
-    def parts(self, width: int) -> list[TextTable]:
+    def parts(self, width: int) -> list[Self]:
         """Return tables of at most `width` characters, each with the names and some of the other columns."""
         needed = [max(map(len, column)) + _BORDER for column in zip(self.header, *self.rows, strict=True)]
         shared = sum(needed[: self.names]) + 1
@@ -51,7 +48,7 @@ class TextTable:
             parts[-1].append(number)
         return [self._only([*range(self.names), *part]) for part in parts]
 
-    def _only(self, columns: Sequence[int]) -> TextTable:
+    def _only(self, columns: Sequence[int]) -> Self:
         rows = tuple(tuple(row[k] for k in columns) for row in self.rows)
         return replace(self, header=tuple(self.header[k] for k in columns), rows=rows)
 
@@ -96,6 +93,11 @@ class TextTable:
         return str(tabulate(rows, self.header, tablefmt=style, colalign=sides, disable_numparse=True))
 
 
+def group_starts(rows: Sequence[Sequence[str]]) -> tuple[int, ...]:
+    """Return the numbers of the rows whose first name is not that of the row before."""
+    return tuple(k for k in range(1, len(rows)) if rows[k][0] != rows[k - 1][0])
+
+
 # --- a study ---------------------------------------------------------------------------------------------
 
 SMALLEST_P: Final = 0.001
@@ -134,20 +136,14 @@ def _table(study: Study, frame: pd.DataFrame, key: str) -> TextTable:
     def row(contrast: Contrast) -> tuple[str, ...]:
         names = tuple(getattr(contrast, name) for name in several)
         value, difference = contrast.value, contrast.difference
+        by = ("baseline", "") if difference is None else _figures(difference, metric.factor, digits, "+")
+        p = "" if np.isnan(contrast.p) else f"{contrast.p:.3f}"
+        p = f"<{SMALLEST_P:g}" if contrast.p < SMALLEST_P else p
         figures = (str(value.count), *_figures(value, metric.factor, digits, ""))
-        if difference is None:
-            return (*names, *figures, "baseline", "", "", "")
-        by = _figures(difference, metric.factor, digits, "+")
-        return (*names, *figures, *by, _p(contrast.p), "*" if contrast.significant else "")
+        return (*names, *figures, *by, p, "*" if contrast.significant else "")
 
     rows = tuple(row(contrast) for contrast in contrasts(study, frame, key))
     return TextTable(metric.heading, header, rows, names=len(several))
-
-
-def _p(p: float) -> str:
-    if np.isnan(p):
-        return ""
-    return f"{p:.3f}" if p >= SMALLEST_P else f"<{SMALLEST_P:g}"
 
 
 def _figures(estimated: Estimate, factor: float, digits: int, sign: str) -> tuple[str, str]:
@@ -159,12 +155,10 @@ def _figures(estimated: Estimate, factor: float, digits: int, sign: str) -> tupl
 
 
 def as_text(tables: Sequence[TextTable], caption: str) -> str:
-    """Return the caption and the tables for a text file."""
     return "\n\n".join([caption, *(f"{table.title}\n{table.text()}" for table in tables)]) + "\n"
 
 
 def as_markdown(tables: Sequence[TextTable], caption: str) -> str:
-    """Return the caption and the tables in Markdown."""
     bold = (replace(table, title=f"**{table.title}**") for table in tables)
     return "\n".join([caption.replace("*", r"\*") + "\n", *(table.markdown() for table in bold)])
 
@@ -188,7 +182,6 @@ def track_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
 
 
 def _rows(columns: Sequence[Column], frame: pd.DataFrame) -> Iterator[tuple[str, ...]]:
-    """Yield a row of texts for each track, and those over all runs."""
     finished = frame.groupby([*RUN], sort=False)["failure"].first() == ""
     values = [_values(column, frame).reindex(finished.index) for column in columns]
     whole = (f"{int(finished.sum())} of {len(finished)}",)

@@ -1,7 +1,7 @@
 """Work is spread over processes or a cluster, and goes on when a worker dies."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar
@@ -48,10 +48,8 @@ def check_jobs(jobs: int) -> None:
         raise SettingsError(f"jobs: expected at least 1, or -1 for every core, found {jobs}")
 
 
-def outcomes(
-    work: Callable[..., R], items: Sequence[T], load: Callable[[T], tuple[Any, ...]]
-) -> Iterator[tuple[T, R | WorkerDiedError]]:
-    """Yield (item, `work(item, *load(item))`) in the order in which they finish; `work` must not raise.
+def outcomes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[tuple[T, R | WorkerDiedError]]:
+    """Yield (item, work(item)) in the order in which they finish; `work` must not raise.
 
     When a worker dies, nobody knows which item it had, so each item under way is tried again alone.
     """
@@ -59,46 +57,39 @@ def outcomes(
     while remaining:
         sent: list[int] = []
         try:
-            for index, result in _run(work, _tasks(remaining, load, sent)):
+            for index, result in _run(work, _noted(remaining, sent)):
                 yield remaining.pop(index), result
         except _deaths():
             for index in sent:
                 if index in remaining:
                     item = remaining.pop(index)
-                    yield item, _alone(work, item, load(item))
+                    yield item, _alone(work, item)
 
 
-def _tasks(
-    remaining: dict[int, T], load: Callable[[T], tuple[Any, ...]], sent: list[int]
-) -> Iterator[tuple[int, tuple[Any, ...]]]:
-    """Yield the remaining work a little ahead of the workers, and notes its indices in `sent`."""
+def _noted(remaining: dict[int, T], sent: list[int]) -> Iterator[tuple[int, T]]:
     for index, item in list(remaining.items()):
         sent.append(index)
-        yield index, (item, *load(item))
+        yield index, item
 
 
-def _run(
-    work: Callable[..., R], tasks: Iterator[tuple[int, tuple[Any, ...]]], **options: Any
-) -> Iterator[tuple[int, R]]:
+def _run(work: Callable[[T], R], tasks: Iterable[tuple[int, T]], **options: Any) -> Iterator[tuple[int, R]]:
     parallel = Parallel(return_as="generator_unordered", batch_size=1, **options)
-    yield from parallel(delayed(_numbered)(work, index, arguments) for index, arguments in tasks)
+    yield from parallel(delayed(_numbered)(work, index, item) for index, item in tasks)
 
 
-def _numbered(work: Callable[..., R], index: int, arguments: tuple[Any, ...]) -> tuple[int, R]:
-    return index, work(*arguments)
+def _numbered(work: Callable[[T], R], index: int, item: T) -> tuple[int, R]:
+    return index, work(item)
 
 
-def _alone(work: Callable[..., R], item: T, loaded: tuple[Any, ...]) -> R | WorkerDiedError:
+def _alone(work: Callable[[T], R], item: T) -> R | WorkerDiedError:
     try:
-        # one job would be done by this very process
-        ((_, result),) = _run(work, iter([(0, (item, *loaded))]), n_jobs=2)
+        ((_, result),) = _run(work, [(0, item)], n_jobs=2)  # one job would be done by this very process
     except _deaths() as error:
         return WorkerDiedError(f"the process that ran it died ({type(error).__name__})")
     return result
 
 
 def _deaths() -> tuple[type[Exception], ...]:
-    """Return the exceptions that mean that a worker died."""
     try:
         from distributed import KilledWorker  # noqa: PLC0415 - an extra
     except ImportError:

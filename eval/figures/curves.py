@@ -17,24 +17,8 @@ from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import curvature_weighted_breaks, fit_spline, refit
 
-from .style import (
-    BLUE,
-    DARK,
-    LIGHT,
-    ORANGE,
-    PURPLE,
-    THIN_WIDTH,
-    WIDTH,
-    draw_control_points,
-    draw_curve,
-    draw_ellipses,
-    draw_points,
-    figure_context,
-    normals,
-    point_blocks,
-    set_frame,
-    uncertainty_band,
-)
+from . import style
+from .style import BLUE, DARK, LIGHT, ORANGE, PURPLE, THIN_WIDTH, WIDTH
 
 # a curve swings to either side, and cones along it were seen but between two shares of its length (m)
 _CONTROL_POINTS, _SPACING, _SWING = 13, 5.5, 6.0
@@ -45,22 +29,21 @@ _SIGMA_BEND, _SIGMA_ANCHOR = 1.0, 2.0  # weak priors of second differences and o
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Curve with its standard deviation across itself, computed in three ways."""
+    """Curve with its standard deviation (m) across itself at n places, computed in three ways."""
 
     boundary: SplineBoundary
-    """Curve with the joint covariance of its control points."""
     cones: Array
     """(k, 2) Positions of the seen cones (m)."""
-    u: Array
-    """Parameters (n,) of all that follows."""
+    edges: tuple[Array, Array]
+    """2-sigma band (n, 2) on both sides (m)."""
     length: Array
-    """Lengths (n,) along the curve at the parameters (m)."""
+    """Lengths (n,) along the curve (m)."""
     joint: Array
-    """Standard deviations (n,) by the joint covariance, B Sigma B' (m)."""
+    """(n,) By the joint covariance, B Sigma B'."""
     marginals: Array
-    """Standard deviations (n,) by the paper's formula, the sum of beta_j^2 Sigma_j (m)."""
+    """(n,) By the paper's formula, the sum of beta_j^2 Sigma_j."""
     sampled: Array
-    """Standard deviations (n,) of the splines drawn at random (m)."""
+    """(n,) Of the splines drawn at random."""
     curves: Array
     """Points (s, n, 2) of the splines drawn at random (m)."""
 
@@ -73,26 +56,21 @@ def uncertainty(rng: np.random.Generator, samples: int = 2000) -> Uncertainty:
     share = (np.arange(_CONES) + 0.5) / _CONES
     seen = spline.parameters_at(spline.length() * share[(share < BLIND[0]) | (share > BLIND[1])])
     covariance = posterior(spline, seen, _SIGMA_DETECTION, _SIGMA_BEND, _SIGMA_ANCHOR)
-    u = np.linspace(*spline.domain, 301)
+    boundary, u = SplineBoundary(spline, covariance), np.linspace(*spline.domain, 301)
     drawn = rng.multivariate_normal(spline.control_points.ravel(), covariance, samples)
     curves = np.einsum("nm,smd->snd", spline.basis_matrix(u), drawn.reshape(samples, -1, 2))
-    across = np.einsum("snd,nd->sn", curves - spline.evaluate(u), normals(spline, u))
+    across = np.einsum("snd,nd->sn", curves - spline.evaluate(u), style.normals(spline, u))
+    without_cross_terms = covariance * np.kron(np.eye(spline.size), np.ones((2, 2)))
     return Uncertainty(
-        boundary=SplineBoundary(spline, covariance),
-        cones=spline.evaluate(seen),
-        u=u,
-        length=spline.arc_length(u),
+        boundary,
+        spline.evaluate(seen),
+        style.uncertainty_band(boundary, u),
+        spline.arc_length(u),
         joint=spline.normal_sigma(u, covariance),
-        marginals=marginal_sigma(spline, u, covariance),
+        marginals=spline.normal_sigma(u, without_cross_terms),
         sampled=across.std(axis=0),
         curves=curves,
     )
-
-
-def marginal_sigma(spline: BSpline, u: Array, covariance: Array) -> Array:
-    """Return sqrt(n' (sum_j beta_j(u)^2 Sigma_j) n) (k,), m: the paper's formula, without cross terms."""
-    own = covariance * np.kron(np.eye(spline.size), np.ones((2, 2)))
-    return spline.normal_sigma(u, own)
 
 
 def posterior(
@@ -103,47 +81,43 @@ def posterior(
     R maps control points to the displacement across the curve at the parameters `seen` (k,), and D to second
     differences. The sigmas are in m.
     """
-    rows = (spline.basis_matrix(seen)[:, :, None] * normals(spline, seen)[:, None, :]).reshape(len(seen), -1)
+    normals = style.normals(spline, seen)
+    rows = (spline.basis_matrix(seen)[:, :, None] * normals[:, None, :]).reshape(len(seen), -1)
     bend = np.kron(smoothness_matrix(greville(spline.knots, spline.degree), None), np.eye(2))
     information = rows.T @ rows / sigma_detection**2 + bend.T @ bend / sigma_bend**2
     return np.asarray(np.linalg.inv(information + np.eye(len(information)) / sigma_anchor**2))
 
 
-# --- figure ----------------------------------------------------------------------------------------------
-
 _SHOWN: Final = 40
 """Number of the splines drawn at random that are shown."""
 _EVERY: Final = 6
-"""Stride of the parameters at which the spread of the samples is marked."""
+"""Stride of the places at which the spread of the samples is marked."""
 
 
 def plot_uncertainty(data: Uncertainty) -> Figure:
     """Draw (a) the uncertainty of control points and curve, (b) its sigma across itself in three ways."""
-    with figure_context():
+    with style.figure_context():
         figure = Figure((WIDTH, 4.6), layout="constrained")
         above, below = figure.subplots(2, 1, height_ratios=(1.55, 1.0))
         _draw_curves(above, data)
         _draw_sigmas(below, data)
-        above.set_title("(a) uncertainty of the control points, and of the curve that they make")
-        below.set_title("(b) standard deviation across the curve")
     return figure
 
 
 def _draw_curves(axes: Axes, data: Uncertainty) -> None:
-    boundary, spline = data.boundary, data.boundary.spline
+    points = data.boundary.spline.control_points
     for number, curve in enumerate(data.curves[:_SHOWN]):
         label = None if number else "sampled splines"
         axes.plot(*curve.T, color=LIGHT, linewidth=THIN_WIDTH, zorder=1.5, label=label)
-    for number, edge in enumerate(uncertainty_band(boundary, data.u)):
-        label = None if number else "2σ band"
+    for edge, label in zip(data.edges, ("2σ band", None), strict=True):
         axes.plot(*edge.T, color=BLUE, linewidth=0.8, zorder=3, label=label)
-    draw_curve(axes, spline, BLUE, "spline")
-    draw_control_points(axes, spline.control_points, ORANGE, "control points, 2σ")
-    draw_ellipses(axes, spline.control_points, point_blocks(boundary.covariance), ORANGE)
-    draw_points(axes, data.cones, "x", DARK, "cones seen", zorder=5)
-    set_frame(axes, spline.control_points.min(axis=0) - 3.0, spline.control_points.max(axis=0) + 3.0)
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
+    style.draw_curve(axes, data.boundary.spline, BLUE, "spline")
+    style.draw_control_points(axes, points, ORANGE, "control points, 2σ")
+    style.draw_ellipses(axes, points, style.point_blocks(data.boundary.covariance), ORANGE)
+    style.draw_points(axes, data.cones, "x", DARK, "cones seen", zorder=5)
+    style.set_frame(axes, points.min(axis=0) - 3.0, points.max(axis=0) + 3.0)
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.set_title("(a) uncertainty of the control points, and of the curve that they make")
     axes.legend(loc="upper right")
 
 
@@ -152,13 +126,14 @@ def _draw_sigmas(axes: Axes, data: Uncertainty) -> None:
     marginals = r"marginals only, $\Sigma_j\, β_j^2 Σ_{C_j}$"
     axes.plot(data.length, data.marginals, color=ORANGE, linestyle="--", label=marginals)
     spread = np.stack([data.length, data.sampled], axis=1)[::_EVERY]
-    draw_points(axes, spread, ".", "black", f"spread of {len(data.curves)} sampled splines", zorder=2)
-    axes.set_xlim(0.0, data.length[-1])
-    axes.set_ylim(0.0, 1.25 * float(data.joint.max()))
-    axes.set_xlabel("length along the curve [m]")
-    axes.set_ylabel("σ [m]")
+    style.draw_points(axes, spread, ".", "black", f"spread of {len(data.curves)} sampled splines", zorder=2)
+    axes.set(xlim=(0.0, data.length[-1]), ylim=(0.0, 1.25 * float(data.joint.max())))
+    axes.set(xlabel="length along the curve [m]", ylabel="σ [m]")
+    axes.set_title("(b) standard deviation across the curve")
     axes.legend(loc="upper left", ncols=3)
 
+
+# --- simplification --------------------------------------------------------------------------------------
 
 # the left boundary of a generated track of some length (m) gets fewer control points
 _TRACK_SEED, _LAP_LENGTH = 3, (200.0, 260.0)
@@ -175,7 +150,6 @@ class Simplified:
 
     @property
     def rms(self) -> float:
-        """Return the root mean square of the distances (m)."""
         return root_mean_square(self.errors)
 
 
@@ -184,7 +158,6 @@ class Simplification:
     """The paper's simplification beside one that ignores curvature."""
 
     old: BSpline
-    """Curve of many control points."""
     length: Array
     """Lengths (n,) along the old curve at which the errors are taken (m)."""
     curvature: Array
@@ -204,26 +177,19 @@ def simplification() -> Simplification:
     points = old.evaluate(u)
 
     def simplified(settings: BreakSettings) -> Simplified:
-        curve = simplify_curve(old, _AFTER, settings)
+        empty = BSpline.periodic_from(
+            curvature_weighted_breaks(old, _AFTER, settings), np.zeros((_AFTER, 2)), old.degree
+        )
+        curve = empty.with_points(refit(old, empty).new_from_old @ old.distinct_control_points)
         return Simplified(curve, np.linalg.norm(points - closest_points(curve, points).position, axis=1))
 
     uniform = BreakSettings(baseline=1.0)
     return Simplification(old, length, old.curvature(u), simplified(BreakSettings()), simplified(uniform))
 
 
-def simplify_curve(old: BSpline, size: int, settings: BreakSettings) -> BSpline:
-    """Return the least-squares curve of `size` control points on curvature-weighted knots."""
-    breaks = curvature_weighted_breaks(old, size, settings)
-    empty = BSpline.periodic_from(breaks, np.zeros((size, 2)), old.degree)
-    return empty.with_points(refit(old, empty).new_from_old @ old.distinct_control_points)
-
-
-# --- figure ----------------------------------------------------------------------------------------------
-
-
 def plot_simplification(data: Simplification) -> Figure:
     """Draw (a) before, (b) after, (c) the distance between the two along the curve, (d) its curvature."""
-    with figure_context():
+    with style.figure_context():
         points = data.old.evaluate(np.linspace(*data.old.domain, 400))
         low, high = points.min(axis=0) - 6.0, points.max(axis=0) + 6.0
         width, height = high - low
@@ -231,24 +197,22 @@ def plot_simplification(data: Simplification) -> Figure:
         figure = Figure((WIDTH, panel_height + 3.0), layout="constrained")
         grid = figure.add_gridspec(3, 2, height_ratios=(panel_height, 1.1, 0.7))
         before, after = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
-        _draw_closed(before, data.old, "(a) before", BLUE)
-        _draw_closed(after, data.weighted.curve, "(b) after", PURPLE)
-        draw_curve(after, data.old, DARK, width=0.8, linestyle="--", zorder=3.5)
-        for axes in (before, after):
-            set_frame(axes, low, high)
-            axes.set_xlabel("x [m]")
+        new = data.weighted.curve
+        for axes, spline, title, color in (
+            (before, data.old, "(a) before", BLUE),
+            (after, new, "(b) after", PURPLE),
+        ):
+            style.draw_curve(axes, spline, color)
+            style.draw_control_points(axes, ring(spline.distinct_control_points), color)
+            style.set_frame(axes, low, high)
+            axes.set(xlabel="x [m]", title=f"{title}: {spline.size} control points")
+        style.draw_curve(after, data.old, DARK, width=0.8, linestyle="--", zorder=3.5)
         before.set_ylabel("y [m]")
         after.tick_params(labelleft=False)
         errors = figure.add_subplot(grid[1, :])
         _draw_errors(errors, data)
         _draw_curvature(figure.add_subplot(grid[2, :], sharex=errors), data)
     return figure
-
-
-def _draw_closed(axes: Axes, spline: BSpline, title: str, color: str) -> None:
-    draw_curve(axes, spline, color)
-    draw_control_points(axes, ring(spline.distinct_control_points), color)
-    axes.set_title(f"{title}: {spline.size} control points")
 
 
 def _draw_errors(axes: Axes, data: Simplification) -> None:
@@ -259,11 +223,9 @@ def _draw_errors(axes: Axes, data: Simplification) -> None:
         errors_cm = 100.0 * simplified.errors
         label = f"{name}: rms {100 * simplified.rms:.1f} cm, largest {errors_cm.max():.1f} cm"
         axes.plot(data.length, errors_cm, color=color, linestyle=line, linewidth=0.9, label=label)
-    axes.set_xlim(0.0, data.old.length())
-    axes.set_ylim(0.0, 170.0 * float(data.uniform.errors.max()))
-    axes.set_ylabel("distance [cm]")
+    axes.set(xlim=(0.0, data.old.length()), ylim=(0.0, 170.0 * float(data.uniform.errors.max())))
+    axes.set(ylabel="distance [cm]", title="(c) distance between before and after")
     axes.tick_params(labelbottom=False)
-    axes.set_title("(c) distance between before and after")
     axes.legend(loc="upper right")
 
 
@@ -271,8 +233,7 @@ def _draw_curvature(axes: Axes, data: Simplification) -> None:
     axes.fill_between(data.length, np.abs(data.curvature), color=LIGHT, linewidth=0.0)
     knots = data.old.arc_length(data.weighted.curve.breaks)
     on_axis = np.stack([knots, np.zeros(len(knots))], axis=1)
-    draw_points(axes, on_axis, "|", PURPLE, markersize=9.0, clip_on=False)
+    style.draw_points(axes, on_axis, "|", PURPLE, markersize=9.0, clip_on=False)
     axes.set_ylim(0.0)
-    axes.set_xlabel("length along the curve [m]")
-    axes.set_ylabel("curvature\n[1/m]")
+    axes.set(xlabel="length along the curve [m]", ylabel="curvature\n[1/m]")
     axes.set_title("(d) curvature, and the knots that follow it")

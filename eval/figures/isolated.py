@@ -1,23 +1,297 @@
-"""The paper's isolated tests as figures, each with a caption that says what it shows."""
+"""The paper's isolated tests as figures: expansion and fit, and all of them with captions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.linalg import block_diag
 
+from pathspace_graph.ckf.expansion import beyond_end, proximity_chain
+from pathspace_graph.ckf.update import SplineMeasurement, fit_detections
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.files import atomic_folder
+from pathspace_graph.io.map import SplineBoundary
+from pathspace_graph.mapping.belief import cubature_points, square_root
+from pathspace_graph.settings.batch import CkfSettings
+from pathspace_graph.sim.curves import left_normals, unit
+from pathspace_graph.spline.bspline import BSpline, end_change_matrix
+from pathspace_graph.spline.knots import fit_spline
 
-from .curves import plot_simplification, plot_uncertainty, simplification, uncertainty
-from .style import save_figures
-from .updates import expansion, fit, plot_expansion, plot_fit
+from . import style
+from .curves import plot_simplification, plot_uncertainty, posterior, simplification, uncertainty
+from .style import BLUE, DARK, GREEN, LIGHT, MARKER_SIZE, ORANGE, PURPLE, RED, THIN_WIDTH, WIDTH
+
+# a curve ends at the origin, on a left bend that it leaves to the outside by a share of its length (m)
+_RADIUS, _DRIFT = 30.0, 0.03
+_POINTS, _SPACING = 6, 3.0
+_SIGMA_KNOWN, _SIGMA_BEND, _SIGMA_ANCHOR = 0.3, 0.5, 1.0  # what the curve was made of, and weak priors
+# detections lie on it and beyond its end, at these lengths along the bend and to the inside of it (m)
+_ALONG, _INSIDE = (-5.5, -2.6, 2.2, 4.6, 7.0), (0.1, 0.25, 0.3, 0.05, 0.2)
+SIGMA_DETECTION = 0.2
+_SETTINGS = CkfSettings(threshold=2.0, separation=2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """The three steps, on a curve with the joint covariance of its control points."""
+
+    detections: Array
+    """(m, 2) Positions (m)."""
+    expands: BoolArray
+    """(m,) Detections that mark an expansion of the curve in step (a)."""
+    order: IntArray
+    """Proximity chain of those detections; the curve is extended to the last one."""
+    before: SplineBoundary
+    extended: SplineBoundary
+    updated: SplineBoundary
+
+
+def expansion() -> Expansion:
+    """Classify the detections, extend the curve to the last of their chain, update it with the others."""
+    before = _known_curve()
+    detections = _on_bend(np.array(_ALONG), np.array(_INSIDE))
+    covariances = np.tile(SIGMA_DETECTION**2 * np.eye(2), (len(detections), 1, 1))
+    spline, high = before.spline, before.spline.domain[1]
+    foot_u = spline.foot_points(detections).u
+    expands = beyond_end(detections, foot_u, high, spline.control_points, _SETTINGS)
+    beyond = np.flatnonzero(expands)
+    order = beyond[proximity_chain(detections[beyond], spline.control_points[-1])]
+    extended = extend(before, detections[order[-1]], covariances[order[-1]])
+    others = np.arange(len(detections)) != order[-1]
+    updated = update(extended, detections[others], covariances[others])
+    return Expansion(detections, expands, order, before, extended, updated)
+
+
+def extend(boundary: SplineBoundary, detection: Array, covariance: Array) -> SplineBoundary:
+    """Unclamp the curve, append the detection (2,), (2, 2) as last control point, and clamp it there."""
+    spline = boundary.spline
+    longer = spline.extend_to(detection)
+    change = np.kron(end_change_matrix(spline.knots, spline.degree, longer.knots), np.eye(2))
+    return SplineBoundary(longer, block_diag(change @ boundary.covariance @ change.T, covariance))
+
+
+def update(boundary: SplineBoundary, detections: Array, covariances: Array) -> SplineBoundary:
+    """Do one Kalman update of the control points with S_z of detections (m, 2), (m, 2, 2), map frame."""
+    spline, n = boundary.spline, boundary.size
+    basis = spline.basis_matrix(spline.foot_points(detections).u)
+    measurement = fit_detections(basis, detections, covariances, spline.control_points, CkfSettings())
+    combine = np.kron(measurement.range_basis(), np.eye(2)).T
+    H = combine @ np.kron(measurement.taken, np.eye(2))
+    R = combine @ measurement.covariance @ combine.T
+    P = boundary.covariance
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    innovation = combine @ (measurement.points - spline.control_points).ravel()
+    points = spline.control_points + (gain @ innovation).reshape(n, 2)
+    keep = np.eye(2 * n) - gain @ H
+    return SplineBoundary(spline.with_points(points), keep @ P @ keep.T + gain @ R @ gain.T)
+
+
+def _known_curve() -> SplineBoundary:
+    """Return a clamped curve along the bend that drifts to its outside and ends beside the origin."""
+    count = _POINTS
+    along = np.linspace(-_SPACING * count, 0.0, 2 * count + 1)
+    row = _on_bend(along, -_DRIFT * (along - along[0]))
+    spline = fit_spline(row, count, periodic=False)
+    seen = np.linspace(*spline.domain, 2 * count)
+    covariance = posterior(spline, seen, _SIGMA_KNOWN, _SIGMA_BEND, _SIGMA_ANCHOR)
+    return SplineBoundary(spline, covariance)
+
+
+def _on_bend(along: Array, inside: Array) -> Array:
+    """Return points (m, 2) of a left bend that passes the origin eastward, m."""
+    angle = along / _RADIUS
+    r = _RADIUS - inside
+    return np.stack([r * np.sin(angle), _RADIUS - r * np.cos(angle)], axis=1)
+
+
+def plot_expansion(data: Expansion) -> Figure:
+    """Draw (a) classified detections, (b) the curve extended to the last of their chain, (c) the update."""
+    interpolated = np.arange(len(data.detections)) == data.order[-1]
+    steps = (
+        ("(a) detections beyond the end expand the curve, the others update it", data.before, None),
+        (
+            "(b) the curve is extended to the last of their chain; the others update it too",
+            data.extended,
+            data.before,
+        ),
+        ("(c) the curve after the update", data.updated, data.extended),
+    )
+    with style.figure_context():
+        figure = Figure((WIDTH, 7.4), layout="compressed")
+        panels = figure.subplots(3, 1, sharex=True)
+        for axes, (title, boundary, before) in zip(panels, steps, strict=True):
+            _draw_step(axes, data, boundary, data.expands if before is None else interpolated)
+            if before is None:
+                _draw_chain(axes, data)
+            else:
+                look: dict[str, Any] = {"linestyle": "--", "zorder": 3.5}
+                style.draw_curve(axes, before.spline, DARK, "spline before the step", 0.9, **look)
+            axes.set(ylabel="y [m]", title=title)
+        panels[2].set_xlabel("x [m]")
+        style.shared_legend(figure, 4)
+        style.fit_height(figure)
+    return figure
+
+
+def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: BoolArray) -> None:
+    color, name = (PURPLE, "updated spline") if boundary is data.updated else (BLUE, "spline")
+    style.draw_band(axes, boundary, color, f"{name}, 2σ", zorder=1)
+    style.draw_curve(axes, boundary.spline, color, name)
+    style.draw_control_points(axes, boundary.spline.control_points, color, f"{name}, control points")
+    for chosen, of, text in (
+        (~expands, GREEN, "detections that update, 2σ"),
+        (expands, RED, "detections that expand, 2σ"),
+    ):
+        points = data.detections[chosen]
+        style.draw_ellipses(axes, points, np.tile(SIGMA_DETECTION**2 * np.eye(2), (len(points), 1, 1)), of)
+        style.draw_points(axes, points, "o", of, text)
+    shown = np.concatenate([data.detections, data.updated.spline.control_points])
+    style.set_frame(axes, shown.min(axis=0) - 1.0, shown.max(axis=0) + 0.8)
+
+
+def _draw_chain(axes: Axes, data: Expansion) -> None:
+    chain = np.concatenate([data.before.spline.control_points[-1:], data.detections[data.order]])
+    axes.plot(*chain.T, color=RED, linewidth=0.8, linestyle=":", zorder=2, label="proximity chain")
+
+
+# a curve swings to either side; detections lie to its left, at shares of its length (m)
+_SHAPE = (9, 3.5, 3.0)  # number of control points, their distance, swing
+_SHARES, _OFFSETS = (0.36, 0.47, 0.58, 0.68), (0.5, 1.2, 1.3, 0.6)
+_SIGMAS, _VEHICLE = (0.45, 0.15), (2.0, 5.5)  # along the ray from the vehicle and across it
+RIDGE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The four steps."""
+
+    curve: BSpline
+    """S_mu, the state's curve."""
+    detections: Array
+    """(m, 2) Positions z (m)."""
+    covariances: Array
+    """(m, 2, 2), m^2."""
+    foot_u: Array
+    """Parameters (m,) of the closest points."""
+    basis: Array
+    """B (m, n), the basis functions at the closest points."""
+    sigma_points: Array
+    """Sigma points X (4 m, m, 2) of the detections (m)."""
+    fitted_points: Array
+    """Control points Z (4 m, n, 2) fitted to each sigma point (m)."""
+    measurement: SplineMeasurement
+    """S_z."""
+
+    @property
+    def fitted(self) -> BSpline:
+        return self.curve.with_points(self.measurement.points)
+
+
+def fit() -> Fit:
+    """Compute C = C_mu + (B' B + L)^-1 B' (y - B C_mu) of the detections and of their sigma points."""
+    count, spacing, swing = _SHAPE
+    x = spacing * np.arange(count)
+    points = np.stack([x, -swing * np.cos(2.0 * np.pi * x / x[-1])], axis=1)
+    curve = BSpline.open_uniform(points, interval=spacing).clamp()
+    beside = curve.parameters_at(np.array(_SHARES) * curve.length())
+    detections = curve.evaluate(beside) + np.array(_OFFSETS)[:, None] * style.normals(curve, beside)
+    covariances = _ray_covariances(detections - np.array(_VEHICLE), _SIGMAS)
+    foot_u = curve.foot_points(detections).u
+    basis = curve.basis_matrix(foot_u)
+    settings = CkfSettings(ridge=RIDGE)
+    measurement = fit_detections(basis, detections, covariances, curve.control_points, settings)
+    root = square_root(block_diag(*covariances))
+    sigma_points = cubature_points(detections.ravel(), root).reshape(-1, *detections.shape)
+    innovations = sigma_points - basis @ curve.control_points
+    fitted_points = curve.control_points + np.einsum("nm,kmd->knd", measurement.gain, innovations)
+    return Fit(curve, detections, covariances, foot_u, basis, sigma_points, fitted_points, measurement)
+
+
+def _ray_covariances(rays: Array, sigmas: tuple[float, float]) -> Array:
+    """Return covariances (m, 2, 2), m^2, of standard deviations (m) along each ray (m, 2) and across it."""
+    along = unit(rays)
+    parts = zip(sigmas, (along, left_normals(along)), strict=True)
+    return np.asarray(sum(s**2 * v[:, :, None] * v[:, None, :] for s, v in parts))
+
+
+_INVISIBLE: Final = 1e-3
+"""Value of a basis function below which it can't be seen."""
+_DETECTIONS: Final = "detections $z$ (a: 2σ)"
+_DIAMOND: Final = 0.8 * MARKER_SIZE
+
+
+def plot_fit(data: Fit) -> Figure:
+    """Draw (a) closest points, (b) sigma points and their fits, (c) S_z, (d) the basis functions there."""
+    with style.figure_context():
+        figure = Figure((WIDTH, 4.0), layout="compressed")
+        closest, sigma, fitted, basis = figure.subplots(2, 2).flat
+        for axes in (closest, sigma, fitted):
+            style.draw_curve(axes, data.curve, BLUE, r"$S_\mu$")
+        _draw_closest(closest, data)
+        _draw_sigma_points(sigma, data)
+        _draw_fitted(fitted, data)
+        _draw_basis(basis, data)
+        shown = np.concatenate([data.curve.control_points, data.detections])
+        low = shown.min(axis=0) - np.array([1.0, 1.6])
+        high = shown.max(axis=0) + np.array([1.0, 1.9])
+        for axes in (closest, sigma, fitted):
+            style.draw_points(axes, data.detections, "o", GREEN, _DETECTIONS)
+            style.set_frame(axes, low, high)
+            axes.set(xlabel="x [m]", ylabel="y [m]")
+        width, height = high - low
+        basis.set_box_aspect(height / width)
+        style.shared_legend(figure, 5)
+        style.fit_height(figure)
+    return figure
+
+
+def _draw_closest(axes: Axes, data: Fit) -> None:
+    style.draw_control_points(axes, data.curve.control_points, BLUE, r"$C_\mu$")
+    nearest = data.curve.evaluate(data.foot_u)
+    for ends in np.stack([data.detections, nearest], axis=1):
+        axes.plot(*ends.T, color=DARK, linewidth=0.7, zorder=4)
+    style.draw_ellipses(axes, data.detections, data.covariances, GREEN)
+    style.draw_points(axes, nearest, "D", ORANGE, "closest points", markersize=_DIAMOND)
+    axes.set_title("(a) closest points on the state's curve")
+
+
+def _draw_sigma_points(axes: Axes, data: Fit) -> None:
+    for number, points in enumerate(data.fitted_points):
+        label = None if number else "splines $Z$"
+        style.draw_curve(axes, data.curve.with_points(points), LIGHT, label, THIN_WIDTH, zorder=2)
+    style.draw_points(axes, data.sigma_points.reshape(-1, 2), ".", RED, "sigma points $X$", zorder=5)
+    axes.set_title("(b) sigma points, and a fit to each")
+
+
+def _draw_fitted(axes: Axes, data: Fit) -> None:
+    points = data.measurement.points
+    style.draw_curve(axes, data.fitted, PURPLE, "$S_z$", zorder=3.5)
+    style.draw_control_points(axes, points, PURPLE, "$C_z$, 2σ")
+    style.draw_ellipses(axes, points, style.point_blocks(data.measurement.covariance), PURPLE)
+    axes.set_title("(c) $S_z$: their mean and covariance")
+
+
+def _draw_basis(axes: Axes, data: Fit) -> None:
+    u = np.linspace(*data.curve.domain, 400)
+    for j, values in enumerate(data.curve.basis_matrix(u).T):
+        color = PURPLE if data.basis[:, j].sum() > _INVISIBLE else LIGHT
+        axes.plot(np.where(values > _INVISIBLE, u, np.nan), values, color=color, linewidth=0.9, zorder=2)
+    rows, columns = np.nonzero(data.basis > _INVISIBLE)
+    values = np.stack([data.foot_u[rows], data.basis[rows, columns]], axis=1)
+    style.draw_points(axes, values, "D", ORANGE, "basis at the closest points", markersize=_DIAMOND, zorder=3)
+    for foot in data.foot_u:
+        axes.axvline(foot, color=ORANGE, linewidth=0.7, linestyle=":", zorder=1)
+    axes.set(xlim=data.curve.domain, ylim=(0.0, 1.0), xlabel="parameter $u$ [m]", ylabel="basis $β_j(u)$")
+    axes.set_title("(d) basis: how freely each control point moves")
+
 
 MARKER: Final = "captions.md"
 """File by which a folder of these figures is known."""
 _SEED: Final = 0
-"""Seed of the splines that are drawn at random."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +299,6 @@ class IsolatedFigure:
     """Figure with a name and a caption."""
 
     name: str
-    """Name of the figure's files."""
     make: Callable[[], tuple[Figure, str]]
     """Function that computes and draws the figure, and returns its caption with its numbers."""
 
@@ -77,7 +350,6 @@ FIGURES: Final = (
     IsolatedFigure("fit", _fit),
     IsolatedFigure("simplification", _simplification),
 )
-"""All figures, in the paper's order."""
 
 
 def write_figures(out: Path, on_figure: Callable[[], None] = lambda: None) -> None:
@@ -86,7 +358,7 @@ def write_figures(out: Path, on_figure: Callable[[], None] = lambda: None) -> No
     with atomic_folder(out, MARKER) as folder:
         for isolated in FIGURES:
             figure, caption = isolated.make()
-            save_figures(folder, {isolated.name: figure})
+            style.save_figures(folder, {isolated.name: figure})
             captions.append(f"![{isolated.name}]({isolated.name}.png)\n\n{caption}\n")
             on_figure()
         (folder / MARKER).write_text("\n".join(captions), encoding="utf-8")

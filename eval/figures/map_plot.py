@@ -1,4 +1,4 @@
-"""A picture of a map: boundaries with their 2-sigma band, control points, trajectory, truth if known."""
+"""Pictures of a map, with its 2-sigma band and the truth if known, and of a log before it is mapped."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,32 +11,16 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.odometry import integrate_poses
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
-from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, RIGHT
+from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, POINTS, RIGHT, UNKNOWN
 
-from .style import (
-    BLUE,
-    DARK,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    RED,
-    SIGMAS,
-    WIDTH,
-    Picture,
-    draw_band,
-    draw_control_points,
-    draw_curve,
-    draw_ellipses,
-    draw_points,
-    figure_context,
-    grouped_legend,
-    point_blocks,
-    set_frame,
-)
+from . import style
+from .style import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, RED, WIDTH, Picture
 
 MARGIN: Final = 3.0
 """Free space around what is drawn (m)."""
@@ -51,7 +35,6 @@ BOUNDARY_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
 """Colours of the boundaries, those of their cones; yellow is amber, which can be seen on white paper."""
 TRAJECTORY_COLOR: Final = GREEN
 HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
-"""Colours of the trajectory where it is not good."""
 BAND_ALPHA: Final = 0.35
 
 TENTATIVE_DASHES: Final = (0, (4, 2))
@@ -63,11 +46,9 @@ class MapStyle:
     """Line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
 
     curve_width: float = 0.7
-    """Width of boundaries."""
     path_width: float = 0.6
     """Width of the trajectory; the true path is thinner."""
     marker_size: float = 2.6
-    """Size of cones and control points."""
     landmark_size: float = 1.4
     """Size of landmarks, small enough for their ellipses to be seen."""
     widest_band: float = np.inf
@@ -99,7 +80,7 @@ def plot_map(
     """
     if not band_scale > 0.0:
         raise SettingsError(f"band_scale: expected a positive number, found {band_scale}")
-    with figure_context():
+    with style.figure_context():
         figure = Picture(layout="constrained")
         axes = figure.add_subplot()
         # the legend names what is drawn first before the rest; zorder decides what lies on top
@@ -121,90 +102,88 @@ def plot_map(
 
 
 def draw_boundary(
-    axes: Axes, boundary: MapBoundary, label: int, style: MapStyle, band_scale: float = 1.0
+    axes: Axes, boundary: MapBoundary, label: int, look: MapStyle, band_scale: float = 1.0
 ) -> None:
     """Draw a curve with its band and control points, or landmarks with their ellipses, in the map frame."""
     if isinstance(boundary, PointBoundary):
-        _draw_landmarks(axes, boundary, label, style, band_scale)
+        _draw_landmarks(axes, boundary, label, look, band_scale)
     else:
-        _draw_spline(axes, boundary, label, style, band_scale)
+        _draw_spline(axes, boundary, label, look, band_scale)
 
 
-def _draw_spline(
-    axes: Axes, boundary: SplineBoundary, label: int, style: MapStyle, band_scale: float
-) -> None:
+def _draw_spline(axes: Axes, boundary: SplineBoundary, label: int, look: MapStyle, band_scale: float) -> None:
     color, name, spline = BOUNDARY_COLORS[label], NAMES[label], boundary.spline
     text = f"{name} {_band_name(band_scale)}"
     if boundary.covariance.size:  # the outline of a map has none
-        draw_band(axes, boundary, color, text, band_scale, BAND_ALPHA, widest=style.widest_band)
+        style.draw_band(axes, boundary, color, text, band_scale, look.widest_band, alpha=BAND_ALPHA)
     until = boundary.confirmed_until
-    draw_curve(axes, spline, color, f"{name} boundary", style.curve_width, (-np.inf, until), zorder=4)
+    style.draw_curve(axes, spline, color, f"{name} boundary", look.curve_width, (-np.inf, until), zorder=4)
     if until < spline.domain[1]:
         text, dashed = f"{name} tentative", {"linestyle": TENTATIVE_DASHES, "zorder": 4}
-        draw_curve(axes, spline, color, text, style.curve_width, (until, np.inf), **dashed)
-    squares = {"markersize": style.marker_size, "markeredgewidth": 0.6, "zorder": 5}
+        style.draw_curve(axes, spline, color, text, look.curve_width, (until, np.inf), **dashed)
+    squares = {"markersize": look.marker_size, "markeredgewidth": 0.6, "zorder": 5}
     points, text = spline.distinct_control_points, f"{name} control points"
-    draw_control_points(axes, points, color, text, polygon=False, **squares)
+    style.draw_control_points(axes, points, color, text, polygon=False, **squares)
 
 
 def _draw_landmarks(
-    axes: Axes, boundary: PointBoundary, label: int, style: MapStyle, band_scale: float
+    axes: Axes, boundary: PointBoundary, label: int, look: MapStyle, band_scale: float
 ) -> None:
     color, name = BOUNDARY_COLORS[label], NAMES[label]
     area = {"alpha": BAND_ALPHA, "linewidth": 0.0}
-    own = point_blocks(boundary.covariance)
-    draw_ellipses(axes, boundary.points, own, color, band_scale, zorder=2, **area)
+    own = style.point_blocks(boundary.covariance)
+    style.draw_ellipses(axes, boundary.points, own, color, band_scale, zorder=2, **area)
     # a collection of ellipses has no key of its own in a legend: an empty patch lends it one
     key = PathPatch(Outline(np.zeros((0, 2))), facecolor=color, **area)
     key.set_label(f"{name} {_band_name(band_scale, 'ellipses')}")
     axes.add_patch(key)
-    size = style.landmark_size
-    draw_points(axes, boundary.points, "o", color, f"{name} landmarks", markersize=size, zorder=4)
+    size = look.landmark_size
+    style.draw_points(axes, boundary.points, "o", color, f"{name} landmarks", markersize=size, zorder=4)
 
 
-def draw_orange(axes: Axes, points: Array, label: int, style: MapStyle) -> None:
+def draw_orange(axes: Axes, points: Array, label: int, look: MapStyle) -> None:
     """Draw orange cones (n, 2) as triangles, those of gates larger, map frame (m)."""
-    size = (2.0 if label == BIG_ORANGE else 1.2) * style.landmark_size
+    size = (2.0 if label == BIG_ORANGE else 1.2) * look.landmark_size
     name = NAMES[label].replace("_", " ")
-    draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
+    style.draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
 
 
 def _band_name(scale: float, shape: str = "band") -> str:
     exaggerated = "" if scale == 1.0 else f" (drawn {scale:g}× as wide)"
-    return f"{SIGMAS:g}σ {shape}{exaggerated}"
+    return f"{style.SIGMAS:g}σ {shape}{exaggerated}"
 
 
-def draw_trajectory(axes: Axes, trajectory: Array, style: MapStyle, label: str = "trajectory") -> None:
+def draw_trajectory(axes: Axes, trajectory: Array, look: MapStyle, label: str = "trajectory") -> None:
     """Draw poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
-    line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": style.path_width, "zorder": 3}
+    line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": look.path_width, "zorder": 3}
     axes.plot(*trajectory[:, :2].T, label=label, **line)
 
 
-def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], style: MapStyle) -> None:
+def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], look: MapStyle) -> None:
     """Draw the parts of the trajectory again that were degraded or lost, each in its colour."""
     for condition, color in HEALTH_COLORS.items():
         chosen = np.array([word == condition for word in health], bool)
         if len(chosen) != len(trajectory) or not chosen.any():
             continue
-        line: dict[str, Any] = {"color": color, "linewidth": 2.0 * style.path_width, "zorder": 3.2}
+        line: dict[str, Any] = {"color": color, "linewidth": 2.0 * look.path_width, "zorder": 3.2}
         x, y = np.where(chosen[:, None], trajectory[:, :2], np.nan).T
         axes.plot(x, y, label=condition, **line)
 
 
-def draw_truth(axes: Axes, truth: Truth, style: MapStyle) -> None:
+def draw_truth(axes: Axes, truth: Truth, look: MapStyle) -> None:
     """Draw the true path dashed and the true cones as crosses, as far as they are known, map frame (m)."""
     if len(truth.poses):
-        line: dict[str, Any] = {"linewidth": 0.6 * style.path_width, "linestyle": (0, (5, 3)), "zorder": 3.5}
+        line: dict[str, Any] = {"linewidth": 0.6 * look.path_width, "linestyle": (0, (5, 3)), "zorder": 3.5}
         axes.plot(*truth.poses[:, :2].T, color=TRUTH_COLOR, label="true path", **line)
     if len(truth.cones):
-        cross = {"markersize": style.marker_size, "markeredgewidth": 0.6}
-        draw_points(axes, truth.cones, "x", TRUTH_COLOR, "true cones", **cross)
+        cross = {"markersize": look.marker_size, "markeredgewidth": 0.6}
+        style.draw_points(axes, truth.cones, "x", TRUTH_COLOR, "true cones", **cross)
 
 
-def draw_start(axes: Axes, style: MapStyle) -> None:
+def draw_start(axes: Axes, look: MapStyle) -> None:
     """Mark the origin of the map frame, where the vehicle stood first, heading along x."""
-    size = 2.0 * style.marker_size
-    draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
+    size = 2.0 * look.marker_size
+    style.draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
 
 
 def finish(figure: Figure, axes: Axes, title: str | None) -> None:
@@ -213,11 +192,51 @@ def finish(figure: Figure, axes: Axes, title: str | None) -> None:
     axes.autoscale_view()
     drawn = np.array([axes.get_xlim(), axes.get_ylim()])
     low, high = drawn[:, 0] - MARGIN, drawn[:, 1] + MARGIN
-    set_frame(axes, low, high)
+    style.set_frame(axes, low, high)
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     if title:
         axes.set_title(title)
-    grouped_legend(figure)
+    style.grouped_legend(figure)
     width, height = high - low
     figure.set_size_inches(WIDTH, min(_MAX_HEIGHT, WIDTH * height / width + _LABELS_HEIGHT))
+
+
+LABEL_COLORS = {**BOUNDARY_COLORS, UNKNOWN: GREY, **dict.fromkeys(POINTS, RED)}
+
+
+def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
+    """Draw where the odometry alone leads, the detections seen from there, and the truth if it is known.
+
+    Dead reckoning drifts: laps lie beside each other, and the detections of a cone apart.
+    """
+    odometry, stamps = log.odometry, np.array([cycle.t for cycle in log.cycles])
+    poses = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
+    poses = np.concatenate([np.zeros((1, 3)), poses])
+    with style.figure_context():
+        figure = style.Picture(layout="constrained")
+        axes = figure.add_subplot()
+        # a cycle lies between two odometry stamps: its pose is interpolated, which a picture can bear
+        at = np.column_stack([np.interp(stamps, odometry.t, column) for column in poses.T])
+        _draw_detections(axes, log, at)
+        line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": WHOLE_TRACK.path_width, "zorder": 3}
+        axes.plot(*poses[:, :2].T, label="odometry alone", **line)
+        if log.truth is not None:
+            draw_truth(axes, log.truth, WHOLE_TRACK)
+        draw_start(axes, WHOLE_TRACK)
+        finish(figure, axes, title)
+    return figure
+
+
+def _draw_detections(axes: Axes, log: Log, poses: Array) -> None:
+    """Draw the detections of all cycles, seen from the poses (n, 3) of the cycles."""
+    counts = [len(cycle.labels) for cycle in log.cycles]
+    seen = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)])
+    points = to_map(seen, np.repeat(poses, counts, axis=0))
+    labels: IntArray = np.concatenate([np.zeros(0, int), *(cycle.labels for cycle in log.cycles)])
+    for label, color in LABEL_COLORS.items():
+        if (labels == label).any():
+            text = f"{NAMES[label].replace('_', ' ')} detections"
+            style.draw_points(
+                axes, points[labels == label], ".", color, text, markersize=1.2, zorder=2, alpha=0.4
+            )

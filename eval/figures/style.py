@@ -27,14 +27,9 @@ from pathspace_graph.spline.bspline import BSpline
 
 WIDTH: Final = 7.0
 """Width of a figure (in): two columns of a paper."""
-FONT_SIZE: Final = 8.0
-"""Size of text (pt)."""
-LEGEND_SIZE: Final = 7.5
-"""Size of the text of a legend (pt)."""
-CURVE_WIDTH: Final = 1.3
-"""Width of a curve (pt)."""
-THIN_WIDTH: Final = 0.5
-"""Width of the line of one sample among many (pt)."""
+FONT_SIZE, LEGEND_SIZE = 8.0, 7.5
+CURVE_WIDTH, THIN_WIDTH = 1.3, 0.5
+"""Widths of a curve, and of the line of one sample among many (pt)."""
 MARKER_SIZE: Final = 4.0
 """Size of a control point or a detection (pt)."""
 ALPHA: Final = 0.25
@@ -59,17 +54,13 @@ _RC: Final = {
     "axes.linewidth": 0.6,
     "grid.linewidth": 0.3,
     "grid.alpha": 0.5,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
+    **{f"{axis}tick.major.width": 0.6 for axis in "xy"},
+    **{f"{axis}tick.major.size": 2.5 for axis in "xy"},
     "legend.fontsize": LEGEND_SIZE,
     "legend.frameon": False,
     "legend.handlelength": 1.8,
     "legend.columnspacing": 1.4,
 }
-_LAYOUT_ROUNDS: Final = 2
-"""Rounds in which the height is fitted, since the layout moves a little when it changes."""
 REST_COLUMNS: Final = 3
 """Most columns of a legend beside those of the boundaries."""
 _SIDES: Final = tuple(NAMES[label] for label in BOUNDARIES)
@@ -93,9 +84,7 @@ class Picture(Figure):
 
 def set_frame(axes: Axes, low: Array, high: Array) -> None:
     """Show the rectangle between two corners (2,), m, with equal scales."""
-    axes.set_aspect("equal")
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
+    axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
 
 
 def label_logarithms(axes: Axes) -> None:
@@ -125,7 +114,6 @@ def grouped_legend(figure: Figure) -> None:
 
 
 def _entries(panels: Iterable[Axes]) -> dict[str, Any]:
-    """Return the first artist of each label."""
     entries: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -135,7 +123,7 @@ def _entries(panels: Iterable[Axes]) -> dict[str, Any]:
 
 def fit_height(figure: Figure, margin: float = 0.05) -> None:
     """Make a figure as high as what is drawn on it, plus a margin (in) on both sides."""
-    for _ in range(_LAYOUT_ROUNDS):
+    for _ in range(2):  # the layout moves a little when the height changes
         figure.draw_without_rendering()
         width, _ = figure.get_size_inches()
         figure.set_size_inches(width, figure.get_tightbbox().height + 2.0 * margin)
@@ -221,22 +209,17 @@ def draw_band(
     color: str,
     label: str,
     scale: float = 1.0,
-    alpha: float = ALPHA,
-    zorder: float = 2,
     widest: float = np.inf,
+    **options: Any,
 ) -> None:
     """Fill the 2-sigma band around a curve, `scale` times as wide as it is, up to `widest` (m) on a side."""
     left, right = uncertainty_band(boundary, curve_parameters(boundary.spline), scale, widest)
-    outline = _band_outline(left, right, boundary.spline.periodic)
-    look: dict[str, Any] = {"alpha": alpha, "linewidth": 0.0, "zorder": zorder}
+    outline = Outline(np.concatenate([left, right[::-1], left[:1]]), closed=True)
+    if boundary.spline.periodic:  # a ring, with edges in opposite directions
+        edges = Outline(left, closed=True), Outline(right[::-1], closed=True)
+        outline = Outline.make_compound_path(*edges)
+    look: dict[str, Any] = {"alpha": ALPHA, "linewidth": 0.0, "zorder": 2} | options
     axes.add_patch(PathPatch(outline, facecolor=color, label=label, **look))
-
-
-def _band_outline(left: Array, right: Array, closed: bool) -> Outline:
-    """Return a polygon around an open band, or a ring with edges in opposite directions for a closed one."""
-    if not closed:
-        return Outline(np.concatenate([left, right[::-1], left[:1]]), closed=True)
-    return Outline.make_compound_path(Outline(left, closed=True), Outline(right[::-1], closed=True))
 
 
 def ellipse_outlines(points: Array, joint: Array, corners: int = 16) -> Array:

@@ -31,13 +31,10 @@ class LapMetrics:
 
     lap: int
     """Number of the lap, from 1; the map is taken as it stood at its end."""
-
     rmse: float
     """Rmse (m) over the cones that aren't missed; NaN where all are."""
-
     missed: float
     """Share (0 to 1) of all true cones that is missed; NaN without true cones."""
-
     size: int
     """Number of control points or landmarks of both boundaries."""
 
@@ -45,12 +42,8 @@ class LapMetrics:
 def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
     """Return rmse = sqrt(mean d^2) over true cones with d <= 3 m, and the share of those with d > 3 m."""
     distances = cone_distances(track, truth)
-    return LapMetrics(
-        lap=lap,
-        rmse=root_mean_square(distances[distances <= MISSED_DISTANCE]),
-        missed=missed_share(distances),
-        size=track.size,
-    )
+    rmse = root_mean_square(distances[distances <= MISSED_DISTANCE])
+    return LapMetrics(lap, rmse, missed_share(distances), track.size)
 
 
 def missed_share(distances: Array, threshold: float = MISSED_DISTANCE) -> float:
@@ -140,7 +133,7 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     closed = len(cones) > _OVERLAP and len(truth.poses) > 0 and len(lap_end_indices(truth.poses)) > 0
     nodes = np.concatenate([cones[-_OVERLAP:], cones, cones[: _OVERLAP + 1]]) if closed else cones
     nodes = nodes[np.append(True, np.linalg.norm(np.diff(nodes, axis=0), axis=1) > 0.0)]
-    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1)))
+    length = lengths_along(nodes)
     low, high = (length[_OVERLAP], length[-_OVERLAP - 1]) if closed else (length[0], length[-1])
     samples = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
     return np.asarray(Akima1DInterpolator(length, nodes)(samples), dtype=float)
@@ -164,9 +157,14 @@ def _first_lap(truth: Truth) -> Array:
     """Return points (n, 2) of the true path up to the end of lap 1, at most PATH_STEP apart."""
     ends = lap_end_indices(truth.poses)
     path = truth.poses[: ends[0] + 1 if len(ends) else None, :2]
-    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+    length = lengths_along(path)
     samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / PATH_STEP)) + 1)
     return np.stack([np.interp(samples, length, coordinate) for coordinate in path.T], axis=1)
+
+
+def lengths_along(points: Array) -> Array:
+    """Return the length (n,) along a polygon from the first of its points (n, 2) to each of them (m)."""
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
 
 
 def _perimeter(points: Array) -> float:
@@ -197,7 +195,6 @@ class CurveDistance:
 
     @property
     def two_way(self) -> float:
-        """Return the mean of both."""
         return 0.5 * (self.mapped_to_truth + self.truth_to_mapped)
 
 
@@ -213,12 +210,12 @@ def curve_distance(track: Map, truth: Truth) -> CurveDistance:
         curve_true = true_curve(truth, label)
         if len(curve_true) == 0:
             continue
-        if label not in track.boundaries:
+        boundary = track.boundaries.get(label)
+        if boundary is None:
             back.append(np.full(1, np.inf))
-            continue
-        boundary = track.boundaries[label]
-        forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
-        back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
+        else:
+            forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
+            back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
     return CurveDistance(_mean(np.concatenate(forth)), _mean(np.concatenate(back)))
 
 
@@ -252,7 +249,6 @@ def crossings(track: Map) -> tuple[int, int]:
 
 
 def _apart(begin: Array, end: Array, a: Array, b: Array) -> BoolArray:
-    """Return whether points a and b lie on different sides of the lines through begin and end."""
     way, first, second = end - begin, a - begin, b - begin
     sides = way[..., 0] * first[..., 1] - way[..., 1] * first[..., 0]
     others = way[..., 0] * second[..., 1] - way[..., 1] * second[..., 0]
@@ -264,19 +260,17 @@ def _apart(begin: Array, end: Array, a: Array, b: Array) -> BoolArray:
 
 @dataclass(frozen=True, slots=True)
 class CentreLineErrors:
-    """Errors of a mapped centre line at its n points, along their normals, and their sigmas (m).
+    """Errors of a mapped centre line at its n points, along their normals, and their claimed sigmas (n,), m.
 
     A value is NaN where a true boundary does not cross the normal near the mapped one.
     """
 
     across: Array
-    """(n,) Distance of the true centre to the left of the mapped one."""
+    """Distance of the true centre to the left of the mapped one."""
     across_sigma: Array
-    """(n,) Its claimed standard deviation."""
     width: Array
-    """(n,) By how much the true track is wider to each side than the mapped one."""
+    """Width by which the true track is wider to each side than the mapped one."""
     width_sigma: Array
-    """(n,) Its claimed standard deviation: the mean of both sides."""
 
 
 def centre_line_errors(track: Map, truth: Truth, step: float = CENTRE_STEP) -> CentreLineErrors | None:
@@ -341,7 +335,6 @@ class Ghosts:
     """What is mapped but doesn't exist, on both boundaries together."""
 
     landmarks: int
-    """Number of landmarks without a true boundary near."""
     metres: float
     """Length of mapped curves without a true boundary near (m)."""
     share: float
@@ -357,27 +350,19 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> G
     """
     settings = settings or GhostSettings()
     landmarks = duplicates = 0
-    metres, all_ghosts = 0.0, []
+    metres, all_ghosts = 0.0, [np.zeros(0, dtype=bool)]
     for label, boundary in track.boundaries.items():
-        is_ghost = _is_ghost(mapped_points(boundary), true_curve(truth, label), settings.distance)
+        points, curve = mapped_points(boundary), true_curve(truth, label)
+        is_ghost = np.ones(len(points), dtype=bool)
+        if len(curve) and len(points):
+            is_ghost = np.asarray(KDTree(curve).query(points)[0] > settings.distance)
         all_ghosts.append(is_ghost)
         if isinstance(boundary, SplineBoundary):
             metres += float(np.mean(is_ghost)) * boundary.spline.length()
         else:
             landmarks += int(is_ghost.sum())
             duplicates += _duplicates(boundary, truth.cones[truth.cone_labels == label], settings.distance)
-    return Ghosts(landmarks, metres, _share(all_ghosts), duplicates)
-
-
-def _is_ghost(points: Array, curve_true: Array, distance: float) -> BoolArray:
-    if len(curve_true) == 0 or len(points) == 0:
-        return np.ones(len(points), dtype=bool)
-    return np.asarray(KDTree(curve_true).query(points)[0] > distance)
-
-
-def _share(all_ghosts: list[BoolArray]) -> float:
-    pooled = np.concatenate([np.zeros(0, dtype=bool), *all_ghosts])
-    return float(np.mean(pooled)) if len(pooled) else float("nan")
+    return Ghosts(landmarks, metres, _mean(np.concatenate(all_ghosts)), duplicates)
 
 
 def _duplicates(boundary: PointBoundary, cones: Array, distance: float) -> int:

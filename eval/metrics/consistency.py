@@ -55,7 +55,6 @@ class NormalizedError:
 
     @property
     def honest(self) -> bool:
-        """Return whether `ratio` lies in its interval."""
         low, high = self.interval
         return low <= self.ratio <= high
 
@@ -137,24 +136,21 @@ class NormalErrors:
 
     errors: Array
     """(k,) Signed distance (m) of each true cone along the normal at its foot point, left positive."""
-
     sigmas: Array
     """(k,) Standard deviation (m) of the curve along that normal."""
 
     def share_inside(self, factor: float = 2.0) -> float:
         """Return the share of the cones with |error| <= factor * sigma; NaN without cones."""
-        if len(self.errors) == 0:
-            return float("nan")
-        return float(np.mean(np.abs(self.errors) <= factor * self.sigmas))
+        inside = np.abs(self.errors) <= factor * self.sigmas
+        return float(np.mean(inside)) if len(inside) else float("nan")
 
     def mean_squared(self) -> float:
         """Return mean (error / sigma)^2, which is 1 where the band is honest; NaN without cones.
 
         In contrast to NEES, correlations between the cones don't count.
         """
-        if len(self.errors) == 0:
-            return float("nan")
-        return float(np.mean((self.errors / self.sigmas) ** 2))
+        squares = (self.errors / self.sigmas) ** 2
+        return float(np.mean(squares)) if len(squares) else float("nan")
 
 
 def normal_errors(track: Map, truth: Truth) -> NormalErrors:
@@ -202,15 +198,9 @@ def with_marginals(track: Map) -> Map:
     It is the squared basis of the paper: `B blockdiag(Sigma) B' = sum_j beta_j(u)^2 Sigma_jj` (section State
     Uncertainty).
     """
-    boundaries = {
-        label: replace(
-            boundary,
-            covariance=boundary.covariance * np.kron(np.eye(boundary.size), np.ones((2, 2))),
-        )
-        for label, boundary in track.boundaries.items()
-        if isinstance(boundary, SplineBoundary)
-    }
-    return Map(track.closed, boundaries)
+    splines = {k: b for k, b in track.boundaries.items() if isinstance(b, SplineBoundary)}
+    blocks = {label: np.kron(np.eye(b.size), np.ones((2, 2))) for label, b in splines.items()}
+    return Map(track.closed, {k: replace(b, covariance=b.covariance * blocks[k]) for k, b in splines.items()})
 
 
 MOST_ROUNDS: Final = 50
@@ -234,20 +224,7 @@ class Turn:
         return (self.angle / self.sigma) ** 2 if self.sigma > 0.0 else float("nan")
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Offsets of points from a map along the map's normals, and what they depend on."""
-
-    error: Array
-    """Offsets n . (p - S) (r,) in m."""
-    lever: Array
-    """Derivatives n . J p (r,) in m/rad of the offsets by the angle of the points."""
-    gradient: Array
-    """Derivative (2m,) of `sum lever n . S` by the points of the map's boundaries."""
-
-
 def turn_from_truth(track: Map, truth: Truth) -> Turn:
-    """Return the turn of a map from the true cones."""
     return turn(track, {label: truth.cones[truth.cone_labels == label] for label in BOUNDARIES})
 
 
@@ -259,29 +236,28 @@ def turn(track: Map, points: Mapping[int, Array]) -> Turn:
     ends of an open curve, don't count. The angle is linear in the map's points near the solution, so their
     joint covariance gives its variance.
     """
-    angle, rows = 0.0, _rows(track, points, 0.0)
+    angle, (error, lever, gradient) = 0.0, _rows(track, points, 0.0)
     for _ in range(MOST_ROUNDS):
-        moment = float(rows.lever @ rows.lever)
+        moment = float(lever @ lever)
         if moment == 0.0:
             return Turn(float("nan"), float("nan"))
-        change = -float(rows.lever @ rows.error) / moment
+        change = -float(lever @ error) / moment
         angle += change
-        rows = _rows(track, points, angle)
+        error, lever, gradient = _rows(track, points, angle)
         if abs(change) < TOLERANCE:
             break
-    return Turn(angle, _sigma(rows, track.joint_covariance))
+    joint = track.joint_covariance
+    variance = float("nan") if joint is None else float(gradient @ joint @ gradient)
+    # of sum lever n . S / sum lever^2
+    return Turn(angle, float(np.sqrt(variance)) / float(lever @ lever))
 
 
-def _sigma(rows: _Rows, joint_covariance: Array | None) -> float:
-    """Return the standard deviation of `sum lever n . S / sum lever^2`."""
-    if joint_covariance is None:
-        return float("nan")
-    variance = float(rows.gradient @ joint_covariance @ rows.gradient)
-    return float(np.sqrt(variance)) / float(rows.lever @ rows.lever)
+def _rows(track: Map, points: Mapping[int, Array], angle: float) -> tuple[Array, Array, Array]:
+    """Return the offsets from the map of points p that are turned by an angle (rad), and two derivatives.
 
-
-def _rows(track: Map, points: Mapping[int, Array], angle: float) -> _Rows:
-    """Return the rows of all boundaries, with the points turned by an angle (rad)."""
+    The offsets are n . (p - S) (r,) in m, their derivatives by the angle n . J p (r,) in m/rad. The third is
+    the derivative (2m,) of `sum lever n . S` by the points of the map's boundaries.
+    """
     error, lever, gradient = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for label, boundary in sorted(track.boundaries.items()):
         turned = points.get(label, np.zeros((0, 2))) @ rotation(angle).T
@@ -292,7 +268,7 @@ def _rows(track: Map, points: Mapping[int, Array], angle: float) -> _Rows:
         error.append(np.einsum("rd,rd->r", normal, point - position))
         lever.append(normal[:, 1] * point[:, 0] - normal[:, 0] * point[:, 1])
         gradient.append((basis.T @ (lever[-1][:, None] * normal)).ravel())
-    return _Rows(*(np.concatenate(parts) for parts in (error, lever, gradient)))
+    return np.concatenate(error), np.concatenate(lever), np.concatenate(gradient)
 
 
 def near_pairs(boundary: MapBoundary, points: Array) -> tuple[Array, Array, Array, Array]:

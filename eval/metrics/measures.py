@@ -1,7 +1,7 @@
 """What is measured of a run: one function measures all metrics, lap by lap and of the whole."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Final
 
 import numpy as np
@@ -11,7 +11,6 @@ from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
-from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import by_prior
@@ -41,7 +40,6 @@ from .trajectory import (
 
 WHOLE: Final = "whole"
 """Name of the whole cycle among its stages."""
-_TAIL: Final = 0.99
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +49,8 @@ class StageTime:
     stage: str
     """Name of the stage; the whole cycle is called `whole`."""
     mean: float
-    """Mean over the cycles (s)."""
     median: float
-    """Median over the cycles (s)."""
     p99: float
-    """99th percentile over the cycles (s)."""
     share: float
     """Its mean as a share of the whole cycle's."""
 
@@ -63,17 +58,17 @@ class StageTime:
 def stage_times(cycles: Sequence[CycleRecord]) -> list[StageTime]:
     """Return the whole cycle and then its stages; a stage that a cycle lacks took no time in it."""
     names = dict.fromkeys(name for record in cycles for name in record.stages)
-    whole = [record.seconds for record in cycles]
-    columns = {WHOLE: whole} | {name: [r.stages.get(name, 0.0) for r in cycles] for name in names}
-    return [_stage(name, values, whole) for name, values in columns.items()]
-
-
-def _stage(name: str, values: Sequence[float], whole: Sequence[float]) -> StageTime:
-    if not values:
-        return StageTime(name, *(float("nan"),) * 4)
-    mean, total = float(np.mean(values)), float(np.mean(whole))
-    share = mean / total if total > 0.0 else float("nan")
-    return StageTime(name, mean, float(np.median(values)), float(np.quantile(values, _TAIL)), share)
+    columns = {WHOLE: [record.seconds for record in cycles]}
+    columns |= {name: [record.stages.get(name, 0.0) for record in cycles] for name in names}
+    if not cycles:
+        return [StageTime(WHOLE, *[float("nan")] * 4)]
+    total = float(np.mean(columns[WHOLE]))
+    times = []
+    for name, seconds in columns.items():
+        mean, median, p99 = np.mean(seconds), np.median(seconds), np.quantile(seconds, 0.99)
+        share = float(mean) / total if total > 0.0 else float("nan")
+        times.append(StageTime(name, float(mean), float(median), float(p99), share))
+    return times
 
 
 DOUBLE_BYTES: Final = 8
@@ -81,13 +76,9 @@ DOUBLE_BYTES: Final = 8
 
 def map_bytes(track: Map) -> int:
     """Return 8 (2 m + knots) bytes for each spline, with one period of its knots, 8 (2 m) for landmarks."""
-    numbers = 0
-    for boundary in track.boundaries.values():
-        numbers += 2 * boundary.size
-        if isinstance(boundary, SplineBoundary):
-            spline = boundary.spline
-            numbers += len(spline.breaks) if spline.periodic else len(spline.knots)
-    return DOUBLE_BYTES * numbers
+    splines = [b.spline for b in track.boundaries.values() if isinstance(b, SplineBoundary)]
+    knots = sum(len(spline.breaks if spline.periodic else spline.knots) for spline in splines)
+    return DOUBLE_BYTES * (2 * sum(boundary.size for boundary in track.boundaries.values()) + knots)
 
 
 def covariance_bytes(track: Map) -> int:
@@ -138,7 +129,12 @@ def measure(
     values = _map_values(run.map, log.truth, ghost_settings, marginals)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
     values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
-    values |= _told_values(run.cycles) | _calibration_values(run)
+    health = [getattr(record, "health", "") for record in run.cycles]
+    if any(health):
+        values |= {f"told_{level}": health.count(level) / len(health) for level in UNHEALTHY}
+    state = run.vehicle
+    if state is not None:
+        values |= {f"{name}_by_prior": value for name, value in by_prior(state, run.settings).items()}
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
     if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):
@@ -193,12 +189,11 @@ def _map_values(
 
 def _cone_values(track: Map, truth: Truth) -> dict[str, float]:
     paper, distances = lap_metrics(track, truth, 0), cone_distances(track, truth)
-    cones = int(np.isin(truth.cone_labels, BOUNDARIES).sum())
     return {
         "rmse": paper.rmse,
         "missed": paper.missed,
-        "cones": cones,
-        "size_share": track.size / cones,
+        "cones": len(distances),
+        "size_share": track.size / len(distances),
         "missed_2m": missed_share(distances, 2.0),
         "missed_1m": missed_share(distances, 1.0),
         "rmse_capped": capped_rmse(distances),
@@ -207,35 +202,21 @@ def _cone_values(track: Map, truth: Truth) -> dict[str, float]:
 
 def _curve_values(track: Map, truth: Truth, ghost_settings: GhostSettings | None) -> dict[str, float]:
     curve, ghost = curve_distance(track, truth), ghosts(track, truth, ghost_settings)
-    return {
-        "mapped_to_truth": curve.mapped_to_truth,
-        "truth_to_mapped": curve.truth_to_mapped,
-        "two_way": curve.two_way,
-        "ghost_landmarks": ghost.landmarks,
-        "ghost_metres": ghost.metres,
-        "ghost_share": ghost.share,
-        "duplicates": ghost.duplicates,
-    }
+    counted = {"ghost_landmarks": ghost.landmarks, "ghost_metres": ghost.metres, "ghost_share": ghost.share}
+    return {**asdict(curve), "two_way": curve.two_way, **counted, "duplicates": ghost.duplicates}
 
 
 def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
     nees, at_cones = map_nees(track, truth), normal_errors(track, truth)
     low, high = nees.interval
-    known = {} if np.isnan(nees.ratio) else {"nees_inside": nees.honest}
-    return {
-        "nees": nees.ratio,
-        "nees_low": low,
-        "nees_high": high,
-        **known,
-        "inside": at_cones.share_inside(),
-        "normalized_error": at_cones.mean_squared(),
-    }
+    values = {"nees": nees.ratio, "nees_low": low, "nees_high": high}
+    values |= {} if np.isnan(nees.ratio) else {"nees_inside": nees.honest}
+    return values | {"inside": at_cones.share_inside(), "normalized_error": at_cones.mean_squared()}
 
 
 def _turn_values(track: Map, truth: Truth) -> dict[str, float]:
-    """Return the turn of a map from the truth (rad), and what its covariance says of it."""
-    found = turn_from_truth(track, truth)
-    values = {"turn": found.angle, "turn_sigma": found.sigma, "turn_nees": found.nees}
+    turn = turn_from_truth(track, truth)
+    values = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
     return {key: value for key, value in values.items() if not np.isnan(value)}
 
 
@@ -272,19 +253,6 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
         values |= longest_astray(run.trajectory_t, run.trajectory, truth, closing_stamp(run))
     jumps = [np.hypot(*record.jump[:2]) for record in run.cycles if record.jump is not None]
     return values | ({"jump": float(max(jumps))} if jumps else {})
-
-
-def _told_values(cycles: Sequence[CycleRecord]) -> dict[str, float]:
-    """Return the shares of the cycles whose health the estimator calls so, if it judges its health."""
-    told = [getattr(record, "health", "") for record in cycles]
-    return {f"told_{level}": told.count(level) / len(told) for level in UNHEALTHY} if any(told) else {}
-
-
-def _calibration_values(run: RunResult) -> dict[str, float]:
-    """Return the calibrations in standard deviations of their priors, where both are known."""
-    state = run.vehicle
-    found = {} if state is None else by_prior(state, run.settings)
-    return {f"{name}_by_prior": value for name, value in found.items()}
 
 
 def closes_falsely(run: RunResult, truth: Truth) -> bool:

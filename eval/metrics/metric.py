@@ -47,7 +47,6 @@ class Metric:
 
     @property
     def heading(self) -> str:
-        """Title with the unit in brackets."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
     @property
@@ -73,7 +72,6 @@ PAPER: Final = (
     Metric("missed", "missed", "%", 1),
     Metric("size", "size", digits=0),
 )
-"""Metrics of the paper's Table 1."""
 _ALL: Final = (
     *PAPER,
     Metric("cones", "true cones", digits=0),
@@ -117,65 +115,56 @@ _ALL: Final = (
     Metric("inside", "cones within 2σ of the curve", "%", 1),
     Metric("inside_marginals", "cones within 2σ of the marginals", "%", 1),
     Metric("normalized_error", "mean squared error by variance at the cones", digits=2),
-    Metric(
-        "normalized_error_marginals",
-        "mean squared error by marginal variance at the cones",
-        digits=2,
-    ),
+    Metric("normalized_error_marginals", "mean squared error by marginal variance at the cones", digits=2),
     Metric(
         "normalized_error_joint",
         "squared error by the joint covariance of the batch at the cones",
-        digits=2,
-        scope="run",
+        "",
+        2,
+        "run",
     ),
-    Metric(
-        "normalized_error_joint_inside",
-        "joint squared error within its 95 % interval",
-        "%",
-        1,
-        scope="run",
-    ),
+    Metric("normalized_error_joint_inside", "joint squared error within its 95 % interval", "%", 1, "run"),
     Metric("closed", "loop closed", "%", 0),
-    Metric("closed_at_end", "loop closed at the end of the log", "%", 0, scope="run"),
-    Metric("false_closing", "loop closed falsely", "%", 1, scope="run"),
-    Metric("jump", "jump of the pose where the map is replaced", "m", 2, scope="run"),
-    Metric("error_max", "largest trajectory error", "m", 2, scope="run"),
-    Metric("error_end", "trajectory error in the last second", "m", 2, scope="run"),
-    Metric("lost_at_end", "vehicle lost at the end", "%", 0, scope="run"),
-    Metric("astray_time", "longest time with an error of over 1 m, after closing", "s", 1, scope="run"),
-    Metric("astray_way", "longest way with an error of over 1 m, after closing", "m", 0, scope="run"),
-    Metric("told_degraded", "cycles that the estimator calls degraded", "%", 1, scope="run"),
-    Metric("told_lost", "cycles that the estimator calls lost", "%", 1, scope="run"),
-    Metric("scale", "scale error of the speeds", "%", 2, scope="run"),
-    Metric("scale_true", "scale error of the speeds, true", "%", 2, scope="run"),
-    Metric("scale_sigma", "scale error of the speeds, claimed sigma", "%", 2, scope="run", average="rms"),
-    Metric("scale_error", "error of the scale", "%", 2, scope="run", average="rms"),
-    Metric("scale_by_sigma", "error of the scale by claimed sigma", digits=2, scope="run", average="rms"),
-    Metric("scale_by_prior", "scale error of the speeds by its prior's sigma", digits=1, scope="run"),
-    Metric("bias", "bias of the yaw rate", "mrad/s", 2, scope="run"),
-    Metric("bias_true", "bias of the yaw rate, true", "mrad/s", 2, scope="run"),
-    Metric("bias_sigma", "bias of the yaw rate, claimed sigma", "mrad/s", 2, scope="run", average="rms"),
-    Metric("bias_error", "error of the bias", "mrad/s", 2, scope="run", average="rms"),
-    Metric("bias_by_sigma", "error of the bias by claimed sigma", digits=2, scope="run", average="rms"),
-    Metric("bias_by_prior", "bias of the yaw rate by its prior's sigma", digits=1, scope="run"),
-    Metric("yaw_by_prior", "yaw of the sensor by its prior's sigma", digits=1, scope="run"),
-    Metric("lateral_by_prior", "lateral offset of the sensor by its prior's sigma", digits=1, scope="run"),
-    Metric("latency_by_prior", "latency of detections by its prior's sigma", digits=1, scope="run"),
-    Metric("range_scale_by_prior", "scale error of ranges by its prior's sigma", digits=1, scope="run"),
-    Metric("range_bias_by_prior", "bias of ranges by its prior's sigma", digits=1, scope="run"),
-    Metric("heading_sigma", "last heading, claimed sigma", "°", 2, scope="run", average="rms"),
-    Metric("heading_error", "error of the last heading", "°", 2, scope="run", average="rms"),
+    Metric("closed_at_end", "loop closed at the end of the log", "%", 0, "run"),
+    Metric("false_closing", "loop closed falsely", "%", 1, "run"),
+    Metric("jump", "jump of the pose where the map is replaced", "m", 2, "run"),
+    Metric("error_max", "largest trajectory error", "m", 2, "run"),
+    Metric("error_end", "trajectory error in the last second", "m", 2, "run"),
+    Metric("lost_at_end", "vehicle lost at the end", "%", 0, "run"),
+    Metric("astray_time", "longest time with an error of over 1 m, after closing", "s", 1, "run"),
+    Metric("astray_way", "longest way with an error of over 1 m, after closing", "m", 0, "run"),
+    Metric("told_degraded", "cycles that the estimator calls degraded", "%", 1, "run"),
+    Metric("told_lost", "cycles that the estimator calls lost", "%", 1, "run"),
+    Metric("scale", "scale error of the speeds", "%", 2, "run"),
+    Metric("scale_true", "scale error of the speeds, true", "%", 2, "run"),
+    Metric("scale_sigma", "scale error of the speeds, claimed sigma", "%", 2, "run", average="rms"),
+    Metric("scale_error", "error of the scale", "%", 2, "run", average="rms"),
+    Metric("scale_by_sigma", "error of the scale by claimed sigma", "", 2, "run", average="rms"),
+    Metric("scale_by_prior", "scale error of the speeds by its prior's sigma", "", 1, "run"),
+    Metric("bias", "bias of the yaw rate", "mrad/s", 2, "run"),
+    Metric("bias_true", "bias of the yaw rate, true", "mrad/s", 2, "run"),
+    Metric("bias_sigma", "bias of the yaw rate, claimed sigma", "mrad/s", 2, "run", average="rms"),
+    Metric("bias_error", "error of the bias", "mrad/s", 2, "run", average="rms"),
+    Metric("bias_by_sigma", "error of the bias by claimed sigma", "", 2, "run", average="rms"),
+    Metric("bias_by_prior", "bias of the yaw rate by its prior's sigma", "", 1, "run"),
+    Metric("yaw_by_prior", "yaw of the sensor by its prior's sigma", "", 1, "run"),
+    Metric("lateral_by_prior", "lateral offset of the sensor by its prior's sigma", "", 1, "run"),
+    Metric("latency_by_prior", "latency of detections by its prior's sigma", "", 1, "run"),
+    Metric("range_scale_by_prior", "scale error of ranges by its prior's sigma", "", 1, "run"),
+    Metric("range_bias_by_prior", "bias of ranges by its prior's sigma", "", 1, "run"),
+    Metric("heading_sigma", "last heading, claimed sigma", "°", 2, "run", average="rms"),
+    Metric("heading_error", "error of the last heading", "°", 2, "run", average="rms"),
     Metric(
         "heading_by_sigma", "error of the last heading by claimed sigma", digits=2, scope="run", average="rms"
     ),
-    Metric("converged", "batch converged", "%", 0, scope="run"),
-    Metric("cost", "cost of the batch", digits=1, scope="run"),
+    Metric("converged", "batch converged", "%", 0, "run"),
+    Metric("cost", "cost of the batch", "", 1, "run"),
     Metric("bytes", "map", "kB", 2),
     Metric("bytes_covariance", "covariance of the map", "kB", 1),
     Metric("ms_mean", "update, mean", "ms", 2, time=True),
     Metric("ms_median", "update, median", "ms", 2, time=True),
     Metric("ms_p99", "update, 99th percentile", "ms", 2, time=True),
-    Metric("seconds", "whole run", "s", 1, scope="run", time=True),
+    Metric("seconds", "whole run", "s", 1, "run", time=True),
 )
 METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}
 """All metrics by key, in the order of the tables."""
@@ -186,7 +175,6 @@ class Column:
     """A figure of several runs: a metric of one lap or several, or a slope of one metric on another."""
 
     metric: Metric
-    """Metric of the figure."""
     laps: str = ""
     """Number of a lap, `later` or `all`; empty for the last lap."""
     given: Metric | None = None
@@ -194,7 +182,6 @@ class Column:
 
     @property
     def title(self) -> str:
-        """Text above the column."""
         if self.given is not None:
             return f"slope of {self.metric.title} on {self.given.title}"
         if self.laps.isdecimal():
@@ -203,7 +190,6 @@ class Column:
 
     @property
     def metrics(self) -> list[Metric]:
-        """Every metric that the column needs."""
         return [self.metric] if self.given is None else [self.metric, self.given]
 
     def average(self, values: pd.DataFrame) -> str:

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import inverse, left_of, to_map
 from pathspace_graph.io.log import Detections, Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
@@ -17,7 +16,6 @@ from pathspace_graph.landmark.batch import LandmarkSolution, solve_landmarks
 from pathspace_graph.settings.batch import FitSettings
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import fit_spline
 
 from .accuracy import (
@@ -31,8 +29,6 @@ from .accuracy import (
 from .consistency import near_pairs
 from .trajectory import pose_errors
 
-Ints = NDArray[np.int64]
-
 
 @dataclass(frozen=True, slots=True)
 class Limit:
@@ -40,13 +36,11 @@ class Limit:
 
     l: float  # noqa: E741 - the issue's and the paper's tables call it so
     """Rmse (m) in the plane of the landmark batch with oracle association."""
-
     f: float
     """Rmse (m) of the true cones to splines of the mapped size that are fitted to them."""
 
     @property
     def total(self) -> float:
-        """Return sqrt(l^2 + f^2) in m."""
         return float(np.hypot(self.l, self.f))
 
 
@@ -73,7 +67,7 @@ def solve_oracle_landmarks(log: Log, *, with_covariance: bool = False) -> Landma
     return solve_landmarks(told, associations, with_covariance=with_covariance, settings=settings)
 
 
-def without_sensor_errors(log: Log, associations: Ints) -> tuple[Log, Ints]:
+def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArray]:
     """Return a log without its sensor's true constant errors, and the associations (R,) that are left.
 
     Cycles get the stamps at which they were seen; those before the first odometry are left out. A range r
@@ -91,9 +85,7 @@ def without_sensor_errors(log: Log, associations: Ints) -> tuple[Log, Ints]:
         if cycle.t - latency < log.odometry.t[0]:
             continue
         measured = cycle.points_vehicle
-        distance = np.maximum(np.linalg.norm(measured, axis=1), np.finfo(float).tiny)
-        unit = measured / distance[:, None]
-        radial = unit[:, :, None] * unit[:, None, :]
+        distance, radial = _rays(measured)
         across = (distance - bias) / (1.0 + scale) / distance
         change = radial / (1.0 + scale) + across[:, None, None] * (np.eye(2) - radial)
         change = to_vehicle @ change
@@ -104,7 +96,7 @@ def without_sensor_errors(log: Log, associations: Ints) -> tuple[Log, Ints]:
     return replace(log, cycles=tuple(cycles)), np.concatenate([np.zeros(0, dtype=int), *left])
 
 
-def with_true_noise(log: Log, associations: Ints) -> Log:
+def with_true_noise(log: Log, associations: IntArray) -> Log:
     """Return a log that states white noise as harmful as its true noise.
 
     The variance of the mean of n errors of a cone, of which a share stays with it for a time, is that of
@@ -123,14 +115,19 @@ def with_true_noise(log: Log, associations: Ints) -> Log:
     cycles, row = [], 0
     for cycle in log.cycles:
         size = len(cycle.labels)
-        distance = np.maximum(np.linalg.norm(cycle.points_vehicle, axis=1), np.finfo(float).tiny)
-        unit = cycle.points_vehicle / distance[:, None]
-        radial = unit[:, :, None] * unit[:, None, :]
+        _, radial = _rays(cycle.points_vehicle)
         along, across = np.sqrt(factors[row : row + size]).T[:, :, None, None]
         change = along * radial + across * (np.eye(2) - radial)
         cycles.append(replace(cycle, covariances=change @ cycle.covariances @ change))
         row += size
     return replace(log, cycles=tuple(cycles), odometry_sigma=noise[:3])
+
+
+def _rays(points: Array) -> tuple[Array, Array]:
+    """Return the distances (m,) of points (m, 2), and the projections (m, 2, 2) on their rays."""
+    distance = np.maximum(np.linalg.norm(points, axis=1), np.finfo(float).tiny)
+    unit = points / distance[:, None]
+    return distance, unit[:, :, None] * unit[:, None, :]
 
 
 def landmark_rmse(solution: LandmarkSolution, truth: Truth) -> float:
@@ -143,27 +140,19 @@ def landmark_rmse(solution: LandmarkSolution, truth: Truth) -> float:
 def fit_rmse(track: Map, truth: Truth) -> float:
     """Return sqrt(mean d^2) in m, d from true cones to splines of the mapped size that are fitted to them.
 
-    A boundary of points, or with a control point for every cone, has distances of 0. Boundaries that aren't
-    mapped don't count.
+    Their knots follow the curvature (paper, section Simplification). A boundary of points, or with a control
+    point for every cone, has distances of 0. Boundaries that aren't mapped don't count.
     """
     distances = [np.zeros(0)]
     for label, boundary in track.boundaries.items():
         cones = driving_order(truth, label)
+        fitted = cones
         if isinstance(boundary, SplineBoundary) and boundary.size < len(cones):
-            distances.append(fit_distances(cones, boundary.size, boundary.spline))
-        else:
-            distances.append(np.zeros(len(cones)))
+            like = boundary.spline
+            spline = fit_spline(cones, boundary.size, like.periodic, FitSettings(degree=like.degree))
+            fitted = closest_points(spline, cones).position
+        distances.append(np.linalg.norm(cones - fitted, axis=1))
     return root_mean_square(np.concatenate(distances))
-
-
-def fit_distances(cones: Array, size: int, like: BSpline) -> Array:
-    """Return the distances (k,) in m of cones (k, 2), in driving order, from a spline fitted to them.
-
-    The spline has `size` control points, and the degree and periodicity of `like`. Its knots follow the
-    curvature (paper, section Simplification).
-    """
-    fitted = fit_spline(cones, size, like.periodic, FitSettings(degree=like.degree))
-    return np.asarray(np.linalg.norm(cones - closest_points(fitted, cones).position, axis=1))
 
 
 def _truth(log: Log) -> Truth:
@@ -200,11 +189,10 @@ def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str,
     Small turns about one point add up, so the turn from the batch is the difference of the turns from the
     truth. Where either map lacks the metric, the result does too.
     """
-    found: dict[str, Any] = {}
-    if {"turn", "rmse"} <= set(values) & set(batch):
-        found["turn_from_batch"] = float(values["turn"] - batch["turn"])
-        found["rmse_by_batch"] = float(values["rmse"] / batch["rmse"])
-    return found
+    if not {"turn", "rmse"} <= set(values) & set(batch):
+        return {}
+    turn, rmse = values["turn"] - batch["turn"], values["rmse"] / batch["rmse"]
+    return {"turn_from_batch": float(turn), "rmse_by_batch": float(rmse)}
 
 
 def gap(run: RunResult, reference: RunResult) -> Gap:
@@ -228,18 +216,17 @@ def aligned_distance(track: Map, reference: Map) -> float:
     own = [mapped_points(track.boundaries[label], STEP) for label in shared]
     other = [mapped_points(reference.boundaries[label], STEP) for label in shared]
     best = np.inf
-    for start in STARTS:
+    for start in STARTS if shared else ():
         motion = _aligning(own, [reference.boundaries[label] for label in shared], start)
-        back = inverse(motion)
-        forth = [
-            boundary_distances(reference.boundaries[label], to_map(points, motion[None]))
-            for label, points in zip(shared, own, strict=True)
+        distances = [
+            boundary_distances(boundaries[label], to_map(points, way[None]))
+            for boundaries, all_points, way in (
+                (reference.boundaries, own, motion),
+                (track.boundaries, other, inverse(motion)),
+            )
+            for label, points in zip(shared, all_points, strict=True)
         ]
-        forth += [
-            boundary_distances(track.boundaries[label], to_map(points, back[None]))
-            for label, points in zip(shared, other, strict=True)
-        ]
-        best = min([best, *([float(np.mean(np.concatenate(forth)))] if forth else [])])
+        best = min(best, float(np.mean(np.concatenate(distances))))
     return float(best)
 
 

@@ -25,7 +25,7 @@ from pathspace_graph.scale.scene import scale_of
 
 from .accuracy import LapMetrics, lap_metrics, root_mean_square
 from .consistency import normal_errors
-from .trajectory import ate, trajectory_errors
+from .trajectory import position_rms, trajectory_errors
 
 LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
 
@@ -48,16 +48,19 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
         "seconds": _timing(result),
         "gate": {
-            "dropped": sum(record.dropped for record in result.cycles),
-            "late": sum(record.late for record in result.cycles),
-            "refused": sum(record.refused for record in result.cycles),
+            name: sum(getattr(record, name) for record in result.cycles)
+            for name in ("dropped", "late", "refused")
         },
     }
     if result.batches is not None:
         summary["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
     if hints:
         summary["hints"] = [asdict(hint) for hint in hints]
-    events = _events(result)
+    events = [
+        {"cycle": record.cycle, "t": record.t, "jump": record.jump, "notice": record.notice}
+        for record in result.cycles
+        if record.jump is not None or record.notice
+    ]
     if events:
         summary["events"] = events
     if any(record.health for record in result.cycles):
@@ -88,7 +91,6 @@ def _vehicle(state: VehicleState) -> dict[str, Any]:
 
 
 def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
-    """Return where the noise comes from, what the log states of it, and what was measured."""
     stated: dict[str, Any] = {}
     if log.odometry_stated:
         stated["odometry"] = log.odometry_sigma.tolist()
@@ -96,15 +98,12 @@ def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
     if log.detections_stated and len(points):
         covariances = np.concatenate([cycle.covariances for cycle in log.cycles])
         along, across = np.median(ray_sigmas(points, covariances), axis=0).tolist()
-        stated["detections"] = {
-            "range": float(np.median(np.hypot(*points.T))),
-            "along": along,
-            "across": across,
-        }
-    found = {"odometry": noise.odometry, "detections": noise.detections, "stated": stated}
+        distance = float(np.median(np.hypot(*points.T)))
+        stated["detections"] = {"range": distance, "along": along, "across": across}
+    sources = {"odometry": noise.odometry, "detections": noise.detections, "stated": stated}
     measured = noise.measured
     if measured is None:
-        return found
+        return sources
     values: dict[str, Any] = {
         "odometry": measured.odometry.tolist(),
         "drift": measured.drift.tolist(),
@@ -115,20 +114,10 @@ def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
             begin, growth = ray.sigma.tolist()
             values[name] = {"sigma": begin, "growth": growth, "share": ray.share, "time": ray.time}
     if measured.along is not None:
+        sigmas = (f"{name}_sigma" for name in SENSOR)
         values |= dict(zip(SENSOR, measured.sensor.tolist(), strict=True))
-        values |= {
-            f"{name}_sigma": sigma for name, sigma in zip(SENSOR, measured.sensor_sigma.tolist(), strict=True)
-        }
-    return found | {"measured": values}
-
-
-def _events(result: RunResult) -> list[dict[str, Any]]:
-    """Return the cycles in which the map was replaced, with the jump of the pose, or that have a notice."""
-    return [
-        {"cycle": record.cycle, "t": record.t, "jump": record.jump, "notice": record.notice}
-        for record in result.cycles
-        if record.jump is not None or record.notice
-    ]
+        values |= dict(zip(sigmas, measured.sensor_sigma.tolist(), strict=True))
+    return sources | {"measured": values}
 
 
 def _health(result: RunResult) -> dict[str, Any]:
@@ -138,12 +127,10 @@ def _health(result: RunResult) -> dict[str, Any]:
 
 
 def stretches_of(result: RunResult) -> list[Stretch]:
-    """Return the stretches of a run that were not good."""
     return stretches([r.t for r in result.cycles], [health_of(r) for r in result.cycles])
 
 
 def health_of(record: CycleRecord) -> Health:
-    """Return the health in a cycle's record."""
     return Health(record.health, record.reason)
 
 
@@ -175,7 +162,6 @@ def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
 
 
 def _metrics(track: Map, truth: Truth, lap: int, scale: float) -> LapMetrics:
-    """Return the metrics of a map where a cone more than 3 m times the scale away is missed."""
     found = lap_metrics(scaled(track, 1.0 / scale), scaled(truth, 1.0 / scale), lap)
     return replace(found, rmse=found.rmse * scale)
 
@@ -193,7 +179,6 @@ def not_mapped(track: Map, log: Log) -> list[str]:
 
 
 def has_cones(truth: Truth) -> bool:
-    """Return whether any true cone belongs to a boundary."""
     return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
 
 
@@ -209,18 +194,13 @@ def _timing(result: RunResult) -> dict[str, float] | None:
 
 
 def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
-    """Return `laps`, and as `final` the same of the map at the end of the log."""
     if not has_cones(truth):
         return {}
     final = asdict(_metrics(result.map, truth, result.laps, result.scale))
     del final["lap"]
-    return {
-        "laps": [asdict(row) for row in laps_of(result, log)],
-        "final": final,
-        "inside_two_sigma": normal_errors(
-            result.at_scale_one().map, scaled(truth, 1.0 / result.scale)
-        ).share_inside(),
-    }
+    inside = normal_errors(result.at_scale_one().map, scaled(truth, 1.0 / result.scale)).share_inside()
+    laps = [asdict(row) for row in laps_of(result, log)]
+    return {"laps": laps, "final": final, "inside_two_sigma": inside}
 
 
 def _trajectory_errors(result: RunResult, truth: Truth) -> dict[str, float]:
@@ -229,9 +209,5 @@ def _trajectory_errors(result: RunResult, truth: Truth) -> dict[str, float]:
         return {}
     errors = trajectory_errors(result.trajectory_t, result.trajectory, truth)
     along, across, heading = (root_mean_square(column) for column in errors.T)
-    return {
-        "ate": ate(result.trajectory_t, result.trajectory, truth),
-        "rmse_along": along,
-        "rmse_across": across,
-        "rmse_heading": heading,
-    }
+    by_axis = {"rmse_along": along, "rmse_across": across, "rmse_heading": heading}
+    return {"ate": position_rms(errors), **by_axis}

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -17,7 +17,7 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.run import ObservedCycle
 
-from .accuracy import boundary_distances, root_mean_square
+from .accuracy import boundary_distances, lengths_along, root_mean_square
 
 LOST: Final = 5.0
 """Position error beyond which a vehicle is lost (m)."""
@@ -102,18 +102,16 @@ def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, flo
     scale, bias = state.calibration.tolist()
     values = {"scale": scale, "bias": bias, "scale_sigma": sigma_scale, "bias_sigma": sigma_bias}
     values["heading_sigma"] = sigma_heading
+    errors = {}
     if truth.calibration is not None:
         values["scale_true"], values["bias_true"] = truth.calibration.tolist()
-        values |= _error("scale", scale - values["scale_true"], sigma_scale)
-        values |= _error("bias", bias - values["bias_true"], sigma_bias)
+        errors = {"scale": scale - values["scale_true"], "bias": bias - values["bias_true"]}
     if len(truth.poses) and truth.pose_t[0] <= t <= truth.pose_t[-1]:
         ((_, _, heading),) = trajectory_errors(np.array([t]), state.pose[None], truth)
-        values |= _error("heading", float(heading), sigma_heading)
+        errors["heading"] = float(heading)
+    for key, error in errors.items():
+        values |= {f"{key}_error": error, f"{key}_by_sigma": error / values[f"{key}_sigma"]}
     return values
-
-
-def _error(key: str, error: float, sigma: float) -> dict[str, float]:
-    return {f"{key}_error": error, f"{key}_by_sigma": error / sigma}
 
 
 def position_rms(errors: Array) -> float:
@@ -129,8 +127,6 @@ SHORT: Final = 4.0
 """Reach below which no planner can work (m)."""
 STARTING: Final = 0.03
 """Share of lap 1 on which the map has only begun, and cycles don't count."""
-NOT_COUNTED: Final = (np.nan, 0.0, 0.0)
-"""Row of a cycle that doesn't count, in place of `CycleReach`."""
 
 
 # --- the true road ---------------------------------------------------------------------------------------
@@ -141,7 +137,7 @@ class TrueRoad:
     """True drive by its length, and the true cones in the order in which the drive passes them."""
 
     t: Array
-    """Stamps (N,) in s of the true poses."""
+    """Stamps (N,) of the true poses (s)."""
     drive: Array
     """(N, 4) Rows [station, x, y, theta] (m, rad): length driven and true pose; theta isn't wrapped."""
     stations: Array
@@ -175,8 +171,7 @@ def true_road(truth: Truth) -> TrueRoad:
     complete lap, cones beside the drive's two ends and cycles less than `MOST` metres before its end don't
     count.
     """
-    steps = np.linalg.norm(np.diff(truth.poses[:, :2], axis=0), axis=1)
-    driven = np.append(0.0, np.cumsum(steps))
+    driven = lengths_along(truth.poses[:, :2])
     own = np.isin(truth.cone_labels, BOUNDARIES)
     cones, ends = truth.cones[own], driven[lap_end_indices(truth.poses)]
     stations, cone = _passes(truth.poses[:, :2], driven, cones, ends)
@@ -211,9 +206,8 @@ def _passes(path: Array, driven: Array, cones: Array, ends: Array) -> tuple[Arra
 # --- one cycle -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class CycleReach:
-    """Reach of the map in one cycle."""
+class CycleReach(NamedTuple):
+    """Reach of the map in one cycle, a row of `RunResult.reach`."""
 
     reach: float
     """Length ahead of the vehicle (m) over which the road is mapped on both sides."""
@@ -221,6 +215,9 @@ class CycleReach:
     """Sum of squared distances (m^2) of the true cones on that stretch from the mapped boundaries."""
     cones: int
     """Number of true cones on that stretch."""
+
+
+NOT_COUNTED: Final = CycleReach(np.nan, 0.0, 0)
 
 
 def cycle_reach(road: TrueRoad, station: float, pose_true: Array, pose: Array, track: Map) -> CycleReach:
@@ -256,21 +253,19 @@ class ReachObserver:
 
     def __init__(self, truth: Truth) -> None:
         self._road = true_road(truth)
-        self._rows: list[tuple[float, float, float]] = []
+        self._rows: list[CycleReach] = []
 
     def __call__(self, cycle: ObservedCycle) -> None:
-        """Measure one cycle, with the map as it stands."""
         result = cycle.result
         station, pose_true = self._road.at(result.t)
-        if not self._road.counts(result.t, station):
-            self._rows.append(NOT_COUNTED)
-            return
-        found = cycle_reach(self._road, station, pose_true, result.pose, cycle.outline)
-        self._rows.append((found.reach, found.squares, float(found.cones)))
+        counts = self._road.counts(result.t, station)
+        row = (
+            cycle_reach(self._road, station, pose_true, result.pose, cycle.outline) if counts else NOT_COUNTED
+        )
+        self._rows.append(row)
 
     @property
     def rows(self) -> Array:
-        """Return the rows (n, 3) of `RunResult.reach`."""
         return np.array(self._rows, float).reshape(-1, 3)
 
 

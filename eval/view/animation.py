@@ -1,8 +1,7 @@
 """The film of a run: the map as it grows, the vehicle, its window and readings, and what is known by then."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,28 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
-from pathspace_graph.eval.figures.map_plot import (
-    BAND_ALPHA,
-    BOUNDARY_COLORS,
-    HEALTH_COLORS,
-    MARGIN,
-    TENTATIVE_DASHES,
-    TRAJECTORY_COLOR,
-    MapStyle,
-    draw_boundary,
-    draw_orange,
-    draw_trajectory,
-    draw_unhealthy,
-)
-from pathspace_graph.eval.figures.style import (
-    DARK,
-    LIGHT,
-    RED,
-    SIGMAS,
-    draw_points,
-    figure_context,
-    set_frame,
-)
+from pathspace_graph.eval.figures import map_plot, style
+from pathspace_graph.eval.figures.map_plot import BOUNDARY_COLORS, TRAJECTORY_COLOR, MapStyle
+from pathspace_graph.eval.figures.style import DARK, LIGHT, RED
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times
 from pathspace_graph.factors.arrays import Array
@@ -45,33 +25,29 @@ from pathspace_graph.settings.output import FilmSettings
 from .film import Film
 
 DPI: Final = 100.0
-"""A frame has this resolution (dots per inch), which decides how large the text is."""
+"""Resolution of a frame (dots per inch), which decides how large the text is."""
 VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
-"""The vehicle is drawn as this arrow (m, vehicle frame), larger than it is, so that it is seen."""
+"""Arrow that stands for the vehicle (m, vehicle frame), larger than it is, so that it is seen."""
 NOTICE_SECONDS: Final = 2.0
-"""A frame tells what happened for this time (s) of the film."""
-
+"""Time (s) of the film for which a frame shows what happened."""
 LEAST_TURN: Final = 0.75
-"""An odometry that turns by less than this share of a full turn has driven no lap."""
+"""Share of a full turn below which an odometry has driven no lap."""
 
 _STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8, widest_band=5.0)
 """Lines are wider than on paper, since a film has few pixels."""
 _MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)
-"""The map has this place in a frame: left, bottom, width, height, as shares of the frame."""
+"""Place of the map: left, bottom, width, height, as shares of the frame."""
 _TEXT_PLACE: Final = (0.775, 0.085, 0.212, 0.845)
-"""The figures of the moment have this place."""
 _LINE: Final = 0.062
-"""A line of the figures of the moment takes this share of the height of their place."""
+"""Height of a line of text as a share of that place."""
 _FRAME_STEP: Final = 10.0
-"""The part of the plane that is shown grows by steps of this length (m)."""
+"""Step (m) by which the part of the plane that is shown grows."""
 _LEAST_FRAME: Final = 30.0
-"""At least this length (m) around the start is shown in each direction."""
-_TURN: Final = 2.0 * np.pi
-"""This is a full turn (rad)."""
+"""Least length (m) around the start that is shown in each direction."""
 
 
 def lap_seconds(log: Log) -> float:
-    """Returns how long a lap of the log takes (s), by its truth, or by how far the odometry turns.
+    """Return how long a lap of the log takes (s), by its truth, or by how far the odometry turns.
 
     A log of less than `LEAST_TURN` of a turn is taken as one lap.
     """
@@ -81,20 +57,16 @@ def lap_seconds(log: Log) -> float:
     if len(ends) and ends[0] > begin:
         return float(ends[0] - begin)
     driven = log.odometry.between(begin, end)
-    turns = abs(float(driven.twist[:, 2] @ np.diff(np.append(driven.t, end)))) / _TURN
+    turns = abs(float(driven.twist[:, 2] @ np.diff(np.append(driven.t, end)))) / (2.0 * np.pi)
     return ((end - begin) / (turns if turns > LEAST_TURN else 1.0)) or 1.0
 
 
-@dataclass(frozen=True)
-class Moment:
-    """Holds a figure of the moment."""
+class Moment(NamedTuple):
+    """Figure of the moment, its value with the unit."""
 
     name: str
-    """It is named so."""
     value: str
-    """This is its value, with the unit."""
     color: str = "black"
-    """The value is written in this colour."""
 
 
 class Animation:
@@ -129,7 +101,7 @@ class Animation:
         self._text = self._figure.add_axes(_TEXT_PLACE)
 
     def __call__(self, cycle: ObservedCycle) -> None:
-        """Notes what happened in a cycle, and draws a frame where one is due."""
+        """Note what happened in a cycle, and draw a frame where one is due."""
         t, result = cycle.detections.t, cycle.result
         self._begin = t if self._begin is None else self._begin
         film_time = (t - self._begin) * self.settings.seconds_per_lap / self._lap
@@ -146,12 +118,10 @@ class Animation:
             self._frames += due
 
     def finish(self) -> None:
-        """Holds the last frame for a while."""
         if self._frames:
             self._film.add(self._figure, self.settings.hold)
 
     def _listen(self, cycle: ObservedCycle, film_time: float) -> None:
-        """Takes up what a cycle has to tell."""
         result, told = cycle.result, [cycle.result.notice] if cycle.result.notice else []
         if result.closed and not self._was_closed:
             told.append(f"loop closed: {self._size} control points become {sum(result.sizes)}")
@@ -165,16 +135,16 @@ class Animation:
 
     def _draw(self, cycle: ObservedCycle, film_time: float) -> None:
         axes = self._axes
-        with figure_context():
+        with style.figure_context():
             axes.clear()
-            draw_points(axes, self._cones, "x", LIGHT, markersize=3.0, markeredgewidth=0.7, zorder=1)
+            style.draw_points(axes, self._cones, "x", LIGHT, markersize=3.0, markeredgewidth=0.7, zorder=1)
             for label, boundary in sorted(cycle.map.boundaries.items()):
-                draw_boundary(axes, boundary, label, _STYLE)
+                map_plot.draw_boundary(axes, boundary, label, _STYLE)
             for label, cones in sorted(cycle.map.points.items()):
-                draw_orange(axes, cones.points, label, _STYLE)
+                map_plot.draw_orange(axes, cones.points, label, _STYLE)
             path = np.array(self._poses)
-            draw_trajectory(axes, path, _STYLE)
-            draw_unhealthy(axes, path, self._healths, _STYLE)
+            map_plot.draw_trajectory(axes, path, _STYLE)
+            map_plot.draw_unhealthy(axes, path, self._healths, _STYLE)
             _draw_readings(axes, cycle.readings, path[-1])
             _draw_vehicle(axes, path[-1], cycle.window)
             self._show(path[-1:, :2])
@@ -182,9 +152,9 @@ class Animation:
             self._write(cycle)
 
     def _show(self, points: Array) -> None:
-        """Enlarges what is shown so that it holds points (k, 2), m, map frame."""
+        """Enlarge what is shown so that it holds points (k, 2), m, map frame."""
         if len(points):
-            low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
+            low, high = points.min(axis=0) - map_plot.MARGIN, points.max(axis=0) + map_plot.MARGIN
             self._low = np.minimum(self._low, _FRAME_STEP * np.floor(low / _FRAME_STEP))
             self._high = np.maximum(self._high, _FRAME_STEP * np.ceil(high / _FRAME_STEP))
 
@@ -192,7 +162,7 @@ class Animation:
         axes, middle = self._axes, 0.5 * (self._low + self._high)
         box = np.array([_MAP_PLACE[2] * self.settings.width, _MAP_PLACE[3] * self.settings.height])
         half = 0.5 * box * ((self._high - self._low) / box).max()  # the map's place is filled
-        set_frame(axes, middle - half, middle + half)
+        style.set_frame(axes, middle - half, middle + half)
         axes.set_xlabel("x [m]", labelpad=1.0)
         axes.set_ylabel("y [m]", labelpad=0.0)
         axes.set_title(self._title, fontsize=10.0)
@@ -207,45 +177,36 @@ class Animation:
             axes.text(0.5, 0.5, self._notice, fontsize=10.0, bbox=frame, **place)
 
     def _write(self, cycle: ObservedCycle) -> None:
-        """Writes the figures of the moment, and below them what is what."""
         axes = self._text
         axes.clear()
         axes.set_axis_off()
         moments = [*_moments(cycle, self._seconds), *_against_truth(cycle.map, self._truth)]
         self._seconds.clear()
-        for number, moment in enumerate(moments):
+        for number, (name, value, color) in enumerate(moments):
             y = 1.0 - _LINE * (number + 0.5)
-            axes.text(0.0, y, moment.name, color=DARK, va="center", fontsize=8.5)
-            axes.text(1.0, y, moment.value, color=moment.color, va="center", ha="right", fontsize=8.5)
-        axes.legend(
-            handles=_legend(self._truth, bool(cycle.map.points)),
-            loc="lower left",
-            borderaxespad=0.0,
-            borderpad=0.0,
-        )
+            axes.text(0.0, y, name, color=DARK, va="center", fontsize=8.5)
+            axes.text(1.0, y, value, color=color, va="center", ha="right", fontsize=8.5)
+        handles = _legend(self._truth, bool(cycle.map.points))
+        axes.legend(handles=handles, loc="lower left", borderaxespad=0.0, borderpad=0.0)
 
 
 def _moments(cycle: ObservedCycle, seconds: Sequence[float]) -> list[Moment]:
-    result = cycle.result
-    condition = result.health.condition
-    used = f"{result.readings} of {len(cycle.detections.labels)}"
+    result, condition = cycle.result, cycle.result.health.condition
     points = any(isinstance(one, PointBoundary) for one in cycle.map.boundaries.values())
-    kind = "landmarks" if points else "control points"
     moments = [
         Moment("time", f"{result.t:.1f} s"),
         Moment("lap", str(cycle.lap)),
         Moment("loop", "closed" if result.closed else "open"),
-        Moment(kind, " + ".join(map(str, result.sizes))),
-        Moment("readings used", used),
+        Moment("landmarks" if points else "control points", " + ".join(map(str, result.sizes))),
+        Moment("readings used", f"{result.readings} of {len(cycle.detections.labels)}"),
         Moment("update", f"{1e3 * float(np.mean(seconds)):.1f} ms"),
     ]
     if condition:
-        moments.append(Moment("health", condition, HEALTH_COLORS.get(condition, TRAJECTORY_COLOR)))
+        moments.append(Moment("health", condition, map_plot.HEALTH_COLORS.get(condition, TRAJECTORY_COLOR)))
     return moments
 
 
 def _against_truth(track: Map, truth: Truth | None) -> list[Moment]:
-    """Returns the paper's metrics of the moment, where there are true cones."""
     if truth is None or not has_cones(truth):
         return []
     metrics = lap_metrics(track, truth, 0)
@@ -254,18 +215,17 @@ def _against_truth(track: Map, truth: Truth | None) -> list[Moment]:
 
 
 def _draw_readings(axes: Axes, readings: Readings | None, pose: Array) -> None:
-    """Draws the readings of the cycle with a ray from the vehicle, used and gated ones apart."""
     if readings is None or len(readings.points) == 0:
         return
     for chosen, color, marker in ((readings.used, DARK, "o"), (~readings.used, RED, "x")):
         points = readings.points[chosen]
         for point in points:
             axes.plot(*np.array([pose[:2], point]).T, color=color, linewidth=0.35, alpha=0.6, zorder=5)
-        draw_points(axes, points, marker, color, markersize=3.2, markeredgewidth=1.0, zorder=8)
+        style.draw_points(axes, points, marker, color, markersize=3.2, markeredgewidth=1.0, zorder=8)
 
 
 def _draw_vehicle(axes: Axes, pose: Array, window: Array) -> None:
-    """Draws the vehicle at its pose (3,), and the window of poses (P, 3) behind it."""
+    """Draw the vehicle at its pose (3,), and the window of poses (P, 3) behind it."""
     axes.plot(*window[:, :2].T, color=TRAJECTORY_COLOR, linewidth=2.6, solid_capstyle="round", zorder=6)
     outline = to_map(VEHICLE, np.tile(pose, (len(VEHICLE), 1)))
     axes.add_patch(Polygon(outline, facecolor="black", edgecolor="white", linewidth=0.5, zorder=10))
@@ -278,11 +238,10 @@ def _legend(truth: Truth | None, orange: bool) -> list[Any]:
     def mark(name: str, color: str, marker: str) -> Line2D:
         return line(name, color, marker=marker, linestyle="none", markersize=4.0)
 
-    curves = [line(f"{NAMES[label]} boundary", BOUNDARY_COLORS[label], linewidth=1.4) for label in BOUNDARIES]
     entries = [
-        *curves,
-        line("tentative", BOUNDARY_COLORS[LEFT], linestyle=TENTATIVE_DASHES),
-        Patch(facecolor=BOUNDARY_COLORS[LEFT], alpha=BAND_ALPHA, label=f"{SIGMAS:g}σ band"),
+        *(line(f"{NAMES[label]} boundary", BOUNDARY_COLORS[label], linewidth=1.4) for label in BOUNDARIES),
+        line("tentative", BOUNDARY_COLORS[LEFT], linestyle=map_plot.TENTATIVE_DASHES),
+        Patch(facecolor=BOUNDARY_COLORS[LEFT], alpha=map_plot.BAND_ALPHA, label=f"{style.SIGMAS:g}σ band"),
         mark("reading, used", DARK, "o"),
         mark("reading, gated", RED, "x"),
         line("trajectory", TRAJECTORY_COLOR, linewidth=0.8),

@@ -19,21 +19,19 @@ from pathspace_graph.io.files import atomic_file, check_file_target
 Pixels = NDArray[np.uint8]
 
 SUFFIXES: Final = (".gif", ".mp4")
-"""A film can be written under these suffixes."""
-
 _COLORS: Final = 255
 """Number of colours of a frame of a .gif; one index of its palette is left for what does not change."""
 
 
 class Film(Protocol):
-    """Takes the frames of a film, one after the other."""
+    """Film that takes its frames one after the other."""
 
     def add(self, figure: Figure, seconds: float) -> None:
-        """Adds a figure as a frame that is shown for a time (s)."""
+        """Add a figure as a frame that is shown for a time (s)."""
 
 
 def check_film_file(file: Path | str) -> None:
-    """Raises where no film can be written to `file`, before anything is drawn."""
+    """Raise where no film can be written to `file`, before anything is drawn."""
     suffix = Path(file).suffix.lower()
     if suffix not in SUFFIXES:
         raise SettingsError(f"{file}: expected a film's name that ends in {' or '.join(SUFFIXES)}")
@@ -46,16 +44,20 @@ def check_film_file(file: Path | str) -> None:
 
 @contextmanager
 def film(file: Path | str, frames_per_second: float) -> Iterator[Film]:
-    """Yields a film that is at `file` on success; an earlier one is kept as a numbered backup."""
+    """Yield a film that is at `file` on success; an earlier one is kept as a numbered backup."""
     check_film_file(file)
     with atomic_file(file) as temporary:
         if Path(file).suffix.lower() == ".gif":
             frames = GifFilm()
             yield frames
             frames.write(temporary)
-        else:
-            with _encoding(temporary, frames_per_second) as encoder:
-                yield encoder
+            return
+        encoder = _FfmpegFilm(temporary, frames_per_second)
+        try:
+            yield encoder
+            encoder.writer.finish()
+        except (subprocess.CalledProcessError, BrokenPipeError) as error:
+            raise OutputError(f"{temporary.name}: ffmpeg could not write the film: {error}") from error
 
 
 # --- gif -------------------------------------------------------------------------------------------------
@@ -70,7 +72,7 @@ class GifFilm:
         self._time = 0.0
 
     def add(self, figure: Figure, seconds: float) -> None:
-        """Adds a figure, of the same size as those before, as a frame that is shown for a time (s).
+        """Add a figure, of the same size as those before, as a frame that is shown for a time (s).
 
         The format counts in hundredths of a second, whose rounding must not add up.
         """
@@ -80,7 +82,7 @@ class GifFilm:
         self._durations.append(10 * (round(100.0 * self._time) - round(100.0 * before)))
 
     def write(self, file: Path) -> None:
-        """Writes a film that is repeated for ever."""
+        """Write a film that is repeated for ever."""
         if not self._frames:
             raise OutputError(f"{file.name}: expected a film of at least one frame, found none")
         first, *others = self._frames
@@ -88,24 +90,13 @@ class GifFilm:
 
 
 def pixels_of(figure: Figure) -> Pixels:
-    """Returns a figure as pixels (height, width, 3)."""
+    """Return a figure as pixels (height, width, 3)."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.array(canvas.buffer_rgba(), np.uint8)[:, :, :3]
 
 
 # --- mp4 -------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _encoding(file: Path, frames_per_second: float) -> Iterator[Film]:
-    """Yields a film that ffmpeg writes to `file`; an OutputError where it fails."""
-    encoder = _FfmpegFilm(file, frames_per_second)
-    try:
-        yield encoder
-        encoder.writer.finish()
-    except (subprocess.CalledProcessError, BrokenPipeError) as error:
-        raise OutputError(f"{file.name}: ffmpeg could not write the film: {error}") from error
 
 
 class _FfmpegFilm:
@@ -116,7 +107,6 @@ class _FfmpegFilm:
         self._file, self._begun = file, False
 
     def add(self, figure: Figure, seconds: float) -> None:
-        """Adds a figure as often as it is to be shown, at least once."""
         if not self._begun:
             self.writer.setup(figure, str(self._file), figure.dpi)
             self._begun = True

@@ -5,19 +5,9 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 
+from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.map_plot import BOUNDARY_COLORS, HEALTH_COLORS, TRAJECTORY_COLOR
-from pathspace_graph.eval.figures.style import (
-    BLUE,
-    DARK,
-    GREEN,
-    GREY,
-    LIGHT,
-    ORANGE,
-    RED,
-    curve_parameters,
-    ellipse_outlines,
-    uncertainty_band,
-)
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, LIGHT, ORANGE, RED
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import CONDITIONS, LOST, Health
@@ -28,17 +18,72 @@ from pathspace_graph.labels import ORANGE as ORANGE_CONE
 from pathspace_graph.run import ObservedCycle
 from pathspace_graph.settings.output import RecordingSettings
 
-from . import entities
+TIMELINE: Final = "cycle"
+"""Timeline that counts the perception cycles, from 0."""
+TIME: Final = "time"
+"""Timeline of the log's time (s)."""
+TIMELINES: Final = (TIMELINE, TIME)
+
+MAP: Final = "map"
+"""Entity above all that has a place, in the map frame (m)."""
+TRAJECTORY: Final = f"{MAP}/trajectory"
+"""Way from the pose of the cycle before."""
+VEHICLE: Final = f"{MAP}/vehicle"
+WINDOW: Final = f"{MAP}/window"
+READINGS: Final = f"{MAP}/readings"
+"""Entity above the detections of the cycle: `used`, `gated` or, where it isn't known, `detected`."""
+FEET: Final = f"{READINGS}/feet"
+"""Line from each detection in use to its foot point."""
+TRUE_CONES: Final = f"{MAP}/truth/cones"
+
+HEALTH: Final = "health"
+MESSAGES: Final = "messages"
+UPDATE: Final = "update"
+"""Entity above the time of each update (ms)."""
+SIZES: Final = "size"
+"""Entity above the numbers of control points or landmarks."""
+READING_COUNTS: Final = "readings"
+"""Entity above the numbers of detections that were offered and used."""
 
 WIDEST_BAND: Final = 5.0
-"""Largest width of a band on either side of its curve, m."""
-VEHICLE: Final = np.array([[1.8, 0.0], [-0.9, 0.7], [-0.9, -0.7], [1.8, 0.0]])
-"""The vehicle is shown as this triangle (m, vehicle frame)."""
+"""Largest width of a band on either side of its curve (m)."""
+OUTLINE: Final = np.array([[1.8, 0.0], [-0.9, 0.7], [-0.9, -0.7], [1.8, 0.0]])
+"""Triangle that stands for the vehicle (m, vehicle frame)."""
 LOW, MIDDLE, HIGH, TOP = 10.0, 20.0, 30.0, 40.0
-"""Things are drawn in this order, the last one on top."""
-_PALE: Final = 0.5
-"""The edges of a band have this share of their boundary's colour, and the rest is white."""
-_MILLISECONDS: Final = 1e3
+"""Order of drawing, the last one on top."""
+WHITE: Final = (255, 255, 255)
+"""Background of the map, as in all our figures, since the colours are made for it."""
+_SERIES: Final = {
+    f"{UPDATE}/milliseconds": BLUE,
+    f"{SIZES}/left": BLUE,
+    f"{SIZES}/right": ORANGE,
+    f"{READING_COUNTS}/offered": GREY,
+    f"{READING_COUNTS}/used": GREEN,
+}
+"""Colour of each curve over time."""
+
+
+def blueprint(rerun: Any) -> Any:
+    """Return the arrangement: the map on the left, and all else below each other on the right."""
+    views = rerun.blueprint
+    beside = views.Vertical(
+        views.StateTimelineView(origin=HEALTH, name="health"),
+        views.TimeSeriesView(origin=UPDATE, name="time per cycle [ms]"),
+        views.TimeSeriesView(origin=SIZES, name="size of the map"),
+        views.TimeSeriesView(origin=READING_COUNTS, name="readings per cycle"),
+        views.TextLogView(origin=MESSAGES, name="messages"),
+        row_shares=[1, 2, 2, 2, 2],
+    )
+    begin, now = rerun.TimeRangeBoundary.infinite(), rerun.TimeRangeBoundary.cursor_relative()
+    ranges = [rerun.VisibleTimeRange(name, start=begin, end=now) for name in TIMELINES]
+    look = {"background": WHITE, "overrides": {TRAJECTORY: views.VisibleTimeRanges(ranges)}}
+    track = views.Spatial2DView(origin="/", contents=f"{MAP}/**", name="map", **look)
+    return views.Blueprint(
+        views.Horizontal(track, beside, column_shares=[3, 2]),
+        views.TimePanel(timeline=TIMELINE, state="collapsed"),
+        views.BlueprintPanel(state="collapsed"),
+        views.SelectionPanel(state="collapsed"),
+    )
 
 
 class Recorder:
@@ -54,75 +99,52 @@ class Recorder:
         self._closed = False
         self._set_styles()
         if truth is not None and len(truth.cones):
-            stream.log(entities.TRUE_CONES, rerun.Points2D(truth.cones), static=True)
+            self._log_static(TRUE_CONES, rerun.Points2D(truth.cones))
 
     def __call__(self, cycle: ObservedCycle) -> None:
-        """Records one cycle."""
-        self._stream.set_time(entities.TIMELINE, sequence=cycle.number)
-        self._stream.set_time(entities.TIME, duration=cycle.detections.t)
+        self._stream.set_time(TIMELINE, sequence=cycle.number)
+        self._stream.set_time(TIME, duration=cycle.detections.t)
         self._show_map(cycle.outline)
-        if cycle.number % self._settings.band_every == 0 or self._is_replaced(cycle):
-            self._show_bands(cycle.map)
+        replaced = cycle.result.jump is not None or cycle.result.closed != self._closed
+        if cycle.number % self._settings.band_every == 0 or replaced:
+            for label, boundary in cycle.map.boundaries.items():
+                self._lines(_path(label, "band"), self._band(boundary))
         self._show_vehicle(cycle)
         self._show_readings(cycle)
         self._show_figures(cycle)
-        self._tell(cycle)
-
-    def _is_replaced(self, cycle: ObservedCycle) -> bool:
-        """Returns whether the cycle has replaced the map, so that the last band is not beside it any more."""
-        return cycle.result.jump is not None or cycle.result.closed != self._closed
+        self._show_messages(cycle)
 
     # --- colours and sizes -------------------------------------------------------------------------------
 
     def _set_styles(self) -> None:
-        """Logs what stays as it is: the map's y axis points up, colours, widths and the order of drawing."""
-        rerun, log = self._rerun, self._log_static
+        rerun = self._rerun
         # the y axis of a two-dimensional view points down, as that of a picture does
-        log(entities.MAP, rerun.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
+        self._log_static(MAP, rerun.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
+        lines, points = rerun.LineStrips2D, rerun.Points2D
         for label in BOUNDARIES:
             color = BOUNDARY_COLORS[label]
-            self._style_lines(_path(label, "curve"), color, 1.5, MIDDLE)
-            self._style_lines(_path(label, "tentative"), color, 1.0, MIDDLE)
-            self._style_lines(_path(label, "band"), pale(color), 0.7, LOW)
-            self._style_points(_path(label, "points"), color, 2.0, MIDDLE)
-        for label in (ORANGE_CONE, BIG_ORANGE):
-            self._style_points(_path(label, "points"), RED, 3.0 if label == BIG_ORANGE else 2.0, MIDDLE)
-        self._style_lines(entities.TRAJECTORY, TRAJECTORY_COLOR, 0.7, MIDDLE)
-        self._style_lines(entities.WINDOW, TRAJECTORY_COLOR, 2.0, HIGH)
-        self._style_lines(entities.VEHICLE, "#000000", 1.5, TOP)
-        self._style_lines(entities.FEET, DARK, 0.7, HIGH)
+            self._style(lines, _path(label, "curve"), color, 1.5, MIDDLE)
+            self._style(lines, _path(label, "tentative"), color, 1.0, MIDDLE)
+            self._style(lines, _path(label, "band"), pale(color), 0.7, LOW)
+            self._style(points, _path(label, "points"), color, 2.0, MIDDLE)
+        for label, size in ((ORANGE_CONE, 2.0), (BIG_ORANGE, 3.0)):
+            self._style(points, _path(label, "points"), RED, size, MIDDLE)
+        self._style(lines, TRAJECTORY, TRAJECTORY_COLOR, 0.7, MIDDLE)
+        self._style(lines, WINDOW, TRAJECTORY_COLOR, 2.0, HIGH)
+        self._style(lines, VEHICLE, "#000000", 1.5, TOP)
+        self._style(lines, FEET, DARK, 0.7, HIGH)
         for name, color in (("used", DARK), ("gated", RED), ("detected", GREY)):
-            self._style_points(f"{entities.READINGS}/{name}", color, 3.0, TOP)
-        self._style_points(entities.TRUE_CONES, LIGHT, 2.0, LOW)
-        self._style_series()
-
-    def _style_series(self) -> None:
-        """Names the curves over time, and colours them; the conditions of health have those of the plots."""
-        rerun = self._rerun
-        for path, color in (
-            (f"{entities.UPDATE}/milliseconds", BLUE),
-            (f"{entities.SIZES}/left", BLUE),
-            (f"{entities.SIZES}/right", ORANGE),
-            (f"{entities.READING_COUNTS}/offered", GREY),
-            (f"{entities.READING_COUNTS}/used", GREEN),
-        ):
+            self._style(points, f"{READINGS}/{name}", color, 3.0, TOP)
+        self._style(points, TRUE_CONES, LIGHT, 2.0, LOW)
+        for path, color in _SERIES.items():
             name = path.rpartition("/")[2]
             self._log_static(path, rerun.SeriesLines(colors=[_rgb(color)], names=[name], widths=[1.0]))
         colors = [_rgb(HEALTH_COLORS.get(condition, GREEN)) for condition in CONDITIONS]
-        self._log_static(entities.HEALTH, rerun.StateConfiguration(values=list(CONDITIONS), colors=colors))
+        self._log_static(HEALTH, rerun.StateConfiguration(values=list(CONDITIONS), colors=colors))
 
-    def _style_lines(self, path: str, color: str, width: float, order: float) -> None:
-        radius = self._rerun.Radius.ui_points(width)
-        style = {"colors": [_rgb(color)], "radii": [radius], "draw_order": order}
-        self._log_static(path, self._rerun.LineStrips2D.from_fields(**style))
-
-    def _style_points(self, path: str, color: str, radius: float, order: float) -> None:
-        style = {
-            "colors": [_rgb(color)],
-            "radii": [self._rerun.Radius.ui_points(radius)],
-            "draw_order": order,
-        }
-        self._log_static(path, self._rerun.Points2D.from_fields(**style))
+    def _style(self, kind: Any, path: str, color: str, radius: float, order: float) -> None:
+        radii = [self._rerun.Radius.ui_points(radius)]
+        self._log_static(path, kind.from_fields(colors=[_rgb(color)], radii=radii, draw_order=order))
 
     def _log_static(self, path: str, what: Any) -> None:
         self._stream.log(path, what, static=True)
@@ -136,12 +158,12 @@ class Recorder:
         self._stream.log(path, self._rerun.Points2D.from_fields(positions=points))
 
     def _show_map(self, track: Map) -> None:
-        """Shows each curve, its tentative stretch dashed, control points or landmarks, and orange cones."""
+        """Show each curve, its tentative stretch dashed, control points or landmarks, and orange cones."""
         for label, boundary in (*track.boundaries.items(), *track.points.items()):
             if isinstance(boundary, PointBoundary):
                 self._points(_path(label, "points"), boundary.points)
                 continue
-            u = curve_parameters(boundary.spline, self._settings.samples_per_span)
+            u = style.curve_parameters(boundary.spline, self._settings.samples_per_span)
             until = boundary.confirmed_until
             confirmed, tentative = u[u <= until], u[u > until]
             if len(tentative):
@@ -150,66 +172,50 @@ class Recorder:
             self._lines(_path(label, "tentative"), dashes(boundary.spline.evaluate(tentative)))
             self._points(_path(label, "points"), boundary.spline.distinct_control_points)
 
-    def _show_bands(self, track: Map) -> None:
-        for label, boundary in track.boundaries.items():
-            self._lines(_path(label, "band"), self._band(boundary))
-
     def _band(self, boundary: MapBoundary) -> list[Array]:
-        """Returns both edges of a curve's band, or the ellipse of each landmark."""
         if isinstance(boundary, SplineBoundary):
-            u = curve_parameters(boundary.spline, self._settings.samples_per_span)
-            return list(uncertainty_band(boundary, u, widest=WIDEST_BAND))
-        return list(ellipse_outlines(boundary.points, boundary.covariance))
+            u = style.curve_parameters(boundary.spline, self._settings.samples_per_span)
+            return list(style.uncertainty_band(boundary, u, widest=WIDEST_BAND))
+        return list(style.ellipse_outlines(boundary.points, boundary.covariance))
 
     def _show_vehicle(self, cycle: ObservedCycle) -> None:
-        """Shows the vehicle, the way that it has come since the cycle before, and the window."""
+        """Show the vehicle, the way that it has come since the cycle before, and the window."""
         pose = np.array(cycle.result.pose, float)
-        self._lines(entities.VEHICLE, [to_map(VEHICLE, np.tile(pose, (len(VEHICLE), 1)))])
+        self._lines(VEHICLE, [to_map(OUTLINE, np.tile(pose, (len(OUTLINE), 1)))])
         before = pose if self._last_pose is None else self._last_pose
-        self._lines(entities.TRAJECTORY, [np.array([before[:2], pose[:2]])])
+        self._lines(TRAJECTORY, [np.array([before[:2], pose[:2]])])
         self._last_pose = pose
         if len(cycle.window):
-            self._lines(entities.WINDOW, [cycle.window[:, :2]])
+            self._lines(WINDOW, [cycle.window[:, :2]])
 
     def _show_readings(self, cycle: ObservedCycle) -> None:
-        """Shows the readings, used and gated ones apart where the estimator says it, and foot points."""
         readings = cycle.readings
         if readings is None:
-            local = cycle.detections.points_vehicle
-            points = to_map(local, np.tile(np.asarray(cycle.result.pose, float), (len(local), 1)))
-            self._points(f"{entities.READINGS}/detected", points)
+            points = cycle.detections.points_vehicle
+            pose = np.asarray(cycle.result.pose, float)
+            self._points(f"{READINGS}/detected", to_map(points, np.tile(pose, (len(points), 1))))
             return
-        self._points(f"{entities.READINGS}/used", readings.points[readings.used])
-        self._points(f"{entities.READINGS}/gated", readings.points[~readings.used])
-        feet = np.stack([readings.points[readings.used], readings.feet[readings.used]], axis=1)
-        self._lines(entities.FEET, list(feet))
+        self._points(f"{READINGS}/used", readings.points[readings.used])
+        self._points(f"{READINGS}/gated", readings.points[~readings.used])
+        self._lines(FEET, list(np.stack([readings.points, readings.feet], axis=1)[readings.used]))
 
     # --- what has none -----------------------------------------------------------------------------------
 
     def _show_figures(self, cycle: ObservedCycle) -> None:
-        """Shows the figures that are curves over time."""
-        left, right = cycle.result.sizes
-        figures: dict[str, float] = {
-            f"{entities.SIZES}/left": left,
-            f"{entities.SIZES}/right": right,
-            f"{entities.READING_COUNTS}/offered": len(cycle.detections.labels),
-            f"{entities.READING_COUNTS}/used": cycle.result.readings,
-        }
-        if np.isfinite(cycle.seconds):
-            figures[f"{entities.UPDATE}/milliseconds"] = _MILLISECONDS * cycle.seconds
-        for path, value in figures.items():
-            self._stream.log(path, self._rerun.Scalars(value))
+        offered, used = len(cycle.detections.labels), cycle.result.readings
+        values = (1e3 * cycle.seconds, *cycle.result.sizes, offered, used)
+        for path, value in zip(_SERIES, values, strict=True):
+            if np.isfinite(value):
+                self._stream.log(path, self._rerun.Scalars(value))
 
-    def _tell(self, cycle: ObservedCycle) -> None:
-        """Tells of a new condition of health with its reason, of the closing of the loop, and of notices."""
+    def _show_messages(self, cycle: ObservedCycle) -> None:
         result, health, levels = cycle.result, cycle.result.health, self._rerun.TextLogLevel
         if health.condition and health.condition != self._last_health.condition:
-            self._stream.log(entities.HEALTH, self._rerun.StateChange(state=[health.condition]))
+            self._stream.log(HEALTH, self._rerun.StateChange(state=[health.condition]))
         if health.condition and health != self._last_health:
-            level = (
-                levels.ERROR if health.condition == LOST else levels.WARN if health.reason else levels.INFO
-            )
-            self._say(f"{health.condition}: {health.reason}" if health.reason else health.condition, level)
+            level = levels.WARN if health.reason else levels.INFO
+            text = f"{health.condition}: {health.reason}" if health.reason else health.condition
+            self._say(text, levels.ERROR if health.condition == LOST else level)
         if result.closed and not self._closed:
             self._say(f"the loop is closed, on {sum(result.sizes)} points", levels.INFO)
         if result.jump is not None:
@@ -219,24 +225,22 @@ class Recorder:
         self._last_health, self._closed = health, result.closed
 
     def _say(self, text: str, level: str) -> None:
-        self._stream.log(entities.MESSAGES, self._rerun.TextLog(text, level=level))
+        self._stream.log(MESSAGES, self._rerun.TextLog(text, level=level))
 
 
 def dashes(points: Array) -> list[Array]:
-    """Returns every other piece of the line through points (k, 2)."""
+    """Return every other piece of the line through points (k, 2)."""
     return [points[first : first + 2] for first in range(0, len(points) - 1, 2)]
 
 
 def _path(label: int, part: str) -> str:
-    """Returns the path of a part of a boundary."""
-    return f"{entities.MAP}/{NAMES[label]}/{part}"
+    return f"{MAP}/{NAMES[label]}/{part}"
 
 
 def pale(color: str) -> str:
-    """Returns a colour "#rrggbb" mixed with white."""
-    return str(to_hex(1.0 - _PALE * (1.0 - np.array(to_rgb(color)))))
+    """Return a colour "#rrggbb" mixed with as much white."""
+    return str(to_hex(0.5 + 0.5 * np.array(to_rgb(color))))
 
 
 def _rgb(color: str) -> tuple[int, ...]:
-    """Returns red, green and blue, 0 to 255 each, of a colour "#rrggbb"."""
     return tuple(bytes.fromhex(color.removeprefix("#")))

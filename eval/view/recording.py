@@ -9,29 +9,28 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.view.animation import Animation, lap_seconds
-from pathspace_graph.eval.view.blueprint import blueprint
-from pathspace_graph.eval.view.film import check_film_file, film
-from pathspace_graph.eval.view.recorder import Recorder
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.run import Observer
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 
+from .animation import Animation, lap_seconds
+from .film import check_film_file, film
+from .recorder import Recorder, blueprint
+
 APPLICATION: Final = "pathspace_graph"
-"""The viewer keeps what a user arranges by this name."""
+"""Name by which the viewer keeps what a user arranges."""
 SUFFIX: Final = ".rrd"
-"""A recording's file has this suffix."""
 DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
-"""One of these variables of the environment is set where there is a display, on Linux."""
+"""Variables of the environment of which one is set where there is a display, on Linux."""
 PORT: Final = 9876
-"""The viewer listens on this port, which is rerun's own; a viewer that is there already is used."""
+"""The viewer's port, rerun's own; a viewer that is there already is used."""
 _TIMEOUT: Final = 2.0
-"""A viewer that was started answers within this time (s)."""
+"""Time within which a viewer that was started answers (s)."""
 
 
 def import_rerun(option: str) -> Any:
-    """Returns the package `rerun`; a SettingsError says how to install it where it is missing."""
+    """Return the package `rerun`; a SettingsError says how to install it where it is missing."""
     try:
         # the package is optional
         import rerun  # noqa: PLC0415
@@ -43,7 +42,7 @@ def import_rerun(option: str) -> Any:
 
 
 def check_recording(file: Path | None, window: bool) -> None:
-    """Raises a SettingsError where a recording could not be opened, before anything is mapped."""
+    """Raise a SettingsError where a recording could not be opened, before anything is mapped."""
     if file is not None:
         if file.suffix.lower() != SUFFIX:
             raise SettingsError(f"{file}: expected a recording's name that ends in {SUFFIX}")
@@ -57,7 +56,7 @@ def check_recording(file: Path | None, window: bool) -> None:
 
 
 def has_display(platform: str, environment: Mapping[str, str]) -> bool:
-    """Returns whether a window can be opened, as far as the environment tells."""
+    """Return whether a window can be opened, as far as the environment tells."""
     return not platform.startswith("linux") or any(environment.get(name) for name in DISPLAYS)
 
 
@@ -69,7 +68,7 @@ def recording(
     settings: RecordingSettings | None = None,
     truth: Truth | None = None,
 ) -> Iterator[Recorder]:
-    """Yields an observer that records each cycle that it is shown, to a file, to a window, or to both.
+    """Yield an observer that records each cycle that it is shown, to a file, to a window, or to both.
 
     The file appears as a whole at the end, and an earlier one is kept as a numbered backup. The window stays
     open afterwards. The true cones are shown where there is a truth.
@@ -86,7 +85,6 @@ def recording(
 
 
 def _connect(rerun: Any, stream: Any, path: Path | None, window: bool) -> None:
-    """Leads a stream to a file, to a window, or to both; each of them gets the blueprint."""
     if window:
         _open_window(rerun, stream)
     sinks = [] if path is None else [rerun.FileSink(str(path))]
@@ -97,9 +95,10 @@ def _connect(rerun: Any, stream: Any, path: Path | None, window: bool) -> None:
 
 
 def _open_window(rerun: Any, stream: Any) -> None:
-    """Starts the viewer, unless one is there already; a SettingsError where it does not start."""
+    """Start the viewer, unless one is there already; a SettingsError where it does not start."""
+    beside = Path(sys.executable).with_name("rerun")  # need not be on the path
+    viewer = {"executable_path": str(beside) if beside.exists() else None, "hide_welcome_screen": True}
     try:
-        viewer = {"executable_path": _viewer(), "hide_welcome_screen": True}
         rerun.spawn(port=PORT, connect=False, recording=stream, **viewer)
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
@@ -110,45 +109,28 @@ def _open_window(rerun: Any, stream: Any) -> None:
         raise SettingsError(f"--view: expected the viewer on port {PORT}, found none: {error}") from error
 
 
-def _viewer() -> str | None:
-    """Returns the viewer beside this Python, which need not be on the path; None leaves the search to it."""
-    viewer = Path(sys.executable).with_name("rerun")
-    return str(viewer) if viewer.exists() else None
-
-
 # --- all that watches a run ------------------------------------------------------------------------------
 
 
 class Watched(Protocol):
-    """Describes the options of a command by which a run is watched."""
+    """Options of a command by which a run is watched."""
 
     @property
-    def estimator(self) -> str:
-        """Returns the name of the estimator."""
-
+    def estimator(self) -> str: ...
     @property
-    def view(self) -> bool:
-        """Returns whether a window of the live viewer is wanted."""
-
+    def view(self) -> bool: ...
     @property
-    def save_view(self) -> Path | None:
-        """Returns the file of the recording."""
-
+    def save_view(self) -> Path | None: ...
     @property
-    def animate(self) -> Path | None:
-        """Returns the file of the film."""
-
+    def animate(self) -> Path | None: ...
     @property
-    def recording(self) -> RecordingSettings:
-        """Returns the settings of the recording."""
-
+    def recording(self) -> RecordingSettings: ...
     @property
-    def film(self) -> FilmSettings:
-        """Returns the settings of the film."""
+    def film(self) -> FilmSettings: ...
 
 
 def check_watchers(options: Watched) -> None:
-    """Raises where a run could not be watched so, before anything is mapped."""
+    """Raise where a run could not be watched so, before anything is mapped."""
     check_recording(options.save_view, options.view)
     if options.animate is not None:
         check_film_file(options.animate)
@@ -156,14 +138,12 @@ def check_watchers(options: Watched) -> None:
 
 @contextmanager
 def watchers(options: Watched, log: Log) -> Iterator[list[Observer]]:
-    """Yields the observers that were asked for; their files are written at the end, or on failure none."""
+    """Yield the observers that were asked for; their files are written at the end, or on failure none."""
     observers: list[Observer] = []
     with ExitStack() as stack:
         if options.view or options.save_view is not None:
-            opened = recording(
-                options.save_view, window=options.view, settings=options.recording, truth=log.truth
-            )
-            observers.append(stack.enter_context(opened))
+            how: dict[str, Any] = {"settings": options.recording, "truth": log.truth}
+            observers.append(stack.enter_context(recording(options.save_view, window=options.view, **how)))
         animation = None
         if options.animate is not None:
             if not log.cycles:

@@ -46,7 +46,6 @@ class Batch:
     """Settings of the estimator."""
 
     def run(self) -> None:
-        """Read, optimize, write and report; the exit code is 3 if it did not converge."""
         check_batch(self.estimator)
         name = for_map(self.estimator, self.map)
         if self.start == "odometry" and name != DEFAULT_BATCH:

@@ -2,19 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from tyro.conf import Positional, arg
 
 from pathspace_graph.console import note, output, progress, say
-from pathspace_graph.eval.experiment.compare import (
-    Comparison,
-    choose,
-    choose_reference,
-    compare,
-    read_logs,
-    tables,
-)
+from pathspace_graph.eval.experiment import compare as experiment
+from pathspace_graph.eval.experiment.compare import Comparison, compare, tables
 from pathspace_graph.eval.experiment.output import MARKER, write_comparison
 from pathspace_graph.eval.experiment.workers import check_jobs
 from pathspace_graph.eval.metrics.accuracy import GhostSettings
@@ -52,24 +46,16 @@ class Compare:
     """Settings of every estimator."""
 
     def run(self) -> None:
-        """Check, run, write and report; the exit code is 3 where an estimator failed."""
-        estimators = choose(self.estimators)
-        reference = choose_reference(self.reference, estimators)
+        estimators = experiment.choose(self.estimators)
+        reference = experiment.choose_reference(self.reference, estimators)
         check_jobs(self.jobs)
         check_target(self.out, MARKER)
-        logs = read_logs(self.log, self.settings.limits)
+        logs = experiment.read_logs(self.log, self.settings.limits)
         for named in logs:
             tell(named.hints, of=named.name if len(logs) > 1 else "")
         with progress("comparing", len(logs) * len(estimators)) as advance:
-            comparison = compare(
-                logs,
-                estimators,
-                self.settings,
-                reference=reference,
-                ghosts=self.ghosts,
-                jobs=self.jobs,
-                on_run=advance,
-            )
+            how: dict[str, Any] = {"reference": reference, "ghosts": self.ghosts, "jobs": self.jobs}
+            comparison = compare(logs, estimators, self.settings, on_run=advance, **how)
         with progress("writing"):
             write_comparison(self.out, comparison, self.settings, self.jobs)
         self._report(comparison)

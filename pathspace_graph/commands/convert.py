@@ -4,7 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from math import inf
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -98,7 +98,6 @@ class Convert:
     """Noise that the record does not state."""
 
     def run(self) -> None:
-        """Convert one record, or each of a folder, and name those that are refused in one line."""
         records = self._records()
         if not records:
             self._convert(self.source, self.out)
@@ -126,7 +125,6 @@ class Convert:
         return sorted({*known, *bags})
 
     def _convert(self, source: Path | None, out: Path) -> None:
-        """Read, convert, write and report."""
         check_target(out, LOG_FILE)
         frames = Frames(self.mounting, self.y_odometry or self.y, self.y)
         rule = LabelRule(self.labels)
@@ -154,17 +152,9 @@ class Convert:
         return read_bag(source, self._bag_options(), rule)
 
     def _bag_options(self) -> BagOptions:
-        return BagOptions(
-            odometry=self.odometry,
-            detections=self.detections,
-            imu=self.imu,
-            wheelbase=self.wheelbase,
-            definitions=self.definition,
-            label_field=self.label_field,
-            from_poses=self.from_poses,
-            received=self.received,
-            mounted=self.mounting is not None,
-        )
+        names = ("odometry", "detections", "imu", "wheelbase", "label_field", "from_poses", "received")
+        same: dict[str, Any] = {name: getattr(self, name) for name in names}
+        return BagOptions(definitions=self.definition, mounted=self.mounting is not None, **same)
 
 
 def with_measured_noise(log: Log) -> Log:

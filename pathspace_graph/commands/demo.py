@@ -45,7 +45,6 @@ class Demo:
     """Settings of both estimators."""
 
     def run(self) -> None:
-        """Simulate, map, draw and report."""
         check_target(self.out, PICTURE)
         with progress("driving"):
             log = simulate(generated_track(self.seed), SimulationSettings(laps=self.laps), self.seed)

@@ -51,7 +51,6 @@ class Export:
     """End the `profile` of an open track at a standstill."""
 
     def run(self) -> None:
-        """Read the map and write the file."""
         check_file_target(self.out)
         if not LEAST_STEP <= self.step < np.inf:
             raise SettingsError(
@@ -60,11 +59,11 @@ class Export:
         if self.format != "profile" and (self.stop or self.start_speed is not None):
             raise SettingsError(f"--start-speed, --stop: expected --as profile, found --as {self.format}")
         plane = self._plane()
-        if self.format == "tum" and not (self.map / MAP_FILE).exists() and (self.map / LOG_FILE).exists():
+        file = self.map / MAP_FILE
+        if self.format == "tum" and not file.exists() and (self.map / LOG_FILE).exists():
             write_true_path(self.map, self.out)
             return
         track = read_map(self.map)
-        file = self.map / MAP_FILE
         check_length(track, self.step, file)
         with atomic_file(self.out) as temporary:
             try:
@@ -80,7 +79,8 @@ class Export:
         elif self.format == "points":
             write_points(file, track, self.step)
         elif self.format == "tum":
-            copy_trajectory(self.map / TRAJECTORY_FILE, file)
+            read_trajectory(self.map / TRAJECTORY_FILE)  # or it is refused
+            shutil.copyfile(self.map / TRAJECTORY_FILE, file)
         elif plane is not None:
             write = write_geojson if self.format == "geojson" else write_lanelet2
             write(file, track, self.step, plane)
@@ -101,12 +101,6 @@ def write_true_path(folder: Path, out: Path) -> None:
         raise InputError(folder, f"expected a log with {TRUTH_POSES_FILE}, or a map, found neither")
     with atomic_file(out) as temporary:
         write_trajectory(temporary, truth.pose_t, truth.poses)
-
-
-def copy_trajectory(source: Path, target: Path) -> None:
-    """Copy the trajectory of a map, which is in the TUM format already, once it is found right."""
-    read_trajectory(source)
-    shutil.copyfile(source, target)
 
 
 def check_length(track: Map, step: float, file: Path) -> None:

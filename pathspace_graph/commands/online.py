@@ -14,15 +14,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT, MapKind, check_online, for_map, make_online
+from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.eval.metrics.summary import (
-    health_of,
-    lap_times,
-    laps_of,
-    not_mapped,
-    stretches_of,
-    summarize,
-)
+from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
@@ -66,7 +60,6 @@ class Online:
     """Settings of the estimator."""
 
     def run(self) -> None:
-        """Read, map, write and report."""
         check_online(self.estimator)
         name = for_map(self.estimator, self.map)
         check_target(self.out, MAP_FILE)
@@ -83,10 +76,8 @@ class Online:
         if self.save is not None and isinstance(estimator, FixedLagMapper):
             estimator.save(self.save)
         report(result, log)
-        written = ", ".join(
-            str(path) for path in (self.out, self.save_view, self.animate) if path is not None
-        )
-        say(f"written to {written}")
+        written = [str(path) for path in (self.out, self.save_view, self.animate) if path is not None]
+        say(f"written to {', '.join(written)}")
 
     def _viewing(self) -> Any:
         """Return the module of viewers and films if one is asked for; importing matplotlib is slow."""
@@ -127,14 +118,10 @@ def map_online(
     log: Log, estimator: OnlineEstimator, name: str = DEFAULT, observers: Sequence[Observer] = ()
 ) -> RunResult:
     """Map a log with progress; the map at the end of each true lap is kept where there is truth."""
+    times = summary.lap_times(log)
     with progress("mapping", len(log.cycles)) as advance, solving("an update"):
-        return run_online(
-            log,
-            estimator,
-            name=name,
-            snapshot_times=lap_times(log),
-            observers=[lambda _: advance(), *observers],
-        )
+        watching = [lambda _: advance(), *observers]
+        return run_online(log, estimator, name=name, snapshot_times=times, observers=watching)
 
 
 def report(result: RunResult, log: Log) -> None:
@@ -168,7 +155,7 @@ def outline(result: RunResult) -> str:
 
 def health_outline(result: RunResult) -> list[str]:
     """Return how many cycles were not good, and why the vehicle is lost at the end, if any were."""
-    number = counts([health_of(record) for record in result.cycles])
+    number = counts([summary.health_of(record) for record in result.cycles])
     total = max(len(result.cycles), 1)
     reasons = Counter(record.reason for record in result.cycles if record.health == DEGRADED)
     mostly = f" (mostly: {reasons.most_common(1)[0][0]})" if reasons else ""
@@ -177,7 +164,7 @@ def health_outline(result: RunResult) -> list[str]:
         for condition, why in ((DEGRADED, mostly), (LOST, ""))
         if number[condition]
     ]
-    last = stretches_of(result)[-1:]
+    last = summary.stretches_of(result)[-1:]
     if last and last[0].health == LOST and last[0].end == result.cycles[-1].t:
         parts.append(f"still lost since {last[0].begin:.1f} s ({last[0].reason})")
     return parts

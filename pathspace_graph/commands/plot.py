@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -51,16 +52,8 @@ class Plot:
         trajectory, smoothed = (read_trajectory(file)[1] if file.exists() else None for file in files)
         cycles = self.map / CYCLES_FILE
         health = read_health(cycles) if cycles.exists() else []
-        figure = plot_map(
-            track,
-            log=log,
-            trajectory=trajectory,
-            smoothed=smoothed,
-            health=health,
-            band_scale=self.band_scale,
-            title=self.title,
-        )
-        save_plot(figure, self.out)
+        look: dict[str, Any] = {"health": health, "band_scale": self.band_scale, "title": self.title}
+        save_plot(plot_map(track, log=log, trajectory=trajectory, smoothed=smoothed, **look), self.out)
 
 
 # --- the paper's isolated tests --------------------------------------------------------------------------
@@ -77,8 +70,7 @@ class Figures:
         check_target(self.out, MARKER)
         with progress("drawing", len(FIGURES)) as advance, threadpool_limits(limits=1):
             write_figures(self.out, advance)
-        names = ", ".join(figure.name for figure in FIGURES)
-        say(f"{names}: {self.out}")
+        say(f"{', '.join(figure.name for figure in FIGURES)}: {self.out}")
 
 
 # --- files as they were written --------------------------------------------------------------------------
@@ -92,7 +84,4 @@ class Verify:
     """Folder of a log, a map, or the result of another command, with its subfolders."""
 
     def run(self) -> None:
-        """Check and report; a file that is missing or has changed ends it."""
-        count = verify_all(self.folder)
-        line = f"{self.folder}: {count} files are as they were written"
-        say(line)
+        say(f"{self.folder}: {verify_all(self.folder)} files are as they were written")

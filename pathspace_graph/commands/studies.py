@@ -64,7 +64,10 @@ class StudyCommand:
         text = write(study, frame, self.out)
         write_manifest(self.out)
         say(text.rstrip("\n"), f"\nwritten to {self.out}")
-        report_failures(frame, len(plan.cells))
+        failures = frame[frame["failure"] != ""]["failure"].tolist()
+        if failures:
+            note(f"{len(failures)} of {len(plan.cells)} cells failed, the first of {failures[0]}")
+            raise SystemExit(CELLS_FAILED)
 
 
 def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], laps: int | None) -> Study:
@@ -80,14 +83,6 @@ def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], l
     return replace(study, **own)  # type: ignore[arg-type]
 
 
-def report_failures(frame: pd.DataFrame, cells: int) -> None:
-    """Say on standard error how many cells failed, and exit with code 3 where any did."""
-    failures = frame[frame["failure"] != ""]
-    if len(failures):
-        note(f"{len(failures)} of {cells} cells failed, the first of {failures.iloc[0]['failure']}")
-        raise SystemExit(CELLS_FAILED)
-
-
 # --- ablate ----------------------------------------------------------------------------------------------
 
 
@@ -99,7 +94,6 @@ class Ablate(StudyCommand):
     """TOML file of the study, or name of one that comes with the package."""
 
     def run(self) -> None:
-        """Check, run, write and report the study; the exit code is 3 where cells failed."""
         self.execute(read_study(find_study(self.study)), write_study)
 
 
@@ -122,7 +116,6 @@ class FaultSuite(StudyCommand):
     """Run each fault at its greatest strength only."""
 
     def run(self) -> None:
-        """Check, run, write and report the suite; the exit code is 3 where runs failed."""
         chosen = replace(only(suite(), self.only), estimators=(self.estimator,))
         self.execute(strongest(chosen) if self.quick else chosen, write_suite)
 
@@ -152,7 +145,6 @@ class Scale:
     """Settings of every estimator."""
 
     def run(self) -> None:
-        """Check, simulate, time, write and report."""
         names = tuple(dict.fromkeys(self.estimators or ONLINE))
         for name in names:
             check_online(name)
@@ -176,8 +168,8 @@ class Scale:
 class Report:
     """Measure the figures of the pages, or what remains of them, and write them and the pages' tables.
 
-    The experiments are `accuracy`, `skidpad` and `speed`. Each keeps its runs in a folder of its own, from
-    which a second call goes on.
+    The experiments are `accuracy`, `skidpad`, `camera`, `faults` and `speed`. Each keeps its runs in a folder
+    of its own, from which a second call goes on.
     """
 
     out: Path
@@ -194,7 +186,6 @@ class Report:
     """Drive little, to see that everything works; it goes with no pages."""
 
     def run(self) -> None:
-        """Check, measure, write and report."""
         check_jobs(self.jobs)
         if self.quick and self.pages is not None:
             raise SettingsError("--pages: expected none with --quick, whose figures mean little")

@@ -15,7 +15,7 @@ LONGEST: Final = 3
 
 def pictures() -> Any:
     """Return the module of pictures of records."""
-    return import_module("pathspace_graph.eval.figures.pictures")
+    return import_module("pathspace_graph.eval.figures.map_plot")
 
 
 def frames() -> Any:

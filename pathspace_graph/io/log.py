@@ -200,7 +200,7 @@ class Log:
         return "\n    ".join(lines)
 
     def plot(self, **options: Any) -> Figure:
-        """Return a picture of the log; the options are those of `eval.figures.pictures.plot_log`."""
+        """Return a picture of the log; the options are those of `eval.figures.map_plot.plot_log`."""
         figure: Figure = pictures().plot_log(self, **options)
         return figure
 

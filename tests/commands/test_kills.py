@@ -94,13 +94,13 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
         "commands.online.report": None,
         "commands.batch.report": None,
         "commands.plot.plot_map": picture,
-        "commands.compare.read_logs": [],
+        "eval.experiment.compare.read_logs": [],
         "commands.compare.compare": comparison,
         "commands.compare.Compare._report": None,
         "commands.studies.make_drives": Roads(),
         "commands.studies.measure_scaling": scaling(),
         "eval.experiment.output.plot_maps": picture,
-        "eval.experiment.output.tables": {"table": TextTable("", ("a",), (("1",),))},
+        "eval.experiment.output.comparison_tables": {"table": TextTable("", ("a",), (("1",),))},
         "eval.benchmark.scaling_output.plot_laps": picture,
         "eval.benchmark.scaling_output.plot_scaling": picture,
         "eval.benchmark.scaling_output._process_megabytes": 1.0,
@@ -221,7 +221,7 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     name: str, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}]
-    monkeypatch.setattr(f"{study}.run.try_drive", lambda _: recorded.log)
+    monkeypatch.setattr(f"{study}.cells.Drive.load", lambda _: recorded.log)
     monkeypatch.setattr(f"{study}.cells.lap_rows", lambda *_, **__: rows)
     monkeypatch.setattr(f"{study}.output.figures", lambda *_: {"rmse": Figure()})
     monkeypatch.setattr(f"{study}.output.plot_faults", lambda *_: Figure())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,14 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
+from pathspace_graph.eval.experiment.faults import of_middle_strength, suite
 from pathspace_graph.eval.report import (
     PAGES,
     Figure,
     MeasuredTable,
     accuracy_table,
+    camera_table,
+    faults_table,
     read_figures,
     render,
     render_pages,
@@ -71,6 +75,41 @@ def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
     assert rows[0][1][0].value == pytest.approx(np.sqrt((1.0 + 4.0) / 2.0))
 
 
+def test_the_table_of_the_camera_has_each_noise_and_the_landmarks_that_are_told_all() -> None:
+    parts = [
+        frame(estimator, 2, rmse).assign(variant=variant, nees=1.5, l=0.2, told_degraded=0.25)
+        for estimator, variant, rmse in (("fixed-lag", "default", 0.6), ("spline", "measured", 0.4))
+    ]
+    header, rows = camera_table(pd.concat(parts, ignore_index=True))
+    assert header[:2] == ("estimator, noise", "rmse [m]")
+    assert [label for label, _ in rows] == [
+        "`fixed-lag`, stated",
+        "`spline`, measured",
+        "landmarks, told all",
+    ]
+    assert [figures[0].value for _, figures in rows] == pytest.approx([0.3, 0.2, 0.2])
+    assert rows[0][1][-1].value == pytest.approx(25.0) and rows[2][1][-1].value is None
+    assert all(len(figures) == len(header) - 1 for _, figures in rows)
+
+
+def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength() -> None:
+    study = of_middle_strength(suite())
+    assert list(study.noise)[:2] == ["clean", "latency of detections: 50 ms"]
+    late = list(study.noise)[1]
+    runs = [
+        frame("fixed-lag", 2, rmse).assign(
+            noise=noise, size=50.0, closed_at_end=True, lost_at_end=False, said=said
+        )
+        for noise, rmse, said in (("clean", 0.2, ""), (late, 0.3, "late"))
+    ]
+    pair = replace(study, noise={noise: study.noise[noise] for noise in ("clean", late)})
+    header, rows = faults_table(pair, pd.concat(runs, ignore_index=True).assign(error_max=2.0))
+    assert [label for label, _ in rows] == ["clean", late]
+    assert [figures[0].text for _, figures in rows] == ["1.00", "1.50"]
+    assert rows[1][1][header.index("said so [%]") - 1].text == "100"
+    assert all(len(figures) == len(header) - 1 for _, figures in rows)
+
+
 def test_figures_come_back_from_their_file(tmp_path: Path) -> None:
     write_json(tmp_path / "figures.json", to_json({"one": TABLE}))
     assert read_figures(tmp_path / "figures.json") == {"one": TABLE}
@@ -96,8 +135,8 @@ def test_the_pages_show_the_committed_figures() -> None:
     if not FIGURES.exists():
         pytest.skip("there are no pages beside an installed package")
     tables = read_figures(FIGURES)
-    for name, page in PAGES.items():
-        assert f"<!-- report: {name} -->" in (ROOT / page).read_text(), f"{page} has no table {name}"
+    for name in tables:
+        assert f"<!-- report: {name} -->" in (ROOT / PAGES[name]).read_text(), f"{PAGES[name]}: no {name}"
     for page, text in render_pages(ROOT, tables).items():
         assert page.read_text() == text, f"{page} does not show the figures of {FIGURES.name}"
 

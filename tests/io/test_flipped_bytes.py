@@ -13,8 +13,15 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError, PathspaceError
-from pathspace_graph.eval.experiment.cells import Cell, Outcome, Store, record_of
-from pathspace_graph.eval.experiment.drives import Drive, NamedTrack
+from pathspace_graph.eval.experiment.cells import (
+    Cell,
+    Drive,
+    NamedTrack,
+    Outcome,
+    read_record,
+    record_of,
+    write_record,
+)
 from pathspace_graph.io.log import FILES, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.map import read_map
@@ -86,20 +93,19 @@ def test_in_a_cell_of_a_study(tmp_path: Path) -> None:
     """A damaged cell is run again."""
     track = NamedTrack("round", read_track(write_round_track(tmp_path)))
     cell = Cell(Drive(track, 0, "nominal", SimulationSettings()), "fixed-lag", MapperSettings(), "default")
-    store = Store(tmp_path)
     record = record_of(cell, Outcome.failed(cell, ValueError("lost"))) | {
         "laps": [{"lap": 1, "rmse": 0.123456}]
     }
-    store.write(cell, record)
-    assert store.read(cell) == record
+    write_record(tmp_path, cell, record)
+    assert read_record(tmp_path, cell) == record
     (file,) = (tmp_path / "cells").iterdir()
     good, rng = file.read_bytes(), np.random.default_rng(0)
     for _ in range(FLIPS):
         file.write_bytes(flipped(good, rng))
-        found = store.read(cell)
+        found = read_record(tmp_path, cell)
         assert found is None or found == record  # another blank between two values is no other content
     file.write_text("[]")
-    assert store.read(cell) is None
+    assert read_record(tmp_path, cell) is None
 
 
 def test_a_file_that_a_user_has_edited_is_accepted_without_the_manifest(tmp_path: Path) -> None:

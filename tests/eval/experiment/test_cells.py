@@ -27,7 +27,7 @@ def cell(estimator: str, log: Log) -> Cell[NamedLog]:
 
 
 def test_a_run_is_measured(log: Log) -> None:
-    found = run_cell(cell("rings", log), log)
+    found = run_cell(cell("rings", log))
     assert found.names == {"log": "a", "estimator": "rings"}
     assert [row.lap for row in found.rows] == [1, 2, None]
     assert found.rows[-1].values["seconds"] > 0.0
@@ -41,9 +41,9 @@ def test_a_failure_of_the_run_and_of_the_measure_are_results(
     def measure(result: RunResult, log: Log, seconds: float) -> None:
         raise SettingsError("two\n  lines")
 
-    assert run_cell(cell("broken", log), log).failure == "ValueError: lost the way"
+    assert run_cell(cell("broken", log)).failure == "ValueError: lost the way"
     monkeypatch.setattr(cells, "measure", measure)
-    found = run_cell(cell("rings", log), log)
+    found = run_cell(cell("rings", log))
     assert found.result is None and not found.rows
     assert found.failure == "SettingsError: two lines"
     assert "in measure" in found.trace

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.experiment.drives import Drive, NamedTrack, load_tracks
+from pathspace_graph.eval.experiment.cells import Drive, NamedTrack, load_tracks
 from pathspace_graph.sim.simulate import SimulationSettings
 
 from ...scenes.pretenders import write_round_track

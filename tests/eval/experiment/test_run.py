@@ -12,11 +12,14 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.errors import OutputError, SettingsError
+from pathspace_graph.eval.experiment import cells as drives
 from pathspace_graph.eval.experiment import run as study_run
+from pathspace_graph.eval.experiment.cells import Drive
 from pathspace_graph.eval.experiment.frame import TIMES, without_times
 from pathspace_graph.eval.experiment.output import write_study, write_tables
-from pathspace_graph.eval.experiment.run import make_plan, run_study
+from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study
+from pathspace_graph.io.log import Log
 
 from ...scenes.pretenders import Fragile, Pretender, contents, register, write_round_track
 
@@ -80,10 +83,11 @@ def test_results_load_into_pandas(study: Study, tmp_path: Path) -> None:
 
 def test_a_log_is_simulated_once(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
     simulated = []
-    real = study_run.try_drive
-    monkeypatch.setattr(study_run, "try_drive", lambda drive: simulated.append(drive.id) or real(drive))
+    real = drives.simulate
+    monkeypatch.setattr(drives, "simulate", lambda *args: simulated.append(args) or real(*args))
+    monkeypatch.setattr(drives, "_latest", {})
     run_study(study)
-    assert len(simulated) == len(set(simulated)) == 2
+    assert len(simulated) == len({seed for *_, seed in simulated}) == 2
 
 
 def test_a_study_all_of_whose_cells_fail_has_rows_and_a_summary(study: Study, tmp_path: Path) -> None:
@@ -113,7 +117,6 @@ def test_a_killed_study_goes_on_where_it_was_with_the_same_results(study: Study,
         with pytest.raises(KeyboardInterrupt):
             run_study(study, killed, on_cell=interrupt_after(cells))
     assert len(list((killed / "cells").iterdir())) == 5
-    assert list((killed / "logs").iterdir())
     # what a kill in the middle of writing leaves
     cell = next((killed / "cells").iterdir())
     cell.with_name(".half.tmp.json").write_text("{")
@@ -122,17 +125,13 @@ def test_a_killed_study_goes_on_where_it_was_with_the_same_results(study: Study,
     first, second = contents(whole), contents(killed)
     for name in ("results.csv", "study.json"):
         assert first[name] == second[name]
-    assert not (killed / "logs").exists()
 
 
-def test_a_damaged_cell_or_log_is_made_again(study: Study, tmp_path: Path) -> None:
+def test_a_damaged_cell_is_made_again(study: Study, tmp_path: Path) -> None:
     first = run_study(study, tmp_path)
     cells = sorted((tmp_path / "cells").iterdir())
     cells[0].write_text("{")
     calls = Pretender.calls + Fragile.calls
-    drive = make_plan(study).cells[0].drive
-    (tmp_path / "logs").mkdir()
-    (tmp_path / "logs" / f"{drive.id}.log").write_bytes(b"not a log")
     again = run_study(study, tmp_path)
     assert Pretender.calls + Fragile.calls == calls + 1
     pd.testing.assert_frame_equal(without_times(first), without_times(again))
@@ -162,9 +161,14 @@ def test_failed_cells_are_kept_until_they_are_to_be_retried(
 def test_a_log_that_cannot_be_simulated_fails_its_cells_only(
     study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = study_run.try_drive
-    stuck = ValueError("stuck")
-    monkeypatch.setattr(study_run, "try_drive", lambda drive: stuck if drive.seed == 1 else real(drive))
+    real = Drive.simulate
+
+    def simulate(drive: Drive) -> Log:
+        if drive.seed == 1:
+            raise ValueError("stuck")
+        return real(drive)
+
+    monkeypatch.setattr(Drive, "simulate", simulate)
     frame = run_study(replace(study, estimators=("pretender",)))
     assert set(frame[frame["seed"] == 1]["failure"]) == {"ValueError: stuck"}
     assert set(frame[frame["seed"] == 0]["failure"]) == {""}

@@ -12,8 +12,15 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.ckf.expansion import beyond_end
 from pathspace_graph.cli import main
 from pathspace_graph.eval.figures.curves import BLIND, simplification, uncertainty
-from pathspace_graph.eval.figures.isolated import FIGURES, MARKER
-from pathspace_graph.eval.figures.updates import RIDGE, SIGMA_DETECTION, expansion, extend, fit
+from pathspace_graph.eval.figures.isolated import (
+    FIGURES,
+    MARKER,
+    RIDGE,
+    SIGMA_DETECTION,
+    expansion,
+    extend,
+    fit,
+)
 from pathspace_graph.io.manifest import MANIFEST_FILE
 from pathspace_graph.mapping.belief import cubature_points, square_root
 from pathspace_graph.settings.batch import CkfSettings

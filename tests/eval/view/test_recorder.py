@@ -10,7 +10,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from pathspace_graph.estimators import make_online
-from pathspace_graph.eval.view import entities
+from pathspace_graph.eval.view import recorder as entities
 from pathspace_graph.eval.view.recorder import dashes, pale
 from pathspace_graph.eval.view.recording import recording
 from pathspace_graph.io.log import Log
