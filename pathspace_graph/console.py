@@ -31,6 +31,16 @@ LINES: Final = 20
 """About the number of lines of progress, where they are printed."""
 
 
+@contextmanager
+def verbosity(level: str) -> Iterator[None]:
+    """Set the level, by its name, within the context."""
+    before = VERBOSITY.set(Verbosity[level])
+    try:
+        yield
+    finally:
+        VERBOSITY.reset(before)
+
+
 def output(wide: bool = False) -> Console:
     """Return the console for results; tables are `FILE_WIDTH` wide in a file if `wide`."""
     quiet = VERBOSITY.get() == Verbosity.QUIET

@@ -9,9 +9,9 @@ from math import nan
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
@@ -21,10 +21,6 @@ from .errors import check_type
 from .health import Health
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,46 +367,39 @@ class _Run:
     def result(self, name: str) -> RunResult:
         """Return the results after the last cycle."""
         self._take_snapshots(before=float("inf"))
-        track = self._estimator.map()
+        estimator, records, track = self._estimator, self._records, self._estimator.map()
         if self._laps.last_lap_is_complete:
             self._lap_maps.append((self._laps.lap, track))
-        t = np.array([record.t for record in self._records])
+        t = np.array([record.t for record in records])
         trajectory = np.array(self._poses).reshape(-1, 3)
+        smoothed = estimator.smoothed(t) if isinstance(estimator, SmoothingEstimator) else np.full(3, np.nan)
+        is_smoothed = np.isfinite(smoothed)
         return RunResult(
             estimator=name,
-            settings=settings_dict(self._estimator.settings),
+            settings=settings_dict(estimator.settings),
             map=track,
             trajectory_t=t,
             trajectory=trajectory,
-            cycles=tuple(self._records),
+            cycles=tuple(records),
             laps=self._laps.completed,
             lap_maps=tuple(self._lap_maps),
             snapshots=tuple(self._snapshots),
-            vehicle=_vehicle_state(self._estimator) if self._records else None,
+            vehicle=(
+                estimator.vehicle_state() if records and isinstance(estimator, VehicleEstimator) else None
+            ),
             observing=self._observing,
-            batches=self._estimator.batches() if isinstance(self._estimator, BatchingEstimator) else None,
+            batches=estimator.batches() if isinstance(estimator, BatchingEstimator) else None,
             waited=self._waited,
-            noise=self._estimator.noise_used() if isinstance(self._estimator, NoiseEstimator) else None,
-            scale=scale(self._estimator),
-            smoothed=self._smoothed(t, trajectory),
+            noise=estimator.noise_used() if isinstance(estimator, NoiseEstimator) else None,
+            scale=scale(estimator),
+            smoothed=np.where(is_smoothed, smoothed, trajectory) if is_smoothed.any() else None,
         )
-
-    def _smoothed(self, t: Array, trajectory: Array) -> Array | None:
-        if not isinstance(self._estimator, SmoothingEstimator):
-            return None
-        smoothed = self._estimator.smoothed(t)
-        corrected = np.isfinite(smoothed)
-        return np.where(corrected, smoothed, trajectory) if corrected.any() else None
 
     def _take_snapshots(self, before: float) -> None:
         while len(self._snapshots) < len(self._snapshot_times):
             if self._snapshot_times[len(self._snapshots)] >= before:
                 return
             self._snapshots.append(self._estimator.map())
-
-
-def _vehicle_state(estimator: OnlineEstimator) -> VehicleState | None:
-    return estimator.vehicle_state() if isinstance(estimator, VehicleEstimator) else None
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:
