@@ -81,30 +81,6 @@ class BatchEstimator(Protocol):
         """Return the optimum over a whole log, whose truth is not read."""
 
 
-@runtime_checkable
-class OutliningEstimator(Protocol):
-    """An online estimator whose map is cheap to look at in every cycle."""
-
-    def outline(self) -> Map:
-        """Return a copy of the map as it stands, without covariances, which are empty (0, 0)."""
-
-
-@runtime_checkable
-class VehicleEstimator(Protocol):
-    """An online estimator that knows the uncertainty of the vehicle's pose and its calibration."""
-
-    def vehicle_state(self) -> VehicleState:
-        """Return the newest pose and the calibration, with their joint covariance."""
-
-
-@runtime_checkable
-class NoiseEstimator(Protocol):
-    """An online estimator that says which noise it uses."""
-
-    def noise_used(self) -> RunNoise:
-        """Return the noise that is used now, and what was measured so far."""
-
-
 @dataclass(frozen=True, eq=False)
 class Readings:
     """Detections of the newest cycle as the estimator took them, seen from its newest pose."""
@@ -121,44 +97,32 @@ class Readings:
     """Foot point (k, 2) of each used detection on its curve or landmark, in m, map frame; NaN for others."""
 
 
-@runtime_checkable
-class ReadingEstimator(Protocol):
-    """An online estimator that says which detections of the newest cycle it used, and where."""
+class OptionalMethods(Protocol):
+    """Methods that an online estimator may have as well, each of which is used where it is there."""
+
+    def outline(self) -> Map:
+        """Return a copy of the map as it stands, without covariances, which are empty (0, 0)."""
+
+    def vehicle_state(self) -> VehicleState:
+        """Return the newest pose and the calibration, with their joint covariance."""
+
+    def noise_used(self) -> RunNoise:
+        """Return the noise that is used now, and what was measured so far."""
 
     def readings(self) -> Readings:
         """Return the detections of the newest cycle as they were used or gated."""
 
-
-@runtime_checkable
-class WindowEstimator(Protocol):
-    """An online estimator that keeps a window of poses."""
-
     def window_poses(self) -> Array:
         """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
 
-
-@runtime_checkable
-class LookedAtEstimator(Protocol):
-    """An online estimator that has to be told that it is looked at only."""
-
     def looked_at(self) -> AbstractContextManager[None]:
         """Return a context in which nothing that is asked for changes the estimate."""
-
-
-@runtime_checkable
-class BatchingEstimator(Protocol):
-    """An online estimator that has batches solved by another process while it goes on."""
 
     def wait(self) -> None:
         """Wait for the batch whose result the next update may take, however long that takes."""
 
     def batches(self) -> LapBatches:
-        """Return the cycles in which batches have ended."""
-
-
-@runtime_checkable
-class SmoothingEstimator(Protocol):
-    """An online estimator that corrects earlier poses when the loop closes."""
+        """Return the cycles in which batches of another process have ended."""
 
     def smoothed(self, t: Array) -> Array:
         """Return the corrected poses (n, 3) of the cycles at stamps (n,); NaN after the last of them."""
@@ -171,7 +135,8 @@ def scale(estimator: OnlineEstimator) -> float:
 
 def outline(estimator: OnlineEstimator) -> Map:
     """Return the present map, without covariances where the estimator can give it so."""
-    return estimator.outline() if isinstance(estimator, OutliningEstimator) else estimator.map()
+    track: Map = estimator.outline() if hasattr(estimator, "outline") else estimator.map()
+    return track
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,24 +162,20 @@ class ObservedCycle:
     def record(self) -> CycleRecord:
         """Return the cycle as a row of `cycles.csv` has it."""
         result = self.result
+        same = ("readings", "closed", "notice", "dropped", "late", "refused")
         return CycleRecord(
             cycle=self.number,
             t=self.detections.t,
             seconds=self.seconds,
             size_left=result.sizes[LEFT],
             size_right=result.sizes[RIGHT],
-            readings=result.readings,
             lap=self.lap,
             stages=dict(result.stages),
-            closed=result.closed,
             jump=None if result.jump is None else tuple(np.asarray(result.jump).tolist()),
-            notice=result.notice,
             offered=len(self.detections.labels),
             health=result.health.condition,
             reason=result.health.reason,
-            dropped=result.dropped,
-            late=result.late,
-            refused=result.refused,
+            **{name: getattr(result, name) for name in same},
         )
 
     @cached_property
@@ -226,19 +187,21 @@ class ObservedCycle:
     def map(self) -> Map:
         """Return the map as it stands, with its covariances, which takes much longer than the outline."""
         estimator = self.estimator
-        with estimator.looked_at() if isinstance(estimator, LookedAtEstimator) else nullcontext():
+        with estimator.looked_at() if hasattr(estimator, "looked_at") else nullcontext():
             return estimator.map()
 
     @cached_property
     def readings(self) -> Readings | None:
         """Return which detections were used; None where the estimator does not say it."""
-        return self.estimator.readings() if isinstance(self.estimator, ReadingEstimator) else None
+        readings: Readings | None = getattr(self.estimator, "readings", lambda: None)()
+        return readings
 
     @cached_property
     def window(self) -> Array:
         """Return the poses (P, 3) in the window, the oldest first; a filter has none."""
         estimator = self.estimator
-        return estimator.window_poses() if isinstance(estimator, WindowEstimator) else np.zeros((0, 3))
+        poses: Array = estimator.window_poses() if hasattr(estimator, "window_poses") else np.zeros((0, 3))
+        return poses
 
 
 Observer = Callable[[ObservedCycle], None]
@@ -282,7 +245,7 @@ def timed_wait(estimator: OnlineEstimator) -> float:
 
     So the update itself waits for nothing, and a replay depends on no other process's speed.
     """
-    if not isinstance(estimator, BatchingEstimator):
+    if not hasattr(estimator, "wait"):
         return 0.0
     begin = time.perf_counter()
     estimator.wait()
@@ -372,7 +335,7 @@ class _Run:
             self._lap_maps.append((self._laps.lap, track))
         t = np.array([record.t for record in records])
         trajectory = np.array(self._poses).reshape(-1, 3)
-        smoothed = estimator.smoothed(t) if isinstance(estimator, SmoothingEstimator) else np.full(3, np.nan)
+        smoothed = estimator.smoothed(t) if hasattr(estimator, "smoothed") else np.full(3, np.nan)
         is_smoothed = np.isfinite(smoothed)
         return RunResult(
             estimator=name,
@@ -384,13 +347,11 @@ class _Run:
             laps=self._laps.completed,
             lap_maps=tuple(self._lap_maps),
             snapshots=tuple(self._snapshots),
-            vehicle=(
-                estimator.vehicle_state() if records and isinstance(estimator, VehicleEstimator) else None
-            ),
+            vehicle=estimator.vehicle_state() if records and hasattr(estimator, "vehicle_state") else None,
             observing=self._observing,
-            batches=estimator.batches() if isinstance(estimator, BatchingEstimator) else None,
+            batches=estimator.batches() if hasattr(estimator, "batches") else None,
             waited=self._waited,
-            noise=estimator.noise_used() if isinstance(estimator, NoiseEstimator) else None,
+            noise=estimator.noise_used() if hasattr(estimator, "noise_used") else None,
             scale=scale(estimator),
             smoothed=np.where(is_smoothed, smoothed, trajectory) if is_smoothed.any() else None,
         )

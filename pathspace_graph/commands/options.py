@@ -179,14 +179,13 @@ def _options(
     """Yield the options of a command, or of settings in it with these values."""
     hints, texts = get_type_hints(kind, include_extras=True), _texts(kind)
     for entry in fields(kind):
-        hint: Any = hints[entry.name]
-        name = entry.name
+        hint, name = hints[entry.name], entry.name
         if get_origin(hint) is Annotated:
             hint, *marks = get_args(hint)
             name = next((mark.name for mark in marks if isinstance(getattr(mark, "name", None), str)), name)
         text = _first_sentence(texts.get(entry.name, ""))
         value = getattr(values, entry.name, entry.default)
-        if is_dataclass(hint):
+        if isinstance(hint, type) and is_dataclass(hint):
             inside = hint() if values is None else value
             own = group if group[0] or not name else (name, text)
             yield from _options(hint, inside, f"{prefix}{name}." if name else prefix, own)

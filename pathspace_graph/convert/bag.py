@@ -278,7 +278,7 @@ class Bag:
         Both are not mixed, since they may be of different clocks: a message without a stamp among others that
         have one is left out.
         """
-        topic = name.split()[0]
+        topic = name.split(maxsplit=1)[0]
         stamped = [] if self.received else [k for k, stamp in enumerate(stamps) if stamp is not None]
         if 2 * len(stamped) <= len(stamps):
             self.notes[f"messages of {topic} have the time at which they were received"] += len(values)

@@ -17,12 +17,12 @@ from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io.log import (
     MAX_HOLD,
-    MIN_RELATIVE_DETERMINANT,
     Detections,
     Log,
     Odometry,
     Truth,
     covariances_of,
+    is_positive_definite,
 )
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
@@ -239,12 +239,11 @@ def positive_definite(covariances: Array) -> BoolArray:
     """Return which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
     xx, yy = covariances[:, 0, 0], covariances[:, 1, 1]
     xy, yx = covariances[:, 0, 1], covariances[:, 1, 0]
-    finite = np.isfinite(covariances).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
-        good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
+        good = np.isfinite(covariances).all(axis=(1, 2)) & is_positive_definite(xx, xy, yy)
         good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
         good &= np.maximum(xx, yy) < MAX_RANGE**2
-    return np.asarray(finite & good)
+    return np.asarray(good)
 
 
 def default_covariances(points: Array, noise: NoiseSettings) -> Array:

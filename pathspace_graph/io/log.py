@@ -287,8 +287,10 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
     table.require(t >= t_first, f"expected a time not before the first odometry row ({t_first:g} s)")
     late = f"expected a time at most {MAX_HOLD:g} s after the last odometry row ({t_last:g} s)"
     table.require(t <= t_last + MAX_HOLD, late)
-    points = table.stack(("x", "y"))
-    cycles = cycles_of(t, points, _covariances(table), _labels(table))
+    points, entries = table.stack(("x", "y")), table.stack(("xx", "xy", "yy")).T
+    wrong = "expected a positive definite covariance (xx > 0, xx yy > xy^2)"
+    table.require(is_positive_definite(*entries), wrong)
+    cycles = cycles_of(t, points, covariances_of(*entries), _labels(table))
     counts = [len(cycle.labels) for cycle in cycles]
     if max(counts) > limits.MAX_DETECTIONS:
         first = sum(counts[: int(np.argmax(counts))])
@@ -310,12 +312,11 @@ def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
     return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
 
 
-def _covariances(table: Table) -> Array:
-    xx, xy, yy = table.stack(("xx", "xy", "yy")).T
+def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
+    """Return which covariances (m,) are positive definite, by their entries."""
     with np.errstate(over="ignore", invalid="ignore"):
         good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
-    table.require(good, "expected a positive definite covariance (xx > 0, xx yy > xy^2)")
-    return covariances_of(xx, xy, yy)
+    return np.asarray(good)
 
 
 def _labels(table: Table) -> IntArray:

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.cli import main, parse_command
+from pathspace_graph.commands.options import ESSENTIAL
 from pathspace_graph.io.files import write_json
 from pathspace_graph.io.overrides import leaves
-from pathspace_graph.commands.options import ESSENTIAL
 from pathspace_graph.settings.checked import GONE, successor
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 

@@ -36,8 +36,8 @@ from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.scale import JUDGED, SceneScale, scale_of, width_and_gap
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .scenes.drives import ODOMETRY_SIGMA, short_drive
-from .scenes.paths import modules
+from ..scenes.drives import ODOMETRY_SIGMA, short_drive
+from ..scenes.paths import modules
 
 STANDING = Odometry(np.array([0.0]), np.zeros((1, 3)))
 CLOSE = 1e-9
