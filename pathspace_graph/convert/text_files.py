@@ -51,14 +51,6 @@ MAX_PERIOD: Final = 1e3
 """Largest mean period of samples (s); more is a wrong unit of time."""
 
 
-@dataclass(frozen=True)
-class Column:
-    """Column of a file, whose numbers may change their sign."""
-
-    name: str
-    sign: float = 1.0
-
-
 class Columns:
     """Columns of the quantities: `vx=speed`, `y=-cone_y` with the sign changed, `detections.t=stamp` for one
     of both files only.
@@ -67,26 +59,18 @@ class Columns:
     """
 
     def __init__(self, pairs: Sequence[str] = ()) -> None:
-        self._named: dict[tuple[str, str], Column] = {}
+        self.named: dict[tuple[str, str], str] = {}
+        """Columns by kind of file and quantity, those whose sign is changed with a minus."""
         for pair in pairs:
             key, equals, name = pair.partition("=")
-            column = Column(name.removeprefix("-"), -1.0 if name.startswith("-") else 1.0)
-            if not equals or not column.name:
+            if not equals or not name.removeprefix("-"):
                 raise SettingsError(f"--columns: expected QUANTITY=COLUMN, found '{pair}'")
             only, _, key = key.rpartition(".")
             known = [key for kind, keys in QUANTITIES.items() if only in ("", kind) for key in keys]
             expected = f"expected one of {', '.join(dict.fromkeys(known))} in '{pair}'"
             check_name(key, known, f"--columns: {expected}")
             for kind in [only] if only else QUANTITIES:
-                self._named[kind, key] = column
-
-    def of(self, kind: str, key: str) -> Column:
-        """Return the column of a quantity in a file of this kind."""
-        return self._named.get((kind, key), Column(key))
-
-    def is_named(self, kind: str, key: str) -> bool:
-        """Return whether the column of a quantity was named."""
-        return (kind, key) in self._named
+                self.named[kind, key] = name
 
 
 class Units:
@@ -141,28 +125,28 @@ class _File:
 
     def has(self, key: str) -> bool:
         """Return whether the file has the column of a quantity; one that was named must be there."""
-        return self.columns.is_named(self.kind, key) or key in self.table.columns
+        return (self.kind, key) in self.columns.named or key in self.table.columns
 
-    def column(self, key: str) -> Column:
+    def column(self, key: str) -> str:
         """Return the column of a quantity; an InputError lists the columns that are there."""
-        column = self.columns.of(self.kind, key)
-        if column.name not in self.table.columns:
-            expected = f"expected a column '{column.name}' for {key} (--columns {key}=NAME)"
+        column = self.columns.named.get((self.kind, key), key).removeprefix("-")
+        if column not in self.table.columns:
+            expected = f"expected a column '{column}' for {key} (--columns {key}=NAME)"
             found = f"found the columns {', '.join(self.table.columns)}"
             raise InputError(self.table.file, f"{expected}, {found}", 1)
         return column
 
     def numbers(self, key: str, power: int = 1) -> Array:
         """Return a column (rows,) in the SI unit, or in its square where `power` is 2."""
-        column = self.column(key)
         quantity = QUANTITIES[self.kind][key]
         factor = UNITS[quantity][self.units.names[quantity]] ** power
-        return np.asarray(column.sign * factor * self.table.numbers(column.name, LARGEST))
+        if self.columns.named.get((self.kind, key), "").startswith("-"):
+            factor = -factor
+        return np.asarray(factor * self.table.numbers(self.column(key), LARGEST))
 
     def stamps(self) -> Array:
         """Return the stamps (rows,) in s, whose unit has to be plausible."""
-        t, unit = self.numbers("t"), self.units.names["time"]
-        name = self.columns.of(self.kind, "t").name
+        t, unit, name = self.numbers("t"), self.units.names["time"], self.column("t")
         self.table.require(
             np.abs(t) <= MAX_STAMP,
             f"expected stamps of at most {MAX_STAMP:g} s in column '{name}', found more: is their unit not "
@@ -184,7 +168,7 @@ def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
     if any(map(file.has, COVARIANCE)):
         covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
     if file.has("label"):
-        labels = rule.of_all(np.array(file.table.columns[file.column("label").name]))
+        labels = rule.of_all(np.array(file.table.columns[file.column("label")]))
     stamps, first, cycle = np.unique(t, return_index=True, return_inverse=True)
     order = np.argsort(first)
     groups = np.split(np.argsort(cycle, kind="stable"), np.cumsum(np.bincount(cycle))[:-1])
@@ -193,18 +177,18 @@ def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
 
 
 def _points(file: _File) -> Array:
-    if not (file.columns.is_named(DETECTIONS, "range") or not file.has("x")):
+    if file.has("x") and (DETECTIONS, "range") not in file.columns.named:
         return np.column_stack([file.numbers("x"), file.numbers("y")])
     if not file.has("range"):
         file.column("x")  # raises: neither x and y nor range and bearing are there
     ranges, bearings = file.numbers("range"), file.numbers("bearing")
-    name, unit = file.column("bearing").name, file.units.names["angle"]
+    name, unit = file.column("bearing"), file.units.names["angle"]
     file.table.require(
         np.abs(bearings) <= MAX_BEARING,
         f"expected bearings of at most a whole turn in column '{name}', found more: is their unit not {unit} "
         "(--units angle=deg)?",
     )
-    negative = f"expected ranges of at least 0 in column '{file.column('range').name}'"
+    negative = f"expected ranges of at least 0 in column '{file.column('range')}'"
     file.table.require(ranges >= 0.0, negative)
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
