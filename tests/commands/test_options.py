@@ -64,6 +64,16 @@ def test_a_flag_in_the_short_help_is_the_one_that_changes_something(
     assert command.settings.calibration.sensor is False
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("convert", "--from bag|"), ("convert", "--sigma-range NUMBER"), ("export", "--as centerline|")],
+)
+def test_the_short_help_names_options_as_the_command_takes_them(
+    command: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert option in help_of(command, "--help", capsys)
+
+
 # --- settings from a file --------------------------------------------------------------------------------
 
 
@@ -215,6 +225,8 @@ def test_the_shell_completes_commands_and_options(capsys: pytest.CaptureFixture[
     assert completed("batch", "MAP", "--spline.deg") == ["--spline.degree"]
     assert completed("simulate", "--ev") == ["--event"]
     assert completed("plot", "MAP", "--band") == ["--band-scale"]
+    assert completed("convert", "--fro") == ["--from", "--from-poses"]
+    assert completed("convert", "--sigma-b") == ["--sigma-bearing"]
     assert completed("verify", "--spline") == []
 
 
