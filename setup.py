@@ -5,7 +5,7 @@ from setuptools import setup
 
 KERNELS = Pybind11Extension(
     "pathspace_graph.factors._kernels",
-    ["factors/kernels.cpp"],
+    ["pathspace_graph/factors/kernels.cpp"],
     cxx_std=17,
     extra_compile_args=["-O3", "-ffp-contract=off"],
 )

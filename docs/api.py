@@ -17,8 +17,6 @@ import pdoc
 import pathspace_graph
 
 ROOT = Path(__file__).resolve().parents[1]
-BESIDE = ("factors", "sim", "eval")
-"""These folders are parts of the package although they lie beside it."""
 
 
 def modules() -> list[str]:
@@ -27,7 +25,7 @@ def modules() -> list[str]:
     pdoc doesn't look for them itself, since the package has an `__all__` of other names.
     """
     rooms = [module.name for module in iter_modules(pathspace_graph.__path__) if module.name != "__main__"]
-    return ["pathspace_graph", *(f"pathspace_graph.{name}" for name in (*rooms, *BESIDE))]
+    return ["pathspace_graph", *(f"pathspace_graph.{name}" for name in rooms)]
 
 
 def main(folder: Path = ROOT / "build" / "api") -> None:

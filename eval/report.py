@@ -320,8 +320,9 @@ def sources_digest() -> str:
     digest = sha256()
     for room in ROOMS:
         spec = find_spec(f"pathspace_graph.{room}")
-        root = Path(str(spec.origin if spec else None)).parent
-        for file in sorted([*root.glob("*.py"), *root.glob("*.cpp")]):
+        origin = Path(str(spec.origin if spec else None))
+        inside = [*origin.parent.glob("*.py"), *origin.parent.glob("*.cpp")]
+        for file in sorted(inside) if origin.name == "__init__.py" else [origin]:
             digest.update(f"{room}/{file.name}".encode() + file.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -5,13 +5,11 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 from traceback import print_exc
 from typing import Any, Final
 
-from .console import VERBOSITY, Verbosity
 from .errors import PathspaceError, SettingsError, SolveError
 
 PROGRAM: Final = "pathspace-graph"
@@ -21,51 +19,26 @@ NOT_SOLVED: Final = 3
 INTERRUPTED: Final = 130
 BROKEN_PIPE: Final = 141
 TERMINATED: Final = 143
-LEVELS: Final = {
-    "-q": Verbosity.QUIET,
-    "--quiet": Verbosity.QUIET,
-    "-v": Verbosity.VERBOSE,
-    "--verbose": Verbosity.VERBOSE,
-}
-"""Options that every command takes."""
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command, which is imported only when it is called: the overview need not wait for GTSAM."""
-
-    module: str
-    """Module of `commands`."""
-    name: str
-    """Dataclass in it with the options as fields, which does the work in `run`."""
-    summary: str
-    """Line in the list of commands."""
-
-
+LEVELS: Final = {"-q": "QUIET", "--quiet": "QUIET", "-v": "VERBOSE", "--verbose": "VERBOSE"}
+"""Options that every command takes, each with its level of `console.Verbosity`."""
 COMMANDS: Final = {
-    "demo": Command(
-        "demo", "Demo", "maps a generated track online, and shows a table, a map and its picture"
-    ),
-    "simulate": Command("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
-    "convert": Command("convert", "Convert", "writes a ROS bag, CSV files or a known data set as a log"),
-    "online": Command("online", "Online", "maps a log online, cycle by cycle"),
-    "batch": Command("batch", "Batch", "optimizes a whole log at once, as the ground reference"),
-    "compare": Command(
-        "compare", "Compare", "runs every estimator on one log or many, and gives the paper's table"
-    ),
-    "ablate": Command("studies", "Ablate", "runs a study of estimators and settings over many drives"),
-    "faults": Command(
-        "studies", "FaultSuite", "measures what each fault of a car costs, and what is said of it"
-    ),
-    "report": Command("studies", "Report", "measures the figures of the pages, and writes their tables"),
-    "figures": Command("plot", "Figures", "draws the paper's isolated tests"),
-    "scale": Command(
-        "studies", "Scale", "measures the time of an update against map size, detections and laps"
-    ),
-    "plot": Command("plot", "Plot", "draws a map with its uncertainty band"),
-    "export": Command("export", "Export", "writes a map in a format that planners and other tools read"),
-    "verify": Command("plot", "Verify", "checks that the files of a folder are as they were written"),
+    "demo": ("demo", "Demo", "maps a generated track online, and shows a table, a map and its picture"),
+    "simulate": ("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
+    "convert": ("convert", "Convert", "writes a ROS bag, CSV files or a known data set as a log"),
+    "online": ("online", "Online", "maps a log online, cycle by cycle"),
+    "batch": ("batch", "Batch", "optimizes a whole log at once, as the ground reference"),
+    "compare": ("compare", "Compare", "runs every estimator on one log or many, and gives the paper's table"),
+    "ablate": ("studies", "Ablate", "runs a study of estimators and settings over many drives"),
+    "faults": ("studies", "FaultSuite", "measures what each fault of a car costs, and what is said of it"),
+    "report": ("studies", "Report", "measures the figures of the pages, and writes their tables"),
+    "figures": ("plot", "Figures", "draws the paper's isolated tests"),
+    "scale": ("studies", "Scale", "measures the time of an update against map size, detections and laps"),
+    "plot": ("plot", "Plot", "draws a map with its uncertainty band"),
+    "export": ("export", "Export", "writes a map in a format that planners and other tools read"),
+    "verify": ("plot", "Verify", "checks that the files of a folder are as they were written"),
 }
+"""Commands by name: module of `commands`, dataclass in it with the options as fields, which does the work in
+`run`, and line of the overview. A module is imported when called: the overview need not wait for GTSAM."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -74,32 +47,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Bad usage and bad input give one line on standard error and 2; an estimate that cannot be computed, 3.
     """
     if threading.current_thread() is threading.main_thread():
-        signal.signal(
-            signal.SIGTERM, lambda *_: sys.exit(TERMINATED)
-        )  # temporary files are removed on the way
+        # temporary files are removed on the way
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     given = list(sys.argv[1:] if arguments is None else arguments)
-    levels = [LEVELS[word] for word in given if word in LEVELS]
-    before = VERBOSITY.set(levels[-1] if levels else Verbosity.NORMAL)
+    level = next((LEVELS[word] for word in reversed(given) if word in LEVELS), "NORMAL")
     try:
-        return _run([word for word in given if word not in LEVELS])
-    except SolveError as error:
-        _refuse(str(error))
-        return NOT_SOLVED
+        _run([word for word in given if word not in LEVELS], level)
     except PathspaceError as error:
-        return _refuse(str(error))
+        return _refuse(str(error), level, NOT_SOLVED if isinstance(error, SolveError) else BAD_INPUT)
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except OSError as error:
-        return _refuse(f"{error.filename or 'output'}: {error.strerror or error}")
+        return _refuse(f"{error.filename or 'output'}: {error.strerror or error}", level)
     except KeyboardInterrupt:
         print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return INTERRUPTED
-    finally:
-        VERBOSITY.reset(before)
+    return DONE
 
 
-def _run(arguments: list[str]) -> int:
+def _run(arguments: list[str], level: str) -> None:
     first = arguments[0] if arguments else ""
     if first in ("-h", "--help"):
         print(overview())
@@ -107,48 +74,49 @@ def _run(arguments: list[str]) -> int:
         kernels = import_module(".factors.kernels", __package__).KERNELS
         print(f"{PROGRAM} {version(PROGRAM)} (GTSAM {version('gtsam')}, {kernels} kernels)")
     elif first == "--completion":
-        options = import_module(".options", __package__)
+        options = import_module(".commands.options", __package__)
         print(options.completion(PROGRAM, {name: command_class(name) for name in COMMANDS}, LEVELS))
     elif first in COMMANDS:
-        command = parse_command(first, arguments[1:])
-        if command is not None:
-            command.run()
+        with import_module(".console", __package__).verbosity(level):
+            command = parse_command(first, arguments[1:])
+            if command is not None:
+                command.run()
     else:
         known = ", ".join(COMMANDS)
         raise SettingsError(f"expected a command ({known}), found {repr(first) if first else 'none'}")
-    return DONE
 
 
 def overview() -> str:
     """Return the list of commands."""
     width = max(map(len, COMMANDS)) + 2
-    lines = [f"  {name:<{width}}{command.summary}" for name, command in COMMANDS.items()]
-    usage = f"usage: {PROGRAM} COMMAND [OPTIONS]"
-    notes = [
-        f"{PROGRAM} COMMAND --help explains each command.",
-        "-q prints errors and hints only, -v progress in lines and where an error comes from.",
-        f'eval "$({PROGRAM} --completion)" completes commands and options in bash and zsh.',
-    ]
-    return "\n".join([usage, "", *lines, "", *notes])
+    lines = [f"  {name:<{width}}{summary}" for name, (_, _, summary) in COMMANDS.items()]
+    return "\n".join(
+        [
+            f"usage: {PROGRAM} COMMAND [OPTIONS]\n",
+            *lines,
+            f"\n{PROGRAM} COMMAND --help explains each command.",
+            "-q prints errors and hints only, -v progress in lines and where an error comes from.",
+            f'eval "$({PROGRAM} --completion)" completes commands and options in bash and zsh.',
+        ]
+    )
 
 
 def parse_command(name: str, arguments: list[str]) -> Any:
     """Return the command with its options, or None where its help was asked for and printed."""
-    options = import_module(".options", __package__)
+    options = import_module(".commands.options", __package__)
     return options.parse(command_class(name), f"{PROGRAM} {name}", arguments)
 
 
 def command_class(name: str) -> type[Any]:
     """Return the dataclass of a command."""
-    found: type[Any] = getattr(
-        import_module(f".commands.{COMMANDS[name].module}", __package__), COMMANDS[name].name
-    )
-    return found
+    module, found, _ = COMMANDS[name]
+    command: type[Any] = getattr(import_module(f".commands.{module}", __package__), found)
+    return command
 
 
-def _refuse(message: str) -> int:
+def _refuse(message: str, level: str, code: int = BAD_INPUT) -> int:
     """Print the traceback of an error if asked, and its one line; return the exit code."""
-    if VERBOSITY.get() == Verbosity.VERBOSE:
+    if level == "VERBOSE":
         print_exc()
     print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr)
-    return BAD_INPUT
+    return code

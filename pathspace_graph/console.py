@@ -35,6 +35,14 @@ class _Output(Console):
     def on_broken_pipe(self) -> None:
         """Leave a closed pipe to the command line; rich would exit with 1."""
         raise  # noqa: PLE0704
+@contextmanager
+def verbosity(level: str) -> Iterator[None]:
+    """Set the level, by its name, within the context."""
+    before = VERBOSITY.set(Verbosity[level])
+    try:
+        yield
+    finally:
+        VERBOSITY.reset(before)
 
 
 def output(wide: bool = False) -> Console:

@@ -5,6 +5,7 @@ An installed package adds an estimator by an entry point in the group `pathspace
 """
 
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final, Literal
 
@@ -39,14 +40,6 @@ BATCH_GROUP: Final = "pathspace_graph.batch"
 """Group of entry points that add batch estimators."""
 
 
-def _spline(settings: MapperSettings, noise: KnownNoise) -> BatchEstimator:
-    return BatchMapper(settings, noise, FixedLagMapper)
-
-
-def _centerline(settings: MapperSettings, noise: KnownNoise) -> BatchEstimator:
-    return centerline_batch.CenterlineBatch(settings, noise, FixedLagMapper)
-
-
 def _installed(group: str) -> dict[str, Callable[[MapperSettings, KnownNoise], Any]]:
     """Return the estimators that other packages add; each is imported when it is made."""
     return {point.name: _loading(point) for point in entry_points(group=group)}
@@ -72,9 +65,9 @@ the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
-    DEFAULT_BATCH: _spline,
+    DEFAULT_BATCH: lambda settings, noise: BatchMapper(settings, noise, FixedLagMapper),
     "landmark-batch": LandmarkBatch,
-    centerline_batch.NAME: _centerline,
+    centerline_batch.NAME: partial(centerline_batch.CenterlineBatch, online=FixedLagMapper),
 }
 """Makers of batch estimators, from settings and what is known of the noise; one of another package is given
 the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""

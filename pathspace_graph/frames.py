@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import pandas as pd
 
-from pathspace_graph.io.csv_table import Table, read_table
 from pathspace_graph.io.manifest import verified
-from pathspace_graph.io.parsing import MAX_STAMP
+from pathspace_graph.io.parsing import MAX_STAMP, Table, read_table
 from pathspace_graph.io.results import CYCLE_COLUMNS, CYCLES_FILE, RunResult
 
 from .errors import InputError, SettingsError
@@ -18,20 +17,6 @@ from .errors import InputError, SettingsError
 if TYPE_CHECKING:
     import xarray
 
-CYCLE_TYPES: Final = {
-    "cycle": "int64",
-    "t": "float64",
-    "seconds": "float64",
-    "size_left": "int64",
-    "size_right": "int64",
-    "readings": "int64",
-    "lap": "int64",
-    "offered": "int64",
-    "health": "str",
-    "reason": "str",
-    "dropped": "int64",
-}
-"""Types of the columns of `cycles.csv`; any further column is text."""
 OPTIONAL: Final = ("offered", "health", "reason", "dropped")
 """Columns of `cycles.csv` that may be missing."""
 RESULTS_FILE: Final = "results.csv"
@@ -53,9 +38,8 @@ def read_cycles(folder: Path | str) -> pd.DataFrame:
     """
     file = Path(folder) / CYCLES_FILE
     with verified(file.parent, file.name):
-        required = [name for name in CYCLE_TYPES if name not in OPTIONAL]
-        table = read_table(file, required)
-    columns = {name: _column(table, name, CYCLE_TYPES.get(name, "str")) for name in table.columns}
+        table = read_table(file, [name for name in CYCLE_COLUMNS if name not in OPTIONAL])
+    columns = {name: _column(table, name, CYCLE_COLUMNS.get(name, "str")) for name in table.columns}
     return pd.DataFrame(columns).set_index("cycle")
 
 
@@ -71,7 +55,7 @@ def _column(table: Table, name: str, kind: str) -> pd.Series:
 def run_frame(result: RunResult) -> pd.DataFrame:
     """Return the cycles of a run as `read_cycles` does, each with its pose x, y (m) and theta (rad)."""
     columns = {name: [getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS}
-    frame = pd.DataFrame(columns).astype({name: CYCLE_TYPES[name] for name in columns}).set_index("cycle")
+    frame = pd.DataFrame(columns).astype({name: CYCLE_COLUMNS[name] for name in columns}).set_index("cycle")
     return frame.assign(**dict(zip(("x", "y", "theta"), result.trajectory.T, strict=True)))
 
 

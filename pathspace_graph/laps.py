@@ -14,19 +14,14 @@ class LapSettings:
 
     min_path: float = 25.0
     """Least length of a lap (m along the path); jitter or an overlap may cross the line sooner."""
-
     min_distance: float = 7.0
     """Least distance from the start that a lap leads to (m)."""
-
     gate_half_width: float = 5.0
     """Half the length of the start line (m), with room for the racing line and for the drift of one lap."""
-
     gate_depth: float = 10.0
     """Distance past the line at which a crossing is still noticed (m), where an estimate jumped."""
-
     max_heading: float = np.pi / 3
     """Largest difference of the heading from the start's where the line is crossed (rad)."""
-
     end_tolerance: float = 5.0
     """Largest distance before the line at which a last lap counts as complete (m)."""
 

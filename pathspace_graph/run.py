@@ -9,9 +9,9 @@ from math import nan
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
@@ -22,10 +22,6 @@ from .errors import check_type
 from .health import Health
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,30 +82,6 @@ class BatchEstimator(Protocol):
         """Return the optimum over a whole log, whose truth is not read."""
 
 
-@runtime_checkable
-class OutliningEstimator(Protocol):
-    """An online estimator whose map is cheap to look at in every cycle."""
-
-    def outline(self) -> Map:
-        """Return a copy of the map as it stands, without covariances, which are empty (0, 0)."""
-
-
-@runtime_checkable
-class VehicleEstimator(Protocol):
-    """An online estimator that knows the uncertainty of the vehicle's pose and its calibration."""
-
-    def vehicle_state(self) -> VehicleState:
-        """Return the newest pose and the calibration, with their joint covariance."""
-
-
-@runtime_checkable
-class NoiseEstimator(Protocol):
-    """An online estimator that says which noise it uses."""
-
-    def noise_used(self) -> RunNoise:
-        """Return the noise that is used now, and what was measured so far."""
-
-
 @dataclass(frozen=True, eq=False)
 class Readings:
     """Detections of the newest cycle as the estimator took them, seen from its newest pose."""
@@ -126,44 +98,32 @@ class Readings:
     """Foot point (k, 2) of each used detection on its curve or landmark, in m, map frame; NaN for others."""
 
 
-@runtime_checkable
-class ReadingEstimator(Protocol):
-    """An online estimator that says which detections of the newest cycle it used, and where."""
+class OptionalMethods(Protocol):
+    """Methods that an online estimator may have as well, each of which is used where it is there."""
+
+    def outline(self) -> Map:
+        """Return a copy of the map as it stands, without covariances, which are empty (0, 0)."""
+
+    def vehicle_state(self) -> VehicleState:
+        """Return the newest pose and the calibration, with their joint covariance."""
+
+    def noise_used(self) -> RunNoise:
+        """Return the noise that is used now, and what was measured so far."""
 
     def readings(self) -> Readings:
         """Return the detections of the newest cycle as they were used or gated."""
 
-
-@runtime_checkable
-class WindowEstimator(Protocol):
-    """An online estimator that keeps a window of poses."""
-
     def window_poses(self) -> Array:
         """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
 
-
-@runtime_checkable
-class LookedAtEstimator(Protocol):
-    """An online estimator that has to be told that it is looked at only."""
-
     def looked_at(self) -> AbstractContextManager[None]:
         """Return a context in which nothing that is asked for changes the estimate."""
-
-
-@runtime_checkable
-class BatchingEstimator(Protocol):
-    """An online estimator that has batches solved by another process while it goes on."""
 
     def wait(self) -> None:
         """Wait for the batch whose result the next update may take, however long that takes."""
 
     def batches(self) -> LapBatches:
-        """Return the cycles in which batches have ended."""
-
-
-@runtime_checkable
-class SmoothingEstimator(Protocol):
-    """An online estimator that corrects earlier poses when the loop closes."""
+        """Return the cycles in which batches of another process have ended."""
 
     def smoothed(self, t: Array) -> Array:
         """Return the corrected poses (n, 3) of the cycles at stamps (n,); NaN after the last of them."""
@@ -176,7 +136,8 @@ def scale(estimator: OnlineEstimator) -> float:
 
 def outline(estimator: OnlineEstimator) -> Map:
     """Return the present map, without covariances where the estimator can give it so."""
-    return estimator.outline() if isinstance(estimator, OutliningEstimator) else estimator.map()
+    track: Map = estimator.outline() if hasattr(estimator, "outline") else estimator.map()
+    return track
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,24 +163,20 @@ class ObservedCycle:
     def record(self) -> CycleRecord:
         """Return the cycle as a row of `cycles.csv` has it."""
         result = self.result
+        same = ("readings", "closed", "notice", "dropped", "late", "refused")
         return CycleRecord(
             cycle=self.number,
             t=self.detections.t,
             seconds=self.seconds,
             size_left=result.sizes[LEFT],
             size_right=result.sizes[RIGHT],
-            readings=result.readings,
             lap=self.lap,
             stages=dict(result.stages),
-            closed=result.closed,
             jump=None if result.jump is None else tuple(np.asarray(result.jump).tolist()),
-            notice=result.notice,
             offered=len(self.detections.labels),
             health=result.health.condition,
             reason=result.health.reason,
-            dropped=result.dropped,
-            late=result.late,
-            refused=result.refused,
+            **{name: getattr(result, name) for name in same},
         )
 
     @cached_property
@@ -231,19 +188,21 @@ class ObservedCycle:
     def map(self) -> Map:
         """Return the map as it stands, with its covariances, which takes much longer than the outline."""
         estimator = self.estimator
-        with estimator.looked_at() if isinstance(estimator, LookedAtEstimator) else nullcontext():
+        with estimator.looked_at() if hasattr(estimator, "looked_at") else nullcontext():
             return estimator.map()
 
     @cached_property
     def readings(self) -> Readings | None:
         """Return which detections were used; None where the estimator does not say it."""
-        return self.estimator.readings() if isinstance(self.estimator, ReadingEstimator) else None
+        readings: Readings | None = getattr(self.estimator, "readings", lambda: None)()
+        return readings
 
     @cached_property
     def window(self) -> Array:
         """Return the poses (P, 3) in the window, the oldest first; a filter has none."""
         estimator = self.estimator
-        return estimator.window_poses() if isinstance(estimator, WindowEstimator) else np.zeros((0, 3))
+        poses: Array = estimator.window_poses() if hasattr(estimator, "window_poses") else np.zeros((0, 3))
+        return poses
 
 
 Observer = Callable[[ObservedCycle], None]
@@ -287,7 +246,7 @@ def timed_wait(estimator: OnlineEstimator) -> float:
 
     So the update itself waits for nothing, and a replay depends on no other process's speed.
     """
-    if not isinstance(estimator, BatchingEstimator):
+    if not hasattr(estimator, "wait"):
         return 0.0
     begin = time.perf_counter()
     estimator.wait()
@@ -372,46 +331,37 @@ class _Run:
     def result(self, name: str) -> RunResult:
         """Return the results after the last cycle."""
         self._take_snapshots(before=float("inf"))
-        track = self._estimator.map()
+        estimator, records, track = self._estimator, self._records, self._estimator.map()
         if self._laps.last_lap_is_complete:
             self._lap_maps.append((self._laps.lap, track))
-        t = np.array([record.t for record in self._records])
+        t = np.array([record.t for record in records])
         trajectory = np.array(self._poses).reshape(-1, 3)
+        smoothed = estimator.smoothed(t) if hasattr(estimator, "smoothed") else np.full(3, np.nan)
+        is_smoothed = np.isfinite(smoothed)
         return RunResult(
             estimator=name,
-            settings=settings_dict(self._estimator.settings),
+            settings=settings_dict(estimator.settings),
             map=track,
             trajectory_t=t,
             trajectory=trajectory,
-            cycles=tuple(self._records),
+            cycles=tuple(records),
             laps=self._laps.completed,
             lap_maps=tuple(self._lap_maps),
             snapshots=tuple(self._snapshots),
-            vehicle=_vehicle_state(self._estimator) if self._records else None,
+            vehicle=estimator.vehicle_state() if records and hasattr(estimator, "vehicle_state") else None,
             observing=self._observing,
-            batches=self._estimator.batches() if isinstance(self._estimator, BatchingEstimator) else None,
+            batches=estimator.batches() if hasattr(estimator, "batches") else None,
             waited=self._waited,
-            noise=self._estimator.noise_used() if isinstance(self._estimator, NoiseEstimator) else None,
-            scale=scale(self._estimator),
-            smoothed=self._smoothed(t, trajectory),
+            noise=estimator.noise_used() if hasattr(estimator, "noise_used") else None,
+            scale=scale(estimator),
+            smoothed=np.where(is_smoothed, smoothed, trajectory) if is_smoothed.any() else None,
         )
-
-    def _smoothed(self, t: Array, trajectory: Array) -> Array | None:
-        if not isinstance(self._estimator, SmoothingEstimator):
-            return None
-        smoothed = self._estimator.smoothed(t)
-        corrected = np.isfinite(smoothed)
-        return np.where(corrected, smoothed, trajectory) if corrected.any() else None
 
     def _take_snapshots(self, before: float) -> None:
         while len(self._snapshots) < len(self._snapshot_times):
             if self._snapshot_times[len(self._snapshots)] >= before:
                 return
             self._snapshots.append(self._estimator.map())
-
-
-def _vehicle_state(estimator: OnlineEstimator) -> VehicleState | None:
-    return estimator.vehicle_state() if isinstance(estimator, VehicleEstimator) else None
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:

@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.csv_table import Table, read_table
 from pathspace_graph.io.parsing import (
     MAX_CONES,
     MAX_COORDINATE,
     MAX_TRACK_BYTES,
     MAX_TRACK_LENGTH,
     MAX_TRACK_WIDTH,
+    Table,
     parse_yaml,
+    read_table,
     read_text,
     shown,
 )

@@ -22,17 +22,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from .scenes.paths import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-PACKAGES, MAPPED = (PROJECT["tool"]["setuptools"][key] for key in ("packages", "package-dir"))
 README = (ROOT / "README.md").read_text()
-
-
-def folder_of(package: str) -> str:
-    """Where setuptools finds a package: where it is told, else in the folder of the package that it is in."""
-    parent, _, name = package.rpartition(".")
-    return MAPPED[package] if package in MAPPED else f"{folder_of(parent)}/{name}"
-
-
-FOLDERS = {package: folder_of(package) for package in PACKAGES}
 
 
 def python_folders() -> set[Path]:
@@ -48,21 +38,33 @@ def python_folders() -> set[Path]:
     }
 
 
-# --- the package list ------------------------------------------------------------------------------------
+LINKS = ("factors", "sim", "eval")
 
 
-def test_the_packages_listed_are_the_folders_on_disk() -> None:
-    assert {Path(folder) for folder in FOLDERS.values()} == python_folders()
-    assert set(MAPPED) <= set(PACKAGES)
-    assert len(PACKAGES) == len(FOLDERS)
-    assert all((ROOT / folder / "__init__.py").is_file() for folder in FOLDERS.values())
+def package_of(folder: Path) -> str:
+    """The name of the package that a folder with Python code is."""
+    parts = folder.parts if folder.parts[0] == "pathspace_graph" else ("pathspace_graph", *folder.parts)
+    return ".".join(parts)
 
 
-@pytest.mark.parametrize("package", FOLDERS)
-def test_each_package_is_imported_from_its_folder(package: str) -> None:
-    home = Path(str(import_module(package).__file__)).parent
+# --- packages --------------------------------------------------------------------------------------------
+
+
+def test_the_package_holds_links_to_the_folders_beside_it() -> None:
+    """So setuptools, mypy and editors find one ordinary package."""
+    for name in LINKS:
+        link = ROOT / "pathspace_graph" / name
+        assert link.is_symlink() and link.resolve() == ROOT / name
+    assert PROJECT["tool"]["setuptools"]["packages"]["find"]["include"] == ["pathspace_graph*"]
+    assert {folder.parts[0] for folder in python_folders()} == {"pathspace_graph", *LINKS}
+
+
+@pytest.mark.parametrize("folder", sorted(python_folders()), ids=str)
+def test_each_folder_with_code_is_imported_as_a_package(folder: Path) -> None:
+    assert (ROOT / folder / "__init__.py").is_file()
+    home = Path(str(import_module(package_of(folder)).__file__)).parent
     names = {file.name for file in home.glob("*.py")}
-    assert names == {file.name for file in (ROOT / FOLDERS[package]).glob("*.py")}
+    assert names == {file.name for file in (ROOT / folder).glob("*.py")}
 
 
 def test_types_are_told_to_users() -> None:
@@ -70,10 +72,7 @@ def test_types_are_told_to_users() -> None:
 
 
 def test_mypy_sees_every_folder() -> None:
-    checked = {(ROOT / file).resolve() for file in PROJECT["tool"]["mypy"]["files"]}
-    assert checked == {ROOT / folder for folder in MAPPED.values()} | {ROOT / "examples"}
-    overlay = ROOT / ".overlay" / "pathspace_graph"
-    assert (overlay / "__init__.py").resolve() == ROOT / "pathspace_graph" / "__init__.py"
+    assert PROJECT["tool"]["mypy"]["files"] == ["pathspace_graph", "examples"]  # it follows links
 
 
 # --- imports ---------------------------------------------------------------------------------------------

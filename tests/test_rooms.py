@@ -39,11 +39,10 @@ ARROWS: dict[str, set[str]] = {
     "spline": {"factors", "settings"},
     "io": {"spline", "factors", "settings"},
     "sim": {"io"},
-    "export": {"settings", "spline", "io"},
     "convert": {"io", "factors"},
     "graph": {"factors"},
     "health": {"settings"},
-    "run": {"io", "laps", "health"},
+    "run": {"factors", "io", "laps", "health"},
     "scale": {"factors", "settings", "io", "run"},
     "checkpoint": set(),
     "snapshot": {"factors", "io", "graph", "checkpoint"},
@@ -62,12 +61,11 @@ ARROWS: dict[str, set[str]] = {
     "eval": BELOW_EVAL | {"eval.metrics", "eval.experiment", "eval.benchmark"},
     "eval.view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
     "commands": BELOW_EVAL
-    | {"export", "convert"}
+    | {"convert"}
     | {"eval"}
     | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark", "view")},
-    "options": {"io", "settings"},
     "frames": {"io"},
-    "cli": {"options", "commands"},
+    "cli": {"commands"},
     "__main__": {"cli"},
 }
 """What each room may import, beside itself and the leaves: arrows point down only."""
@@ -171,9 +169,9 @@ ASSIGNED = {
     "mapping.smoother": {"self.window.exact"},
     "online.fixed_lag": {"self.recovery.failures"},
     "online.outlook": {"row.ended"},
-    "options": {"entry.metadata"},  # of dataclasses
-    "scale.door": {"door.scene.is_final", "door.cycles"}
-    | {f"estimator.{name}" for name in ("__init__", "update", "solve", "ahead", "scale")},  # a decorator
+    "commands.options": {"entry.metadata"},  # of dataclasses
+    "scale": {"door.scene.is_final", "door.cycles"}
+    | {f"estimator.{name}" for name in ("__init__", "update", "solve", "scale")},  # a decorator
     "snapshot": {"array.flags.writeable", "zipped.comment"},  # of numpy and zipfile
 }
 """Attributes that a module assigns to objects of others: no module may have another one."""

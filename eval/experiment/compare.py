@@ -16,7 +16,7 @@ from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.eval.metrics.summary import has_cones
-from pathspace_graph.io.disk import is_temporary
+from pathspace_graph.io.files import is_temporary
 from pathspace_graph.io.log import LOG_FILE
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import BatchRun, RunResult

@@ -21,7 +21,7 @@ from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
-from pathspace_graph.scale.scene import scale_of
+from pathspace_graph.scale import scale_of
 
 from .accuracy import LapMetrics, lap_metrics, root_mean_square
 from .consistency import normal_errors

@@ -26,7 +26,7 @@ from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun
 from pathspace_graph.run import settings_dict
-from pathspace_graph.scale.door import log_at_scale
+from pathspace_graph.scale import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.centre_line import SIDE, Ribbon, find_line
 

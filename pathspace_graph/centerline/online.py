@@ -14,7 +14,7 @@ from pathspace_graph.io.results import LapBatches, RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult
-from pathspace_graph.scale.door import at_scale
+from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import Ribbon, find_line

@@ -30,7 +30,7 @@ from pathspace_graph.mapping.registration import (
 )
 from pathspace_graph.mapping.seam import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, PeriodicCurve, make_periodic
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.scale.door import at_scale
+from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit

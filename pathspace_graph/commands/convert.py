@@ -24,7 +24,7 @@ from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import measured_line
 from pathspace_graph.plausibility.hint import because
 from pathspace_graph.plausibility.judge import hints
-from pathspace_graph.scale.scene import scale_of
+from pathspace_graph.scale import scale_of
 
 from .online import tell
 from .simulate import describe

@@ -9,9 +9,14 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.export.geojson import LocalPlane, write_geojson
-from pathspace_graph.export.lanelet2 import write_lanelet2
-from pathspace_graph.export.tables import write_centre_line, write_points, write_profile
+from pathspace_graph.io.export import (
+    LocalPlane,
+    write_centre_line,
+    write_geojson,
+    write_lanelet2,
+    write_points,
+    write_profile,
+)
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map

@@ -18,7 +18,7 @@ from .recording import Recording, twists_between
 from .settings import LabelRule
 
 INSTALL: Final = "pip install 'pathspace-graph[ros]'"
-"""Installs the package that reads bags."""
+"""Command that installs the package that reads bags."""
 SUPPORTED: Final = {
     "--odometry": "a twist, a speed or a pose",
     "--imu": "an angular velocity",
@@ -31,11 +31,9 @@ STATIC: Final = "/tf_static"
 BODIES: Final = ("base_link", "base_footprint")
 """Frames of a vehicle whose odometry names none."""
 LEVEL: Final = 0.98
-"""A sensor's frame is level where its z axis and the vehicle's have at least this cosine."""
+"""Least cosine of a level sensor's z axis and the vehicle's."""
 LATE: Final = 0.1
-"""Messages received this time (s) after or before their stamps, in the median, are worth a word."""
-UNDEFINED: Final = "a type without a definition"
-"""Neither the bag, nor ROS, nor a file that was handed over defines a message."""
+"""Median time (s) of receipt after or before the stamps that is worth a word."""
 
 
 @dataclass(frozen=True)
@@ -102,11 +100,11 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
     def points(message: Any) -> tuple[str, Points]:
         return frame_of(message), points_of(message, rule, options.label_field)
 
-    with Bag.opened(path, options.definitions) as bag:
-        odometry = bag.samples(options.odometry, "--odometry", options, notes, motion)
-        imu = bag.samples(options.imu, "--imu", options, notes, yaw_rate_of) if options.imu else None
-        detections = bag.samples(options.detections, "--detections", options, notes, points)
-        static = [] if options.mounted else bag.transforms(options)
+    with opened(path, options, notes) as bag:
+        odometry = bag.samples(options.odometry, "--odometry", motion)
+        imu = bag.samples(options.imu, "--imu", yaw_rate_of) if options.imu else None
+        detections = bag.samples(options.detections, "--detections", points)
+        static = [] if options.mounted else bag.transforms()
     t, twists = _twists(odometry, imu, options, notes, path)
     mounting = None if options.mounted else _mounting(odometry, detections, static, notes, path)
     source = {"bag": path.name, "odometry": odometry.name, "detections": detections.name}
@@ -140,10 +138,8 @@ def _mounting(
         told = f"which {STATIC} puts at {x:.3g} {y:.3g} {yaw:.3g} (m, m, rad) in {body}"
         notes[f"messages with detections are in frame {others[0]}, {told}"] += len(detections.values)
         return float(x), float(y), float(yaw)
-    notes[
-        f"messages with detections are in frame {', '.join(others)}, the odometry is of {body}: --mounting "
-        "says where the sensor is"
-    ] += len(detections.values)
+    told = f"in frame {', '.join(others)}, the odometry is of {body}: --mounting says where the sensor is"
+    notes[f"messages with detections are {told}"] += len(detections.values)
     return None
 
 
@@ -224,42 +220,38 @@ def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[
 # --- bags ------------------------------------------------------------------------------------------------
 
 
+@contextmanager
+def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Bag]":
+    """Yield a bag that is closed afterwards."""
+    if not path.exists():
+        raise InputError(path, "expected a bag, found none")
+    rosbag1, rosbag2, _ = _rosbags()
+    definitions = _given_definitions(options.definitions)
+    try:
+        reader = (rosbag1 if is_ros1(path) else rosbag2).Reader(path)
+        reader.open()
+    except Exception as error:
+        expected = "expected a ROS bag: a file .bag, .mcap or .db3, or a folder with metadata.yaml"
+        raise InputError(path, f"{expected} ({error})") from None
+    try:
+        yield Bag(path, reader, definitions, options.received, notes)
+    finally:
+        reader.close()
+
+
+@dataclass(frozen=True)
 class Bag:
-    """Read a bag by the package `rosbags`, and turn its errors into InputErrors."""
+    """A bag as the package `rosbags` reads it, with InputErrors in place of its errors."""
 
-    def __init__(self, path: Path, reader: Any, definitions: dict[str, Any]) -> None:
-        self.path = path
-        self._reader = reader
-        self._definitions = definitions
-        self._is_ros1 = is_ros1(path)
+    path: Path
+    reader: Any
+    definitions: dict[str, Any]
+    """Definitions of messages that were handed over."""
+    received: bool
+    """Take the times of receipt as stamps."""
+    notes: Counter[str]
 
-    @staticmethod
-    @contextmanager
-    def opened(path: Path, definitions: Sequence[str] = ()) -> "Iterator[Bag]":
-        """Yield a bag that is closed afterwards."""
-        if not path.exists():
-            raise InputError(path, "expected a bag, found none")
-        rosbag1, rosbag2, _ = _rosbags()
-        given = _given_definitions(definitions)
-        try:
-            reader = (rosbag1 if is_ros1(path) else rosbag2).Reader(path)
-            reader.open()
-        except Exception as error:
-            expected = "expected a ROS bag: a file .bag, .mcap or .db3, or a folder with metadata.yaml"
-            raise InputError(path, f"{expected} ({error})") from None
-        try:
-            yield Bag(path, reader, given)
-        finally:
-            reader.close()
-
-    def samples(
-        self,
-        topic: str | None,
-        option: str,
-        options: BagOptions,
-        notes: Counter[str],
-        take: Callable[[Any], Any],
-    ) -> Samples:
+    def samples(self, topic: str | None, option: str, take: Callable[[Any], Any]) -> Samples:
         """Return what to `take` of the messages of a topic; a message may be large, and is not kept."""
         connections = self._connections(topic)
         if not connections:
@@ -268,11 +260,9 @@ class Bag:
         received, stamps, values = self._read(connections, take, option)
         if not values:
             raise self._error(f"{option}: expected messages of {topic}, found none")
-        if options.received:
-            stamps = [None] * len(stamps)
-        return _stamped(str(topic), connections[0].msgtype, stamps, received, values, notes)
+        return self._stamped(f"{topic} ({connections[0].msgtype})", stamps, received, values)
 
-    def transforms(self, options: BagOptions) -> list[Any]:
+    def transforms(self) -> list[Any]:
         """Return the `TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
         connections = self._connections(STATIC)
         if not connections:
@@ -280,33 +270,52 @@ class Bag:
         _, _, messages = self._read(connections, lambda message: list(message.transforms), "transforms")
         return [one for message in messages for one in message]
 
+    def _stamped(
+        self, name: str, stamps: list[float | None], received: list[float], values: list[Any]
+    ) -> Samples:
+        """Return samples with header stamps where most have one, else with the times of receipt.
+
+        Both are not mixed, since they may be of different clocks: a message without a stamp among others that
+        have one is left out.
+        """
+        topic = name.split(maxsplit=1)[0]
+        stamped = [] if self.received else [k for k, stamp in enumerate(stamps) if stamp is not None]
+        if 2 * len(stamped) <= len(stamps):
+            self.notes[f"messages of {topic} have the time at which they were received"] += len(values)
+            return Samples(name, np.array(received), values)
+        self.notes[f"messages of {topic} without a stamp were left out"] += len(stamps) - len(stamped)
+        t = np.array([stamps[k] for k in stamped], dtype=float)
+        late = float(np.median(np.array(received)[stamped] - t))
+        if abs(late) > LATE:
+            told = f"messages of {topic} were received {late:.3g} s after their stamps, in the median"
+            self.notes[f"{told} (--received takes the times of receipt)"] += len(stamped)
+        return Samples(name, t, [values[k] for k in stamped])
+
     def _connections(self, topic: str | None) -> list[Any]:
-        return [entry for entry in self._reader.connections if entry.topic == topic]
+        return [entry for entry in self.reader.connections if entry.topic == topic]
 
     def _error(self, message: str) -> InputError:
         """Return an InputError that also lists all topics with type, number of messages and rate."""
-        seconds = 1e-9 * (self._reader.end_time - self._reader.start_time)
+        seconds = 1e-9 * (self.reader.end_time - self.reader.start_time)
         topics = [
             f"{name} ({topic.msgtype}, {topic.msgcount} messages, {topic.msgcount / seconds:.3g} Hz)"
-            for name, topic in sorted(self._reader.topics.items())
+            for name, topic in sorted(self.reader.topics.items())
             if topic.msgcount
         ]
-        listed = (
-            f"the topics with messages are {', '.join(topics)}" if topics else "it has no messages at all"
-        )
-        return InputError(self.path, f"{message}; {listed}")
+        listed = f"the topics with messages are {', '.join(topics)}"
+        return InputError(self.path, f"{message}; {listed if topics else 'it has no messages at all'}")
 
     def _read(
         self, connections: list[Any], take: Callable[[Any], Any], option: str
     ) -> tuple[list[float], list[float | None], list[Any]]:
         """Return the times of receipt, the stamps and what was taken of all messages of a topic."""
         store, kind = self._store(connections[0]), connections[0].msgtype
-        decode = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
+        decode = store.deserialize_ros1 if is_ros1(self.path) else store.deserialize_cdr
         received: list[float] = []
         stamps: list[float | None] = []
         values: list[Any] = []
         try:
-            for _, time, data in self._reader.messages(connections):
+            for _, time, data in self.reader.messages(connections):
                 message = decode(data, kind)
                 values.append(take(message))
                 stamps.append(stamp_of(message))
@@ -322,49 +331,23 @@ class Bag:
     def _store(self, connection: Any) -> Any:
         """Return the types of a topic: those of the bag, or else those handed over and those of ROS."""
         *_, typesys = _rosbags()
-        ros = typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.ROS2_HUMBLE
+        ros = typesys.Stores.ROS1_NOETIC if is_ros1(self.path) else typesys.Stores.ROS2_HUMBLE
         try:
             known = _types_of(connection, typesys)
-            known = known or {**typesys.get_typestore(ros).fielddefs, **self._definitions}
+            known = known or {**typesys.get_typestore(ros).fielddefs, **self.definitions}
             store = typesys.get_typestore(typesys.Stores.EMPTY)
             store.register(known)
             store.get_msgdef(connection.msgtype)
         except Exception as error:
-            found = f"found {UNDEFINED} ({connection.msgtype}: {error}); --definition hands one over"
-            raise InputError(self.path, f"{connection.topic}: expected a known type, {found}") from None
+            found = f"found a type without a definition ({connection.msgtype}: {error})"
+            expected = f"{connection.topic}: expected a known type"
+            raise InputError(self.path, f"{expected}, {found}; --definition hands one over") from None
         return store
 
 
 def is_ros1(path: Path) -> bool:
     """Return whether a bag is one of rosbag1: a file. A folder is a bag of rosbag2, whatever its name."""
     return path.suffix == ".bag" and not path.is_dir()
-
-
-def _stamped(
-    topic: str,
-    kind: str,
-    stamps: list[float | None],
-    received: list[float],
-    values: list[Any],
-    notes: Counter[str],
-) -> Samples:
-    """Return samples with header stamps where most have one, else with the times of receipt.
-
-    Both are not mixed, since they may be of different clocks: a message without a stamp among others that
-    have one is left out.
-    """
-    name = f"{topic} ({kind})"
-    stamped = [index for index, stamp in enumerate(stamps) if stamp is not None]
-    if 2 * len(stamped) <= len(stamps):
-        notes[f"messages of {topic} have the time at which they were received"] += len(values)
-        return Samples(name, np.array(received), values)
-    notes[f"messages of {topic} without a stamp were left out"] += len(stamps) - len(stamped)
-    t = np.array([stamps[index] for index in stamped], dtype=float)
-    late = float(np.median(np.array(received)[stamped] - t))
-    if abs(late) > LATE:
-        told = f"messages of {topic} were received {late:.3g} s after their stamps, in the median"
-        notes[f"{told} (--received takes the times of receipt)"] += len(stamped)
-    return Samples(name, t, [values[index] for index in stamped])
 
 
 def _types_of(connection: Any, typesys: Any) -> dict[str, Any]:
@@ -375,11 +358,9 @@ def _types_of(connection: Any, typesys: Any) -> dict[str, Any]:
     if form != "IDL":
         return {}
     types: dict[str, Any] = {}
-    for part in text.split("=" * 80 + "\n"):
+    for part in filter(str.strip, text.split("=" * 80 + "\n")):
         head, _, body = part.partition("\n")
-        types |= (
-            typesys.get_types_from_idl(body if head.startswith("IDL: ") else part) if part.strip() else {}
-        )
+        types |= typesys.get_types_from_idl(body if head.startswith("IDL: ") else part)
     return types
 
 
@@ -387,28 +368,21 @@ def _given_definitions(definitions: Sequence[str]) -> dict[str, Any]:
     *_, typesys = _rosbags()
     types: dict[str, Any] = {}
     for entry in definitions:
-        name, file = _type_and_file(entry)
+        stated, equals, path = entry.rpartition("=")
+        file = Path(path)
+        parts = stated.split("/") if equals else [*file.absolute().parts[-3:-1], file.stem]
+        parts = [part for part in parts if part != "msg"]
+        if len(parts) < 2 or not all(parts):
+            raise SettingsError(f"--definition: expected PACKAGE/msg/NAME=FILE, found '{entry}'")
+        name = f"{parts[-2]}/msg/{parts[-1]}"
         try:
-            text = file.read_text(encoding="utf-8")
-            types |= typesys.get_types_from_msg(text, name)
+            types |= typesys.get_types_from_msg(file.read_text(encoding="utf-8"), name)
         except OSError as error:
-            raise InputError(
-                file, f"expected a message definition, can't be read ({error.strerror})"
-            ) from None
+            expected = "expected a message definition"
+            raise InputError(file, f"{expected}, can't be read ({error.strerror})") from None
         except Exception as error:
             raise InputError(file, f"expected the definition of {name} ({error})") from None
     return types
-
-
-def _type_and_file(entry: str) -> tuple[str, Path]:
-    """Return the type `PACKAGE/msg/NAME` and the file of `TYPE=FILE`, or of a path that ends like a type."""
-    name, equals, path = entry.rpartition("=")
-    file = Path(path)
-    parts = name.split("/") if equals else [*file.absolute().parts[-3:-1], file.stem]
-    parts = [part for part in parts if part != "msg"]
-    if len(parts) < 2 or not all(parts):
-        raise SettingsError(f"--definition: expected PACKAGE/msg/NAME=FILE, found '{entry}'")
-    return f"{parts[-2]}/msg/{parts[-1]}", file
 
 
 def _rosbags() -> tuple[Any, Any, Any]:

@@ -9,17 +9,14 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.io.log import covariances_of
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from .settings import LabelRule
 
 LIST_NAMES: Final = {
-    "big_orange": BIG_ORANGE,
-    "orange": ORANGE,
-    "blue": LEFT,
-    "left": LEFT,
-    "yellow": RIGHT,
-    "right": RIGHT,
+    **{"big_orange": BIG_ORANGE, "orange": ORANGE},
+    **{"blue": LEFT, "left": LEFT, "yellow": RIGHT, "right": RIGHT},
 }
 """Labels of the cones in a list with such a word in its name."""
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
@@ -157,8 +154,7 @@ def cloud_points(cloud: Any, rule: LabelRule, label_field: str | None = None) ->
     points = np.column_stack([columns["x"], columns["y"]]).astype(float)
     covariances = np.full((len(points), 2, 2), np.nan)
     if {"xx", "xy", "yy"} <= columns.keys():
-        entries = [columns[entry] for entry in ("xx", "xy", "xy", "yy")]
-        covariances = np.stack(entries, axis=-1).astype(float).reshape(-1, 2, 2)
+        covariances = covariances_of(*(columns[entry].astype(float) for entry in ("xx", "xy", "yy")))
     labels = np.full(len(points), UNKNOWN)
     if label_field != NO_LABEL:
         asked = (label_field,) if label_field else LABEL_FIELDS
@@ -178,12 +174,9 @@ def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
         raise MessageError(f"expected a point cloud with the fields x and y, found {', '.join(known)}")
     if not cloud.width * cloud.height:
         return {name: np.zeros(0) for name in known}
-    layout = {
-        "names": list(known),
-        "formats": [order + CLOUD_TYPES[field.datatype] for field in known.values()],
-        "offsets": [field.offset for field in known.values()],
-        "itemsize": cloud.point_step,
-    }
+    formats = [order + CLOUD_TYPES[field.datatype] for field in known.values()]
+    layout = {"names": [*known], "formats": formats, "itemsize": cloud.point_step}
+    layout["offsets"] = [field.offset for field in known.values()]
     try:
         of_a_point = np.dtype(layout)  # type: ignore[call-overload]
     except ValueError as error:

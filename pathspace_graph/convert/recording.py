@@ -1,36 +1,41 @@
-"""A record as it was found, in any order and with gaps, becomes a log, and what was left out is counted."""
+"""A record as it was found, in any order and with gaps, as a log, and messages as they arrive as cycles.
 
-from collections import Counter
+What was left out is counted.
+"""
+
+from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import gtsam
 import numpy as np
 
-from pathspace_graph.errors import InputError
+from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io.log import (
     MAX_HOLD,
-    MIN_RELATIVE_DETERMINANT,
     Detections,
     Log,
     Odometry,
     Truth,
     covariances_of,
+    is_positive_definite,
 )
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
-from .messages import Points
-from .settings import SIGMA_ODOMETRY, Frames, NoiseSettings, Window
+from .messages import Points, points_of, stamp_of, twist_of
+from .settings import SIGMA_ODOMETRY, Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3
 """Largest difference of the entries xy and yx of a covariance, by the larger variance; messages may have
 single precision."""
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 """Note of covariances that the record does not have."""
+OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
+SHARED_STAMP: Final = "messages with detections have the stamp of another one, and are one cycle with it"
 MIN_RANGE_OF_BEARING: Final = 1.0
 """Least range (m) at which a bearing's standard deviation counts across, so that the covariance of a
 detection at the sensor itself is positive definite."""
@@ -131,8 +136,13 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     notes["odometry samples that are not finite were left out"] += int((~good).sum())
     t, twists = t[good], twists[good]
     _check_stamps(t, "odometry", file)
-    _check_size(twists[:, :2], MAX_SPEED, "speeds of at most {:g} m/s", file)
-    _check_size(twists[:, 2], MAX_YAW_RATE, "yaw rates of at most {:g} rad/s", file)
+    for values, most, expected in (
+        (twists[:, :2], MAX_SPEED, f"speeds of at most {MAX_SPEED:g} m/s"),
+        (twists[:, 2], MAX_YAW_RATE, f"yaw rates of at most {MAX_YAW_RATE:g} rad/s"),
+    ):
+        worst = float(np.abs(values).max(initial=0.0))
+        if worst > most:
+            raise InputError(file, f"expected {expected}, found {worst:g}: is the unit right?")
     order = np.argsort(t, kind="stable")
     notes["odometry samples were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
     t, twists = t[order], twists[order]
@@ -150,12 +160,6 @@ def _check_stamps(t: Array, what: str, file: Path) -> None:
         raise InputError(file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}")
 
 
-def _check_size(values: Array, largest: float, expected: str, file: Path) -> None:
-    worst = float(np.abs(values).max(initial=0.0))
-    if worst > largest:
-        raise InputError(file, f"expected {expected.format(largest)}, found {worst:g}: is the unit right?")
-
-
 # --- detections ------------------------------------------------------------------------------------------
 
 
@@ -171,47 +175,32 @@ def _cycles(
         points = usable(record.scans[index], notes)
         if not len(points.labels):
             notes["messages without any detection give no cycle"] += 1
-        elif not begin <= t[index] <= end:
-            notes["messages with detections outside the time of the odometry were left out"] += 1
-        else:
-            _add(found.setdefault(float(t[index]), []), points, notes)
-    if not found:
-        raise InputError(file, f"expected {_expected(t, begin, end, notes)}")
-    return tuple(in_vehicle_frame(stamp, join(scans), frames, noise, notes) for stamp, scans in found.items())
-
-
-def _expected(t: Array, begin: float, end: float, notes: Counter[str]) -> str:
-    if not notes["messages with detections outside the time of the odometry were left out"]:
-        return f"detections that can be used, found {len(t)} messages without any"
-    return (
-        f"detections in the time of the odometry, {begin:.9g} s to {end - MAX_HOLD:.9g} s, found them from "
-        f"{t.min():.9g} s to {t.max():.9g} s: do both have the same clock?"
-    )
-
-
-def _add(scans: list[Points], points: Points, notes: Counter[str]) -> None:
-    """Add the points of a message to those of the same stamp, unless it is the same message again."""
-    if any(
-        np.array_equal(scan.points, points.points) and np.array_equal(scan.labels, points.labels)
-        for scan in scans
-    ):
-        notes["messages with detections were repetitions, and were left out"] += 1
-    else:
-        notes["messages with detections have the stamp of another one, and are one cycle with it"] += bool(
-            scans
-        )
+            continue
+        if not begin <= t[index] <= end:
+            notes[OUTSIDE] += 1
+            continue
+        scans = found.setdefault(float(t[index]), [])
+        if any(
+            np.array_equal(scan.points, points.points) and np.array_equal(scan.labels, points.labels)
+            for scan in scans
+        ):
+            notes["messages with detections were repetitions, and were left out"] += 1
+            continue
+        notes[SHARED_STAMP] += bool(scans)
         scans.append(points)
+    if not found and notes[OUTSIDE]:
+        expected = f"expected detections in the time of the odometry, {begin:.9g} s to {end - MAX_HOLD:.9g} s"
+        stamps = f"from {t.min():.9g} s to {t.max():.9g} s"
+        raise InputError(file, f"{expected}, found them {stamps}: do both have the same clock?")
+    if not found:
+        raise InputError(file, f"expected detections that can be used, found {len(t)} messages without any")
+    return tuple(in_vehicle_frame(stamp, join(scans), frames, noise, notes) for stamp, scans in found.items())
 
 
 def join(scans: list[Points]) -> Points:
     """Return the points of several messages as those of one."""
-    if len(scans) == 1:
-        return scans[0]
-    return Points(
-        np.concatenate([scan.points for scan in scans]),
-        np.concatenate([scan.covariances for scan in scans]),
-        np.concatenate([scan.labels for scan in scans]),
-    )
+    parts = zip(*((scan.points, scan.covariances, scan.labels) for scan in scans), strict=True)
+    return scans[0] if len(scans) == 1 else Points(*map(np.concatenate, parts))
 
 
 def usable(points: Points, notes: Counter[str]) -> Points:
@@ -250,12 +239,11 @@ def positive_definite(covariances: Array) -> BoolArray:
     """Return which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
     xx, yy = covariances[:, 0, 0], covariances[:, 1, 1]
     xy, yx = covariances[:, 0, 1], covariances[:, 1, 0]
-    finite = np.isfinite(covariances).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
-        good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
+        good = np.isfinite(covariances).all(axis=(1, 2)) & is_positive_definite(xx, xy, yy)
         good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
         good &= np.maximum(xx, yy) < MAX_RANGE**2
-    return np.asarray(finite & good)
+    return np.asarray(good)
 
 
 def default_covariances(points: Array, noise: NoiseSettings) -> Array:
@@ -267,12 +255,81 @@ def default_covariances(points: Array, noise: NoiseSettings) -> Array:
     begin, growth, bearing = noise.sigmas
     along = (begin + growth * ranges) ** 2
     across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * bearing) ** 2
-    return polar_covariances(bearings, along, across)
-
-
-def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
-    """Return the covariances (m, 2, 2) with these variances along and across the rays at bearings (rad)."""
     c, s = np.cos(bearings), np.sin(bearings)
     xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
     xy = c * s * (along - across)
     return covariances_of(xx, xy, yy)
+
+
+# --- messages as they arrive -------------------------------------------------------------------------------
+
+MAX_BUFFERED: Final = 10_000
+"""Largest number of twists that wait for a perception cycle, the newest ones."""
+BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexError, OverflowError)
+"""Errors of a message that cannot be read."""
+
+
+class MessageStream:
+    """Buffers twists, and gives each message with detections the twists up to it.
+
+    No message raises an error: one that cannot be used is counted in `refused`, and left out. A message
+    without a stamp has the time at which it was received.
+    """
+
+    def __init__(
+        self,
+        frames: Frames | None = None,
+        noise: NoiseSettings | None = None,
+        rule: LabelRule | None = None,
+        label_field: str | None = None,
+    ) -> None:
+        self.frames, self.noise = frames or Frames(), noise or NoiseSettings()
+        self.rule, self.label_field = rule or LabelRule(), label_field
+        self.refused: Counter[str] = Counter()
+        """Number of messages for each reason."""
+        self._twists: deque[tuple[float, list[float]]] = deque(maxlen=MAX_BUFFERED)
+        self._first = np.inf  # the stamp (s) of the first twist
+        self._newest = -np.inf  # the stamp (s) of the newest cycle in order
+
+    def take_odometry(self, message: Any, received: float) -> None:
+        """Buffer the twist of a message that was received at this time (s)."""
+        try:
+            t, twist = stamp_of(message) or received, twist_of(message)
+            if twist is None:
+                raise ValueError("odometry: expected a message with a twist, found a pose alone")
+            twist = twist * self.frames.flip
+            if not np.isfinite([t, *twist]).all() or (self._twists and t <= self._twists[-1][0]):
+                raise ValueError("odometry: expected finite numbers and a stamp later than the one before")
+            self._twists.append((t, twist.tolist()))
+            self._first = min(self._first, t)
+        except BROKEN as error:
+            self.refused[str(error)] += 1
+
+    def take_detections(self, message: Any, received: float) -> tuple[Odometry, Detections] | None:
+        """Return a perception cycle with the twists since the last one that was used, or None.
+
+        A late cycle comes without twists, which the cycles in order have had already. The caller says by
+        `use` that the estimator took the cycle; until then its twists are kept.
+        """
+        try:
+            points = usable(points_of(message, self.rule, self.label_field), self.refused)
+            t = stamp_of(message) or received
+            if not self._first <= t < np.inf:
+                raise ValueError("detections: expected a stamp not before that of the first odometry")
+            cycle = in_vehicle_frame(t, points, self.frames, self.noise, self.refused)
+        except BROKEN as error:
+            self.refused[str(error)] += 1
+            return None
+        return self._odometry_until(t), cycle
+
+    def use(self, t: float) -> None:
+        """Drop the twists that a cycle at t (s) has used, but for the last one, which is held."""
+        self._newest = max(self._newest, t)
+        while len(self._twists) > 1 and self._twists[1][0] <= self._newest:
+            self._twists.popleft()
+
+    def _odometry_until(self, t: float) -> Odometry:
+        """Return the buffered twists up to t (s); there are none for a late cycle."""
+        rows = [] if t <= self._newest else [row for row in self._twists if row[0] <= t]
+        twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
+        return Odometry(np.array([stamp for stamp, _ in rows]), twists)

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Sequence
+from colorsys import rgb_to_hsv
 from dataclasses import dataclass
 from math import inf, isfinite, pi
 from typing import Any, Final, Literal
@@ -14,15 +15,24 @@ from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
 
 Side = Literal["left", "right"]
-"""The y axis points to this side of the x axis."""
+"""Side of the x axis to which the y axis points."""
 DEFAULT_LABELS: Final = ("left=0", "right=1")
-"""Numbers mean these labels where nothing else is said."""
+"""Labels of numbers where nothing else is said."""
 SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)
-"""A twist has these standard deviations (m/s, m/s, rad/s) where nothing is known of them."""
-GROWTH: Final = "sigma_range_growth"
-DETECTION_SIGMAS: Final = ("sigma_range", GROWTH, "sigma_bearing")
+"""Standard deviations of a twist (m/s, m/s, rad/s) where nothing is known of them."""
 SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)
 """Noise of detections (m, m/m, rad) where nothing is known of it."""
+SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
+ORANGE_WORDS: Final = {"orange", "o"}
+BIG_WORDS: Final = {"big", "large"}
+UNKNOWN_WORDS: Final = {"unknown", "none", "other", "undefined", "uncolored", "colourless", "colour"}
+"""Words of values that mean no side, and of colours, whose hue has decided."""
+MOST_TOLD: Final = 12
+"""Number of values of labels that a line lists."""
+HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}
+"""Hues (degrees) of blue, orange and yellow; that of red is below, that of green between yellow and blue."""
+MIN_SATURATION: Final = 0.3
+"""Least saturation of a colour that is not grey."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +57,11 @@ class NoiseSettings:
         sigmas = self.sigma_odometry
         if sigmas is not None and (len(sigmas) != 3 or not all(0 < sigma < inf for sigma in sigmas)):
             raise SettingsError(f"--sigma-odometry: expected three positive numbers, found {sigmas}")
-        given = [name for name, own in zip(DETECTION_SIGMAS, self._own, strict=True) if own is not None]
-        check_numbers(self, "convert", [name for name in given if name != GROWTH], "a positive number")
-        check_numbers(self, "convert", [name for name in given if name == GROWTH], "a number of at least 0")
+        for name in ("sigma_range", "sigma_bearing", "sigma_range_growth"):
+            if getattr(self, name) is not None:
+                is_growth = name == "sigma_range_growth"
+                expected = "a number of at least 0" if is_growth else "a positive number"
+                check_numbers(self, "convert", [name], expected)
 
     @property
     def _own(self) -> tuple[float | None, ...]:
@@ -58,9 +70,8 @@ class NoiseSettings:
     @property
     def sigmas(self) -> tuple[float, ...]:
         """Return sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
-        return tuple(
-            default if own is None else own for own, default in zip(self._own, SIGMA_DETECTIONS, strict=True)
-        )
+        pairs = zip(self._own, SIGMA_DETECTIONS, strict=True)
+        return tuple(default if own is None else own for own, default in pairs)
 
     @property
     def states_detections(self) -> bool:
@@ -197,37 +208,11 @@ def label_of_words(text: str) -> int:
     return sides[0] if len(sides) == 1 else UNKNOWN
 
 
-SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
-ORANGE_WORDS: Final = {"orange", "o"}
-BIG_WORDS: Final = {"big", "large"}
-UNKNOWN_WORDS: Final = {"unknown", "none", "other", "undefined", "uncolored", "colourless", "colour"}
-"""Words of values that mean no side, and of colours, whose hue has decided."""
-MOST_TOLD: Final = 12
-"""Number of values of labels that a line lists."""
-BLUE_HUES: Final = (190.0, 265.0)
-"""A colour with a hue (degrees) between these is blue."""
-YELLOW_HUES: Final = (44.0, 75.0)
-"""A colour with a hue (degrees) between these is yellow; that of green is above."""
-ORANGE_HUES: Final = (14.0, 44.0)
-"""A colour with a hue (degrees) between these is orange; that of red is below."""
-MIN_SATURATION: Final = 0.3
-"""A colour of less saturation is grey."""
-
-
 def label_of_colour(red: float, green: float, blue: float) -> int:
     """Return the label of a blue, yellow or orange colour, UNKNOWN of any other; the scale is free."""
     most, least = max(red, green, blue), min(red, green, blue)
     if not 0.0 < most < inf or not most - least > MIN_SATURATION * most:
         return UNKNOWN
-    chroma = most - least
-    if most == red:
-        hue = 60.0 * (green - blue) / chroma
-    elif most == green:
-        hue = 60.0 * (blue - red) / chroma + 120.0
-    else:
-        hue = 60.0 * (red - green) / chroma + 240.0
-    if BLUE_HUES[0] <= hue <= BLUE_HUES[1]:
-        return LEFT
-    if ORANGE_HUES[0] <= hue < ORANGE_HUES[1]:
-        return ORANGE
-    return RIGHT if YELLOW_HUES[0] <= hue <= YELLOW_HUES[1] else UNKNOWN
+    hue = 360.0 * rgb_to_hsv(red, green, blue)[0]
+    labels = [label for label, (low, high) in HUES.items() if low <= hue <= high]
+    return labels[-1] if labels else UNKNOWN  # yellow begins where orange ends

@@ -10,10 +10,9 @@ from typing import Any, Final
 import numpy as np
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
-from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.io.csv_table import Table, read_table
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import covariances_of
-from pathspace_graph.io.parsing import MAX_STAMP, read_text, shown
+from pathspace_graph.io.parsing import MAX_STAMP, Table, read_table, read_text, shown
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import Points
@@ -25,15 +24,8 @@ DETECTIONS: Final = "detections"
 QUANTITIES: Final = {
     ODOMETRY: {"t": "time", "vx": "speed", "vy": "speed", "wz": "yaw_rate"},
     DETECTIONS: {
-        "t": "time",
-        "x": "length",
-        "y": "length",
-        "range": "length",
-        "bearing": "angle",
-        "label": "",
-        "xx": "length",
-        "xy": "length",
-        "yy": "length",
+        **{"t": "time", "x": "length", "y": "length", "range": "length", "bearing": "angle", "label": ""},
+        **{"xx": "length", "xy": "length", "yy": "length"},
     },
 }
 """Columns of each file and their quantities; a covariance is of the square of one."""
@@ -59,14 +51,6 @@ MAX_PERIOD: Final = 1e3
 """Largest mean period of samples (s); more is a wrong unit of time."""
 
 
-@dataclass(frozen=True)
-class Column:
-    """Column of a file, whose numbers may change their sign."""
-
-    name: str
-    sign: float = 1.0
-
-
 class Columns:
     """Columns of the quantities: `vx=speed`, `y=-cone_y` with the sign changed, `detections.t=stamp` for one
     of both files only.
@@ -75,27 +59,18 @@ class Columns:
     """
 
     def __init__(self, pairs: Sequence[str] = ()) -> None:
-        self._named: dict[tuple[str, str], Column] = {}
+        self.named: dict[tuple[str, str], str] = {}
+        """Columns by kind of file and quantity, those whose sign is changed with a minus."""
         for pair in pairs:
             key, equals, name = pair.partition("=")
-            column = Column(name.removeprefix("-"), -1.0 if name.startswith("-") else 1.0)
-            if not equals or not column.name:
+            if not equals or not name.removeprefix("-"):
                 raise SettingsError(f"--columns: expected QUANTITY=COLUMN, found '{pair}'")
             only, _, key = key.rpartition(".")
             known = [key for kind, keys in QUANTITIES.items() if only in ("", kind) for key in keys]
-            check_name(
-                key, known, f"--columns: expected one of {', '.join(dict.fromkeys(known))} in '{pair}'"
-            )
+            expected = f"expected one of {', '.join(dict.fromkeys(known))} in '{pair}'"
+            check_name(key, known, f"--columns: {expected}")
             for kind in [only] if only else QUANTITIES:
-                self._named[kind, key] = column
-
-    def of(self, kind: str, key: str) -> Column:
-        """Return the column of a quantity in a file of this kind."""
-        return self._named.get((kind, key), Column(key))
-
-    def is_named(self, kind: str, key: str) -> bool:
-        """Return whether the column of a quantity was named."""
-        return (kind, key) in self._named
+                self.named[kind, key] = name
 
 
 class Units:
@@ -111,19 +86,11 @@ class Units:
             check_name(quantity, UNITS, f"--units: expected one of {', '.join(UNITS)} in '{pair}'")
             known = UNITS[quantity]
             if not equals or unit not in known:
-                raise SettingsError(
-                    f"--units: expected {quantity}= one of {', '.join(known)}, found '{pair}'"
-                )
+                expected = f"expected {quantity}= one of {', '.join(known)}"
+                raise SettingsError(f"--units: {expected}, found '{pair}'")
             self.names[quantity] = unit
-        self.names = {
-            "speed": f"{self.names['length']}/s",
-            "yaw_rate": f"{self.names['angle']}/s",
-            **self.names,
-        }
-
-    def factor(self, quantity: str) -> float:
-        """Return by what a number is multiplied for the SI unit."""
-        return UNITS[quantity][self.names[quantity]]
+        length, angle = self.names["length"], self.names["angle"]
+        self.names = {"speed": f"{length}/s", "yaw_rate": f"{angle}/s", **self.names}
 
     def __str__(self) -> str:
         return ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(self.names.items()))
@@ -131,13 +98,16 @@ class Units:
 
 def read_csv(odometry: Path, detections: Path, columns: Columns, units: Units, rule: LabelRule) -> Recording:
     """Return what two CSV files have of a drive; an InputError names file, row and column."""
-    twists = _File.read(ODOMETRY, odometry, columns, units)
-    found = _File.read(DETECTIONS, detections, columns, units)
+    twists, found = (
+        _File(kind, read_table(file, ()), columns, units)
+        for kind, file in ((ODOMETRY, odometry), (DETECTIONS, detections))
+    )
     t = twists.stamps()
-    speeds = [twists.numbers(key) if key != "vy" else twists.optional(key) for key in ("vx", "vy", "wz")]
+    vx, wz = twists.numbers("vx"), twists.numbers("wz")
+    vy = twists.numbers("vy") if twists.has("vy") else np.zeros(len(t))
     scan_t, scans = _scans(found, rule)
     source = {"odometry": odometry.name, "detections": detections.name, "units": str(units)}
-    return Recording(t, np.column_stack(speeds), scan_t, scans, source)
+    return Recording(t, np.column_stack([vx, vy, wz]), scan_t, scans, source)
 
 
 @dataclass(frozen=True)
@@ -149,44 +119,34 @@ class _File:
     columns: Columns
     units: Units
 
-    @staticmethod
-    def read(kind: str, file: Path, columns: Columns, units: Units) -> "_File":
-        """Return a file of this kind, which has one row at least."""
-        table = read_table(file, ())
-        if not len(table):
-            raise InputError(file, "expected at least one row, found a header only", 2)
-        return _File(kind, table, columns, units)
+    def __post_init__(self) -> None:
+        if not len(self.table):
+            raise InputError(self.table.file, "expected at least one row, found a header only", 2)
 
     def has(self, key: str) -> bool:
         """Return whether the file has the column of a quantity; one that was named must be there."""
-        return self.columns.is_named(self.kind, key) or key in self.table.columns
+        return (self.kind, key) in self.columns.named or key in self.table.columns
 
-    def column(self, key: str) -> Column:
+    def column(self, key: str) -> str:
         """Return the column of a quantity; an InputError lists the columns that are there."""
-        column = self.columns.of(self.kind, key)
-        if column.name not in self.table.columns:
-            raise InputError(
-                self.table.file,
-                f"expected a column '{column.name}' for {key} (--columns {key}=NAME), "
-                f"found the columns {', '.join(self.table.columns)}",
-                1,
-            )
+        column = self.columns.named.get((self.kind, key), key).removeprefix("-")
+        if column not in self.table.columns:
+            expected = f"expected a column '{column}' for {key} (--columns {key}=NAME)"
+            found = f"found the columns {', '.join(self.table.columns)}"
+            raise InputError(self.table.file, f"{expected}, {found}", 1)
         return column
 
     def numbers(self, key: str, power: int = 1) -> Array:
         """Return a column (rows,) in the SI unit, or in its square where `power` is 2."""
-        column = self.column(key)
-        factor = self.units.factor(QUANTITIES[self.kind][key]) ** power
-        return np.asarray(column.sign * factor * self.table.numbers(column.name, LARGEST))
-
-    def optional(self, key: str) -> Array:
-        """Return a column (rows,) in the SI unit, or zeros where the file has none."""
-        return self.numbers(key) if self.has(key) else np.zeros(len(self.table))
+        quantity = QUANTITIES[self.kind][key]
+        factor = UNITS[quantity][self.units.names[quantity]] ** power
+        if self.columns.named.get((self.kind, key), "").startswith("-"):
+            factor = -factor
+        return np.asarray(factor * self.table.numbers(self.column(key), LARGEST))
 
     def stamps(self) -> Array:
         """Return the stamps (rows,) in s, whose unit has to be plausible."""
-        t, unit = self.numbers("t"), self.units.names["time"]
-        name = self.columns.of(self.kind, "t").name
+        t, unit, name = self.numbers("t"), self.units.names["time"], self.column("t")
         self.table.require(
             np.abs(t) <= MAX_STAMP,
             f"expected stamps of at most {MAX_STAMP:g} s in column '{name}', found more: is their unit not "
@@ -196,52 +156,41 @@ class _File:
         period = float(np.ptp(stamps)) / max(len(stamps) - 1, 1)
         if len(stamps) > 1 and not MIN_PERIOD < period < MAX_PERIOD:
             expected = f"expected stamps in {unit} in column '{name}'"
-            raise InputError(
-                self.table.file, f"{expected}, found them {period:.3g} s apart: is their unit another one?"
-            )
+            found = f"found them {period:.3g} s apart: is their unit another one?"
+            raise InputError(self.table.file, f"{expected}, {found}")
         return t
 
 
 def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
     """Return the stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
-    t, points, covariances, labels = file.stamps(), _points(file), _covariances(file), _labels(file, rule)
+    t, points, rows = file.stamps(), _points(file), len(file.table)
+    covariances, labels = np.full((rows, 2, 2), np.nan), np.full(rows, UNKNOWN)
+    if any(map(file.has, COVARIANCE)):
+        covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
+    if file.has("label"):
+        labels = rule.of_all(np.array(file.table.columns[file.column("label")]))
     stamps, first, cycle = np.unique(t, return_index=True, return_inverse=True)
     order = np.argsort(first)
     groups = np.split(np.argsort(cycle, kind="stable"), np.cumsum(np.bincount(cycle))[:-1])
-    rows = [groups[index] for index in order]
-    return stamps[order], [Points(points[own], covariances[own], labels[own]) for own in rows]
+    cycles = [groups[index] for index in order]
+    return stamps[order], [Points(points[own], covariances[own], labels[own]) for own in cycles]
 
 
 def _points(file: _File) -> Array:
-    if not (file.columns.is_named(DETECTIONS, "range") or not file.has("x")):
+    if file.has("x") and (DETECTIONS, "range") not in file.columns.named:
         return np.column_stack([file.numbers("x"), file.numbers("y")])
     if not file.has("range"):
         file.column("x")  # raises: neither x and y nor range and bearing are there
     ranges, bearings = file.numbers("range"), file.numbers("bearing")
-    name, unit = file.column("bearing").name, file.units.names["angle"]
+    name, unit = file.column("bearing"), file.units.names["angle"]
     file.table.require(
         np.abs(bearings) <= MAX_BEARING,
         f"expected bearings of at most a whole turn in column '{name}', found more: is their unit not {unit} "
         "(--units angle=deg)?",
     )
-    file.table.require(
-        ranges >= 0.0, f"expected ranges of at least 0 in column '{file.column('range').name}'"
-    )
+    negative = f"expected ranges of at least 0 in column '{file.column('range')}'"
+    file.table.require(ranges >= 0.0, negative)
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
-
-
-def _covariances(file: _File) -> Array:
-    """Return the covariances (rows, 2, 2) in m^2, which are NaN where the file has none."""
-    if not any(map(file.has, COVARIANCE)):
-        return np.full((len(file.table), 2, 2), np.nan)
-    xx, xy, yy = (file.numbers(key, power=2) for key in COVARIANCE)
-    return covariances_of(xx, xy, yy)
-
-
-def _labels(file: _File, rule: LabelRule) -> IntArray:
-    if not file.has("label"):
-        return np.full(len(file.table), UNKNOWN)
-    return rule.of_all(np.array(file.table.columns[file.column("label").name]))
 
 
 # --- JSON lines ------------------------------------------------------------------------------------------
@@ -269,9 +218,8 @@ def read_json_lines(file: Path, rule: LabelRule) -> Recording:
                 scans.append(_points_of_objects(entry["detections"], rule))
         except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
             expected = "expected a line with t, and with twist [vx, vy, wz] or a list of detections"
-            raise InputError(
-                file, f"{expected}, found {shown(line)} ({type(error).__name__}: {error})", row
-            ) from None
+            found = f"found {shown(line)} ({type(error).__name__}: {error})"
+            raise InputError(file, f"{expected}, {found}", row) from None
     source = {"file": file.name}
     return Recording(np.array(t), np.array(twists).reshape(-1, 3), np.array(scan_t), scans, source)
 

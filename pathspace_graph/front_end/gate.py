@@ -20,8 +20,7 @@ from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, L
 from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.scale.door import in_scene
-from pathspace_graph.scale.scene import scale_of
+from pathspace_graph.scale import in_scene, scale_of
 from pathspace_graph.settings.online import LimitSettings
 
 UNITS: Final = "stamps are in seconds"

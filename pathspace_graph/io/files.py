@@ -1,11 +1,22 @@
-"""Output that appears as a whole or not at all, and never costs an earlier result."""
+"""Output that appears as a whole or not at all, and never costs an earlier result.
 
+Each step that changes what a path names is one system call. Python announces most of them to audit hooks
+(`sys.addaudithook`); those that it doesn't know announce themselves in the same way, so that a test can end
+the process before any of them.
+"""
+
+import ctypes
+import errno
 import json
 import math
 import os
+import re
+import secrets
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
+from functools import cache
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,11 +26,25 @@ import numpy as np
 
 from pathspace_graph.errors import OutputError
 
-from . import disk
 from .manifest import MANIFEST_FILE, manifest_of
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks
+    fcntl = None  # type: ignore[assignment]
 
 STDOUT: Final = Path("-")
 """Path at which a single file is written to standard output."""
+SYNC: Final = "pathspace_graph.sync"
+"""Audit event before a file or a folder is flushed to the disk, with its path."""
+RENAME: Final = "pathspace_graph.rename"
+"""Audit event before a rename with flags, with both paths."""
+
+_AT_FDCWD: Final = -100  # a relative path is relative to the working folder
+_NOREPLACE: Final = 1
+_EXCHANGE: Final = 2
+_UNSUPPORTED: Final = frozenset({errno.ENOSYS, errno.EINVAL, errno.ENOTSUP})
+_TOKEN: Final = "[0-9a-f]{8}"
 
 
 @contextmanager
@@ -49,7 +74,10 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
             temporary = Path(folder, path.name)
             yield temporary
             with _naming(path):
-                _copy(temporary, path)
+                content = temporary.read_bytes()
+                with nullcontext(sys.stdout.buffer) if path == STDOUT else path.open("wb") as stream:
+                    stream.write(content)
+                    stream.flush()
         return
     with _placed(final, Path.touch, lambda: check_file_target(final)) as temporary:
         yield temporary
@@ -60,22 +88,15 @@ def is_stream(path: Path) -> bool:
     return path == STDOUT or (path.exists() and not path.is_file() and not path.is_dir())
 
 
-def _copy(source: Path, target: Path) -> None:
-    content = source.read_bytes()
-    with nullcontext(sys.stdout.buffer) if target == STDOUT else target.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-
-
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
     """Yield a temporary path beside `file` that takes its place on success; no backup is kept."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    with _naming(file), disk.beside(file, Path.touch) as temporary:
+    with _naming(file), _beside(file, Path.touch) as temporary:
         yield temporary
-        disk.sync(temporary)
+        sync(temporary)
         temporary.replace(file)
-        disk.sync(file.parent)
+        sync(file.parent)
 
 
 def write_text(file: Path, text: str) -> None:
@@ -127,13 +148,13 @@ def check_target(target: Path | str, marker: str) -> None:
     if not target.is_dir():
         raise OutputError(f"{target}: expected a folder to write, found a file")
     try:
-        names = [entry.name for entry in target.iterdir() if not disk.is_temporary(entry.name)]
-        foreign = bool(names) and not (target / marker).is_file()
+        is_empty = all(is_temporary(entry.name) for entry in target.iterdir())
+        if is_empty or (target / marker).is_file():
+            return
     except OSError as error:
         raise OutputError(f"{target}: expected a readable folder: {error.strerror}") from error
-    if foreign:
-        expected = "expected an empty folder or an earlier result"
-        raise OutputError(f"{target}: {expected}, found files but no {marker}")
+    expected = "expected an empty folder or an earlier result"
+    raise OutputError(f"{target}: {expected}, found files but no {marker}")
 
 
 def check_file_target(path: Path | str) -> None:
@@ -156,6 +177,9 @@ def _check_parents(target: Path) -> None:
         raise OutputError(f"{nearest}: expected a folder, found a file")
 
 
+# --- the way to the place ----------------------------------------------------------------------------------
+
+
 @contextmanager
 def _placed(final: Path, make: Callable[[Path], None], check: Callable[[], None]) -> Iterator[Path]:
     """Yield a temporary path that is flushed to the disk and put in place on success.
@@ -167,13 +191,13 @@ def _placed(final: Path, make: Callable[[Path], None], check: Callable[[], None]
     with _naming(final):
         try:
             final.parent.mkdir(parents=True, exist_ok=True)
-            with disk.beside(final, make) as temporary:
+            with _beside(final, make) as temporary:
                 yield temporary
                 check()
-                disk.sync_tree(temporary)
+                sync_tree(temporary)
                 _put_in_place(temporary, final)
             for parent in (final, *missing):
-                disk.sync(parent.parent)
+                sync(parent.parent)
         except BaseException:
             for parent in missing:
                 with suppress(OSError):
@@ -188,11 +212,11 @@ def _put_in_place(temporary: Path, final: Path) -> None:
             temporary.rename(final)  # also over an empty folder, but over nothing else
             return
     numbers = count(1)
-    while not disk.rename_new(temporary, final):
+    while not rename_new(temporary, final):
         backup = final.with_name(f"{final.name}.~{next(numbers)}~")
-        if disk.rename_new(temporary, backup):
+        if rename_new(temporary, backup):
             try:
-                disk.exchange(backup, final, spare=temporary)
+                exchange(backup, final, spare=temporary)
                 return
             except OSError as error:
                 with suppress(FileNotFoundError):
@@ -207,9 +231,159 @@ def _naming(final: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if any(map(disk.is_temporary, final.parts)):
+        if any(map(is_temporary, final.parts)):
             raise  # whoever writes the folder around it names that
         named = Path(str(error.filename or final))
-        if not any(map(disk.is_temporary, named.parts)) and named not in (final, *final.parents):
+        if not any(map(is_temporary, named.parts)) and named not in (final, *final.parents):
             raise  # of a file that is read
         raise OutputError(f"{final}: can't be written: {error.strerror or error}") from error
+
+
+# --- temporary paths -------------------------------------------------------------------------------------
+
+
+def is_temporary(name: str) -> bool:
+    """Return whether a file has the name of a temporary one."""
+    return re.fullmatch(rf"\..*\.{_TOKEN}\.tmp(\.[^.]*)?", name) is not None
+
+
+@contextmanager
+def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
+    """Yield a new path beside `final`, made by `make`, and remove it if it is still there at the end.
+
+    It is locked meanwhile, so that another run knows that it is in use. What runs that died have left of the
+    same target is removed before.
+    """
+    remove_leftovers(final)
+    descriptor = None
+    while descriptor is None:
+        # the suffix stays last, as writers choose the format by it
+        path = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.tmp{final.suffix}")
+        make(path)
+        descriptor = lock(path, wait=True)
+        if descriptor is None and path.exists():  # no locks here
+            break
+    try:
+        yield path
+    finally:
+        _remove(path)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def remove_leftovers(final: Path) -> None:
+    """Remove the temporary files of `final` that no living process has locked."""
+    name = re.compile(re.escape(f".{final.stem}.") + _TOKEN + re.escape(f".tmp{final.suffix}"))
+    with suppress(OSError):
+        for leftover in [path for path in final.parent.iterdir() if name.fullmatch(path.name)]:
+            descriptor = lock(leftover, wait=False)
+            if descriptor is not None:
+                _remove(leftover)
+                os.close(descriptor)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+
+
+def lock(path: Path, *, wait: bool) -> int | None:
+    """Return a descriptor that locks a file or a folder until it is closed, or the process dies.
+
+    None where the path is gone, where the file system has no locks, and, unless it is to `wait`, where
+    another process holds the lock.
+    """
+    if fcntl is None:
+        return None
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    with suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        if os.path.samestat(os.fstat(descriptor), path.lstat()):
+            return descriptor
+    os.close(descriptor)
+    return None
+
+
+# --- single steps ----------------------------------------------------------------------------------------
+
+
+def sync(path: Path) -> None:
+    """Wait until the content of a file, or the names in a folder, are on the disk."""
+    sys.audit(SYNC, str(path))
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except PermissionError:  # what may be written need not be readable
+        return
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _UNSUPPORTED:  # some file systems can't flush a folder
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def sync_tree(path: Path) -> None:
+    """Wait until a file, or a folder with everything below it, is on the disk."""
+    for parent, _, names in os.walk(path, topdown=False):
+        for file in (Path(parent, name) for name in names):
+            if not file.is_symlink():
+                sync(file)
+        sync(Path(parent))
+    if path.is_file():
+        sync(path)
+
+
+def rename_new(source: Path, target: Path) -> bool:
+    """Rename to a path that names nothing; return False, and do nothing, where something is there."""
+    try:
+        if _rename(source, target, _NOREPLACE):
+            return True
+    except FileExistsError:
+        return False
+    if os.path.lexists(target):
+        return False
+    source.rename(target)
+    return True
+
+
+def exchange(first: Path, second: Path, spare: Path) -> None:
+    """Exchange what two paths name in one step.
+
+    Where the system has no such step there are three by way of `spare`, and `first` names the old content of
+    `second` between the last two.
+    """
+    if _rename(first, second, _EXCHANGE):
+        return
+    first.rename(spare)
+    second.rename(first)
+    try:
+        spare.rename(second)
+    except OSError:
+        first.rename(second)
+        raise
+
+
+@cache
+def _renameat2() -> Any:
+    """Return the rename with flags of Linux; None elsewhere."""
+    return getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
+
+
+def _rename(source: Path, target: Path, flag: int) -> bool:
+    """Rename with a flag; return False where the system or the file system does not know the flag."""
+    sys.audit(RENAME, str(source), str(target))
+    rename = _renameat2()
+    if rename is None:
+        return False
+    if rename(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in _UNSUPPORTED:
+        return False
+    raise OSError(code, os.strerror(code), str(source), None, str(target))

@@ -12,9 +12,8 @@ from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
-from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_NOISE, shown
 
-from .parsing import parse_toml, read_text
+from .parsing import MAX_HEADER_BYTES, MAX_NOISE, parse_toml, read_text, shown
 
 FORMAT: Final = "pathspace-log/1"
 POSITIVE: Final = math.ulp(0.0)
@@ -116,11 +115,10 @@ def to_toml(sections: Mapping[str, Mapping[str, Any]]) -> str:
 
 def toml_text(value: Any) -> str:
     """Return a text, a number or a list of numbers as TOML."""
+    if not isinstance(value, str):
+        return repr(value)
     # a JSON string is a TOML string, but for the delete character
-    text = (
-        json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f") if isinstance(value, str) else None
-    )
-    return repr(value) if text is None else text
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | None) -> dict[str, Any]:
@@ -132,10 +130,8 @@ def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | N
         "odometry": STATED if odometry else UNSTATED[measured is None],
         "detections": STATED if detections else UNSTATED[not rays],
     }
-    return {"noise": section} | ({} if measured is None else {MEASURED: _entries(measured)})
-
-
-def _entries(measured: MeasuredNoise) -> dict[str, Any]:
+    if measured is None:
+        return {"noise": section}
     entries: dict[str, Any] = {name: getattr(measured, name).tolist() for name in ("odometry", "drift")}
     entries["interval"] = measured.interval
     for name, ray in (("along", measured.along), ("across", measured.across)):
@@ -145,4 +141,4 @@ def _entries(measured: MeasuredNoise) -> dict[str, Any]:
         entries |= {name: getattr(measured, name) for name in ("count", "period", "per_cycle")}
         errors = np.column_stack([measured.sensor, measured.sensor_sigma]).tolist()
         entries |= dict(zip(SENSOR, errors, strict=True))
-    return entries | {"seconds": measured.seconds}
+    return {"noise": section, MEASURED: entries | {"seconds": measured.seconds}}

@@ -13,15 +13,15 @@ import numpy as np
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
-from pathspace_graph.io import parsing as limits
-from pathspace_graph.io.brief import Brief, pictures
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE
 
-from .csv_table import Column, Table, read_table, write_table
+from . import parsing as limits
+from .brief import Brief, pictures
 from .files import atomic_folder
 from .header import POSITIVE, Header, noise_sections, to_toml, toml_text
 from .manifest import verified
+from .parsing import Column, Table, read_table, write_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -164,12 +164,8 @@ class Log:
     """All that a vehicle recorded on one drive."""
 
     LENGTHS: ClassVar = {
-        "odometry": 0,
-        "cycles": 0,
+        **dict.fromkeys(("odometry", "cycles", "sensor", "measured", "truth"), 0),
         "odometry_sigma": POSE,
-        "sensor": 0,
-        "measured": 0,
-        "truth": 0,
     }
 
     odometry: Odometry
@@ -191,13 +187,13 @@ class Log:
     def __repr__(self) -> str:
         seconds, noise = self.odometry.t[-1] - self.odometry.t[0], ("measured", "stated")
         detections = sum(len(cycle.labels) for cycle in self.cycles)
-        lines = (
-            f"Log({seconds:.1f} s: {len(self.odometry.t)} twists, their noise {noise[self.odometry_stated]};",
-            f"{len(self.cycles)} cycles with {detections} detections,"
-            f" their noise {noise[self.detections_stated]};",
-            f"{'no truth' if self.truth is None else 'with truth'})",
+        return (
+            f"Log({seconds:.1f} s: {len(self.odometry.t)} twists,"
+            f" their noise {noise[self.odometry_stated]};\n"
+            f"    {len(self.cycles)} cycles with {detections} detections,"
+            f" their noise {noise[self.detections_stated]};\n"
+            f"    {'no truth' if self.truth is None else 'with truth'})"
         )
-        return "\n    ".join(lines)
 
     def plot(self, **options: Any) -> Figure:
         """Return a picture of the log; the options are those of `eval.figures.map_plot.plot_log`."""
@@ -228,6 +224,12 @@ def _read_log(folder: Path) -> Log:
     table = _table(folder, DETECTIONS_FILE)
     cycles = _cycles(table, float(odometry.t[0]), float(odometry.t[-1]))
     sensor = [name for name in _SENSOR_INFO if name in header.section("sensor")]
+    truth = header.section("truth")
+    true_errors = {
+        name: np.array([header.numbers("truth", entry).item() for entry in entries])
+        for name, entries in _TRUE_ERRORS.items()
+        if truth and (entries == CALIBRATION or not truth.keys().isdisjoint(entries))
+    }
     return Log(
         odometry=odometry,
         cycles=cycles,
@@ -235,7 +237,7 @@ def _read_log(folder: Path) -> Log:
         sensor=SensorInfo(**{name: header.numbers("sensor", name, 1, POSITIVE).item() for name in sensor}),
         source={key: str(value) for key, value in header.section("source").items()},
         **header.noise(),
-        truth=_read_truth(folder, len(table), _true_errors(header)),
+        truth=_read_truth(folder, len(table), true_errors),
     )
 
 
@@ -256,16 +258,6 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
             write_table(target / name, COLUMNS[name], *values)
         if check:
             _read_log(target)
-
-
-def _true_errors(header: Header) -> dict[str, Array]:
-    """Return the true calibration, errors of the sensor and noise, those of them that the header has."""
-    section = header.section("truth")
-    return {
-        name: np.array([header.numbers("truth", entry).item() for entry in entries])
-        for name, entries in _TRUE_ERRORS.items()
-        if section and (entries == CALIBRATION or not section.keys().isdisjoint(entries))
-    }
 
 
 def _read_odometry(table: Table) -> Odometry:
@@ -295,8 +287,10 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
     table.require(t >= t_first, f"expected a time not before the first odometry row ({t_first:g} s)")
     late = f"expected a time at most {MAX_HOLD:g} s after the last odometry row ({t_last:g} s)"
     table.require(t <= t_last + MAX_HOLD, late)
-    points = table.stack(("x", "y"))
-    cycles = cycles_of(t, points, _covariances(table), _labels(table))
+    points, entries = table.stack(("x", "y")), table.stack(("xx", "xy", "yy")).T
+    wrong = "expected a positive definite covariance (xx > 0, xx yy > xy^2)"
+    table.require(is_positive_definite(*entries), wrong)
+    cycles = cycles_of(t, points, covariances_of(*entries), _labels(table))
     counts = [len(cycle.labels) for cycle in cycles]
     if max(counts) > limits.MAX_DETECTIONS:
         first = sum(counts[: int(np.argmax(counts))])
@@ -318,12 +312,11 @@ def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
     return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
 
 
-def _covariances(table: Table) -> Array:
-    xx, xy, yy = table.stack(("xx", "xy", "yy")).T
+def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
+    """Return which covariances (m,) are positive definite, by their entries."""
     with np.errstate(over="ignore", invalid="ignore"):
         good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
-    table.require(good, "expected a positive definite covariance (xx > 0, xx yy > xy^2)")
-    return covariances_of(xx, xy, yy)
+    return np.asarray(good)
 
 
 def _labels(table: Table) -> IntArray:
@@ -359,7 +352,6 @@ def _associations(table: Table, detection_count: int, cone_count: int) -> IntArr
 
 
 def _sections(log: Log) -> dict[str, dict[str, Any]]:
-    """Return the sections of the header."""
     sensor = {name: getattr(log.sensor, name) for name in _SENSOR_INFO}
     truth = dict[str, Any]()
     for name, entries in _TRUE_ERRORS.items():

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.parsing import shown
 
-from .parsing import parse_json, read_text
+from .parsing import parse_json, read_text, shown
 
 FORMAT: Final = "pathspace-manifest/1"
 MANIFEST_FILE: Final = "manifest.json"

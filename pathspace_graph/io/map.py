@@ -13,14 +13,13 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.brief import Brief, pictures
-from pathspace_graph.io.parsing import MAX_COORDINATE, MAX_DEGREE, MAX_INTEGER, shown
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, POINTS, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
+from .brief import Brief, pictures
 from .manifest import verified
-from .parsing import read_json
+from .parsing import MAX_COORDINATE, MAX_DEGREE, MAX_INTEGER, read_json, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,10 +44,8 @@ class SplineBoundary(Brief):
 
     spline: BSpline
     """Curve in the map frame, in the direction of travel."""
-
     covariance: Array
     """Joint covariance (2m, 2m) in m^2 of the distinct control points, in the order x0, y0, x1 and so on."""
-
     confirmed_until: float = math.inf
     """Parameter up to which the curve is confirmed; beyond, it is tentative, and may be taken back."""
 
@@ -66,7 +63,6 @@ class PointBoundary(Brief):
 
     points: Array
     """Points (m, 2) in m, map frame, in no particular order."""
-
     covariance: Array
     """Joint covariance (2m, 2m) in m^2 of the points, in the order x0, y0, x1 and so on."""
 
@@ -104,13 +100,10 @@ class Map:
 
     closed: bool
     """Whether the track was found to be a loop."""
-
     boundaries: Mapping[Any, MapBoundary]
     """Boundaries by label, LEFT or RIGHT, or by its name; one that could not be mapped is absent."""
-
     joint_covariance: Array | None = None
     """Joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their labels."""
-
     points: Mapping[int, PointBoundary] = field(default_factory=dict)
     """Cones of no boundary by their label, ORANGE or BIG_ORANGE, each label with one covariance."""
 
@@ -118,7 +111,12 @@ class Map:
         object.__setattr__(self, "boundaries", Boundaries(self.boundaries))
 
     def __repr__(self) -> str:
-        sides = [_outline(NAMES[label], own) for label, own in sorted(self.boundaries.items())]
+        sides = [
+            f"{NAMES[label]}: {own.size} points"
+            if isinstance(own, PointBoundary)
+            else f"{NAMES[label]}: {own.size} control points on {own.spline.length():.0f} m"
+            for label, own in sorted(self.boundaries.items())
+        ]
         cones = [f"{own.size} {NAMES[label].replace('_', ' ')} cones" for label, own in self.points.items()]
         loop = "closed" if self.closed else "open"
         return f"Map({', '.join([loop, *(sides or ['no boundary']), *cones])})"
@@ -156,9 +154,12 @@ class Map:
         where they aren't side by side, SettingsError is raised.
         """
         left, right = (self.curve(label, "a centre line") for label in BOUNDARIES)
-        return centre_line(
-            left.spline, right.spline, self.covariance_of(left, right), self._is_loop(left, right), step
-        )
+        closed = left.spline.periodic
+        if closed != right.spline.periodic:
+            raise SettingsError(
+                "a centre line: expected both boundaries closed or both open, found one of each"
+            )
+        return centre_line(left.spline, right.spline, self.covariance_of(left, right), closed, step)
 
     def curve(self, label: int, purpose: str) -> SplineBoundary:
         """Return a boundary that is a curve; a SettingsError says for which purpose one was expected."""
@@ -175,20 +176,6 @@ class Map:
         if any(boundary.covariance.shape[0] != 2 * boundary.size for boundary in (left, right)):
             return None
         return np.asarray(block_diag(left.covariance, right.covariance))
-
-    def _is_loop(self, left: SplineBoundary, right: SplineBoundary) -> bool:
-        """Return whether the centre line is closed: both curves are."""
-        if left.spline.periodic != right.spline.periodic:
-            raise SettingsError(
-                "a centre line: expected both boundaries closed or both open, found one of each"
-            )
-        return left.spline.periodic
-
-
-def _outline(name: str, boundary: MapBoundary) -> str:
-    if isinstance(boundary, PointBoundary):
-        return f"{name}: {boundary.size} points"
-    return f"{name}: {boundary.size} control points on {boundary.spline.length():.0f} m"
 
 
 def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:
@@ -267,7 +254,6 @@ def _boundary(entry: _Object) -> MapBoundary:
 
 
 def _points(top: _Object) -> dict[int, PointBoundary]:
-    """Return the cones of no boundary by label."""
     names, found, listed = {NAMES[label]: label for label in POINTS}, {}, top.object("points")
     for name in listed.entries:
         cones = _boundary(listed.object(name))
@@ -311,7 +297,7 @@ class _Object:
         return InputError(self.file, f"{self._inner(name)}: {message}")
 
     def _inner(self, name: str) -> str:
-        return ".".join(part for part in (self._path, name) if part)
+        return ".".join(filter(None, (self._path, name)))
 
     def _get(self, name: str) -> Any:
         if name not in self.entries:

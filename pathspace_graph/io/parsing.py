@@ -1,23 +1,29 @@
-"""TOML, JSON and YAML as plain data, never as code, within limits beyond which a file is refused.
+"""TOML, JSON, YAML and CSV as plain data, never as code, within limits beyond which a file is refused.
 
 The limits are generous: they guard against damage and mistakes. What a certain vehicle can do is a setting of
 its estimator.
 """
 
+import csv
 import json
 import re
 import stat
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from io import StringIO
 from itertools import chain
 from pathlib import Path
 from reprlib import Repr
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, NoReturn
 
+import numpy as np
 import yaml
+from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.factors.arrays import Array, BoolArray
 
 MAX_FILE_BYTES: Final = 2**30
 MAX_HEADER_BYTES: Final = 2**22  # also of a study
@@ -43,13 +49,9 @@ MAX_CONES: Final = 6_000  # of each boundary of a track
 SHOWN_CHARACTERS: Final = 120  # of what was found, in a message
 
 
-def _short() -> Repr:
-    short = Repr()
-    short.maxlevel, short.maxstring, short.maxother, short.maxlong = 3, 80, 60, 40
-    return short
-
-
-_SHORT: Final = _short()
+TOO_DEEP: Final = f"expected lists and tables nested at most {MAX_DEPTH} deep, found deeper ones"
+_SHORT: Final = Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 80, 60, 40
 
 
 def shown(value: Any) -> str:
@@ -72,12 +74,7 @@ def check_content(content: Any, file: Path) -> None:
         seen |= inner.keys()
         if not level:
             return
-    raise InputError(file, too_deep())
-
-
-def too_deep() -> str:
-    """Return the message for a file that is nested deeper than allowed."""
-    return f"expected lists and tables nested at most {MAX_DEPTH} deep, found deeper ones"
+    raise InputError(file, TOO_DEEP)
 
 
 def _children(value: Any) -> Any:
@@ -107,22 +104,17 @@ def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) 
 def read_bytes(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> bytes:
     """Return the bytes of a file, at most `most`; an InputError says that `expected` was expected."""
     try:
-        # a pipe would block where it is opened
-        data = _read(file, most + 1) if stat.S_ISREG(file.stat().st_mode) else None
+        if not stat.S_ISREG(file.stat().st_mode):  # a pipe would block where it is opened
+            raise InputError(file, f"expected {expected}, found a folder, a device or a pipe")
+        with file.open("rb") as stream:
+            data = stream.read(most + 1)
     except FileNotFoundError:
         raise InputError(file, f"expected {expected}, found none") from None
     except OSError as error:
         raise InputError(file, f"expected {expected}, can't be read ({error.strerror})") from None
-    if data is None:
-        raise InputError(file, f"expected {expected}, found a folder, a device or a pipe")
     if len(data) > most:
         raise InputError(file, f"expected at most {most} bytes, found more")
     return data
-
-
-def _read(file: Path, most: int) -> bytes:
-    with file.open("rb") as stream:
-        return stream.read(most)
 
 
 @contextmanager
@@ -131,7 +123,7 @@ def _parsing(file: Path, kind: str) -> Iterator[None]:
     try:
         yield
     except RecursionError:
-        raise InputError(file, too_deep()) from None
+        raise InputError(file, TOO_DEEP) from None
     except json.JSONDecodeError as error:
         raise InputError(file, f"expected {kind} ({error.msg})", error.lineno) from None
     except yaml.MarkedYAMLError as error:
@@ -176,21 +168,143 @@ class _Loader(_YAML_LOADER):  # type: ignore[misc]
 def parse_yaml(text: str, file: Path) -> Any:
     """Return the content of YAML; an InputError names the file and, where it is known, the row."""
     with _parsing(file, "YAML"):
-        _check_depth(text, file)
+        depth = 0
+        for event in yaml.parse(text, Loader=_YAML_LOADER):  # deep ones overflow the stack of its composer
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise InputError(file, TOO_DEEP, _row(event.start_mark))
         content = yaml.load(text, Loader=_Loader)
     check_content(content, file)
     return content
 
 
-def _check_depth(text: str, file: Path) -> None:
-    """Raise an InputError where YAML is nested too deep, which would overflow the stack of its composer."""
-    depth = 0
-    for event in yaml.parse(text, Loader=_YAML_LOADER):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_DEPTH:
-            raise InputError(file, too_deep(), _row(event.start_mark))
-
-
 def _row(mark: Any) -> int | None:
     """Return the row (from 1) of a mark, which the parser may not give."""
     return None if mark is None else int(mark.line) + 1
+
+
+# --- CSV -------------------------------------------------------------------------------------------------
+
+
+class Column(NamedTuple):
+    """What the numbers of a column must be."""
+
+    largest: float = MAX_COORDINATE
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows below a CSV header, as text, column by column."""
+
+    file: Path
+    columns: dict[str, list[str]]
+    """Texts of each column, as they stand in the file."""
+    lines: list[int]
+    """Line of each row in the file; the header is line 1."""
+    declared: Mapping[str, Column] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def fail(self, index: int, message: str) -> NoReturn:
+        """Raise the InputError of the row with this index."""
+        raise InputError(self.file, message, self.lines[index])
+
+    def require(self, good: BoolArray, message: str) -> None:
+        """Raise an InputError for the first row that is not good; `good` is (rows,)."""
+        if not good.all():
+            self.fail(int(np.argmin(good)), message)
+
+    def numbers(self, name: str, largest: float | None = None) -> Array:
+        """Return the column as numbers (rows,), at most as large as declared, or as `largest`.
+
+        A word, NaN, infinity or a larger number is an InputError.
+        """
+        column, texts = self.declared.get(name, Column()), self.columns[name]
+        most, unit = largest or column.largest, f" {column.unit}".rstrip()
+        try:
+            values = np.array(list(map(float, texts)), dtype=float)
+            good = is_plain("".join(texts))
+        except ValueError:
+            good = False
+        if not good:
+            self._refuse(name, [*map(_is_number, texts)], "a number")
+        self._refuse(name, np.isfinite(values), "a finite number")
+        self._refuse(name, np.abs(values) <= most, f"a number of at most {most:g}{unit} in size")
+        return values
+
+    def _refuse(self, name: str, good: ArrayLike, expected: str) -> None:
+        if not np.all(good):
+            index = int(np.argmin(good))
+            found = shown(self.columns[name][index].strip())
+            self.fail(index, f"expected {expected} in column '{name}', found {found}")
+
+    def stack(self, names: Sequence[str], largest: float | None = None) -> Array:
+        """Return the named columns side by side (rows, names), see `numbers`."""
+        return np.column_stack([self.numbers(name, largest) for name in names])
+
+
+def read_table(
+    file: Path, required: Mapping[str, Column] | Sequence[str], comment: str = "", most: int = MAX_FILE_BYTES
+) -> Table:
+    """Read a CSV file with a header that holds at least the required columns, in any order.
+
+    Quotes, blanks around fields, empty lines, Windows line ends and a byte-order mark are tolerated;
+    `comment` is stripped from the front of the header. A file that is missing, empty or larger than `most`
+    (bytes), a missing column, or a row with too few or too many fields is an InputError.
+    """
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    reader = csv.reader(StringIO(read_text(file, most=most), newline=""), skipinitialspace=True)
+    try:
+        for row in reader:
+            if "".join(row).strip():
+                rows.append(row)
+                lines.append(reader.line_num)
+    except csv.Error as error:
+        raise InputError(file, f"expected comma-separated values: {error}", reader.line_num) from error
+    if not rows:
+        raise InputError(file, f"expected a header {','.join(required)}, found an empty file", 1)
+    header = [name.strip() for name in rows[0]]
+    if header:
+        header[0] = header[0].removeprefix(comment).strip()
+    for name in required:
+        if header.count(name) != 1:
+            found = "none" if name not in header else "more than one"
+            expected = f"expected a column '{name}'"
+            raise InputError(file, f"{expected}, found {found} in {shown(','.join(header))}", lines[0])
+    body, width = rows[1:], len(header)
+    for row, line in zip(body, lines[1:], strict=True):
+        while len(row) > width and not row[-1].strip():
+            row.pop()
+        if len(row) != width:
+            raise InputError(file, f"expected {width} fields, found {len(row)}", line)
+    columns = [list(column) for column in zip(*body, strict=True)] or [[] for _ in header]
+    declared = required if isinstance(required, Mapping) else {}
+    return Table(file, dict(zip(header, columns, strict=True)), lines[1:], declared)
+
+
+def write_table(file: Path, names: Iterable[str], *values: ArrayLike) -> None:
+    """Write a CSV file of columns (rows,), each of numbers or of texts, or of several side by side (rows, k).
+
+    Every number has the shortest text that reads back as the same one.
+    """
+    columns = [column for value in values for column in np.atleast_2d(np.asarray(value).T).tolist()]
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(names)
+        writer.writerows(zip(*columns, strict=True))
+
+
+def is_plain(text: str) -> bool:
+    """Return whether numbers are written in ASCII and without underscores, which Python would also read."""
+    return text.isascii() and "_" not in text
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return is_plain(text)

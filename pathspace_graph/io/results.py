@@ -19,14 +19,14 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
-from pathspace_graph.io.brief import Brief, frames
-from pathspace_graph.io.csv_table import is_plain, read_table, write_table
-from pathspace_graph.io.files import atomic_folder, write_json
-from pathspace_graph.io.log import CALIBRATION
-from pathspace_graph.io.manifest import verified
-from pathspace_graph.io.map import MAP_FILE, Map, map_to_json
-from pathspace_graph.io.parsing import MAX_COORDINATE, MAX_STAMP, read_text, shown
 from pathspace_graph.lengths import POSE, scaled
+
+from .brief import Brief, frames
+from .files import atomic_folder, write_json
+from .log import CALIBRATION
+from .manifest import verified
+from .map import MAP_FILE, Map, map_to_json
+from .parsing import MAX_COORDINATE, MAX_STAMP, is_plain, read_table, read_text, shown, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,12 +52,8 @@ def read_trajectory(file: Path) -> tuple[Array, Array]:
     Empty lines and lines that begin with # are left out. An InputError names the row that is wrong.
     """
     with verified(file.parent, file.name):
-        lines = read_text(file, "a trajectory").split("\n")
-        rows = [
-            _values(file, line, number)
-            for number, line in enumerate(lines, start=1)
-            if line.strip() and not line.startswith("#")
-        ]
+        lines = enumerate(read_text(file, "a trajectory").split("\n"), start=1)
+        rows = [_values(file, line, n) for n, line in lines if line.strip() and not line.startswith("#")]
     values = np.array(rows).reshape(-1, _COLUMNS)
     theta = 2 * np.arctan2(values[:, 6], values[:, 7])
     return values[:, 0], np.column_stack([values[:, 1:3], theta])
@@ -83,10 +79,12 @@ NoiseSource = Literal["stated", "measured", "assumed"]
 """Where noise comes from: the log's statement, the drive, or a default."""
 
 CYCLES_FILE: Final = "cycles.csv"
-CYCLE_COLUMNS: Final = (
-    *("cycle", "t", "seconds", "size_left", "size_right", "readings", "lap"),
-    *("offered", "health", "reason", "dropped"),
-)
+CYCLE_COLUMNS: Final = {
+    **{"cycle": "int64", "t": "float64", "seconds": "float64"},
+    **dict.fromkeys(("size_left", "size_right", "readings", "lap", "offered"), "int64"),
+    **{"health": "str", "reason": "str", "dropped": "int64"},
+}
+"""Columns of `cycles.csv` with their types; any further one is text."""
 
 
 @dataclass(frozen=True)
@@ -206,16 +204,8 @@ class RunResult:
     """Result of an estimator's run over a log."""
 
     LENGTHS: ClassVar = {
-        "map": 0,
-        "trajectory": POSE,
-        "smoothed": POSE,
-        "cycles": 0,
-        "lap_maps": 0,
-        "snapshots": 0,
-        "vehicle": 0,
-        "reach": (1, 2, 0),
-        "noise": 0,
-        "scale": 1,
+        **dict.fromkeys(("map", "cycles", "lap_maps", "snapshots", "vehicle", "noise"), 0),
+        **{"trajectory": POSE, "smoothed": POSE, "reach": (1, 2, 0), "scale": 1},
     }
 
     estimator: str

@@ -32,7 +32,7 @@ from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import settings_dict, split_odometry
-from pathspace_graph.scale.door import log_at_scale
+from pathspace_graph.scale import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import (

@@ -30,7 +30,7 @@ from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.scale.door import at_scale
+from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import ROUGH, Association, Gates, associate, compatible, pair_costs

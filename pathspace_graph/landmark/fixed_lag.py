@@ -32,7 +32,7 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
-from pathspace_graph.scale.door import at_scale
+from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import (

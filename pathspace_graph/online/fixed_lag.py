@@ -27,7 +27,7 @@ from pathspace_graph.mapping.registration import passes_start, register
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.scale.door import at_scale
+from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.snapshot import restore, save
 

@@ -9,7 +9,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
-from pathspace_graph.scale.scene import scale_of
+from pathspace_graph.scale import scale_of
 
 from .hint import Hint, told
 from .hypotheses import (

@@ -8,9 +8,8 @@ import numpy as np
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.front_end.gate import read_usable_log
-from pathspace_graph.io.csv_table import Table, read_table
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry, covariances_of, cycles_of
-from pathspace_graph.io.parsing import shown
+from pathspace_graph.io.parsing import Table, read_table, shown
 from pathspace_graph.labels import UNKNOWN, label_from_name
 from pathspace_graph.settings.online import LimitSettings
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.cli import main, parse_command
+from pathspace_graph.commands.options import ESSENTIAL
 from pathspace_graph.io.files import write_json
 from pathspace_graph.io.overrides import leaves
-from pathspace_graph.options import ESSENTIAL
 from pathspace_graph.settings.checked import GONE, successor
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
@@ -62,6 +62,16 @@ def test_a_flag_in_the_short_help_is_the_one_that_changes_something(
     assert "--calibration.no-sensor" in help_of("online", "--help", capsys)
     command = parse_command("online", [*ONLINE, "--calibration.no-sensor"])
     assert command.settings.calibration.sensor is False
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("convert", "--from bag|"), ("convert", "--sigma-range NUMBER"), ("export", "--as centerline|")],
+)
+def test_the_short_help_names_options_as_the_command_takes_them(
+    command: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert option in help_of(command, "--help", capsys)
 
 
 # --- settings from a file --------------------------------------------------------------------------------
@@ -215,6 +225,8 @@ def test_the_shell_completes_commands_and_options(capsys: pytest.CaptureFixture[
     assert completed("batch", "MAP", "--spline.deg") == ["--spline.degree"]
     assert completed("simulate", "--ev") == ["--event"]
     assert completed("plot", "MAP", "--band") == ["--band-scale"]
+    assert completed("convert", "--fro") == ["--from", "--from-poses"]
+    assert completed("convert", "--sigma-b") == ["--sigma-bearing"]
     assert completed("verify", "--spline") == []
 
 

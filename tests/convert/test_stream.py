@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pathspace_graph.convert.recording import MessageStream
 from pathspace_graph.convert.settings import Frames
-from pathspace_graph.convert.stream import MessageStream
 
 from .bags import EPOCH, Messages
 

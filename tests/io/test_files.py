@@ -207,7 +207,7 @@ from pathlib import Path
 from pathspace_graph import cli
 from pathspace_graph.io.files import atomic_file, atomic_folder
 
-def work(_):
+def work(*_):
     with atomic_folder(Path(sys.argv[1], "new", "out"), "marker"), atomic_file(Path(sys.argv[1], "f")):
         print("ready", flush=True)
         time.sleep(60.0)

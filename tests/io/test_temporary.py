@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.errors import OutputError
-from pathspace_graph.io import disk
-from pathspace_graph.io.disk import is_temporary
-from pathspace_graph.io.files import atomic_file, atomic_folder, check_target, write_text
+from pathspace_graph.io import files
+from pathspace_graph.io.files import atomic_file, atomic_folder, check_target, is_temporary, write_text
 
 from ..scenes.kills import leftovers
 
@@ -75,22 +74,22 @@ def test_an_exchange_is_one_step_or_goes_by_way_of_a_spare_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_exchange: bool
 ) -> None:
     if not has_exchange:
-        monkeypatch.setattr(disk, "_renameat2", lambda: None)
+        monkeypatch.setattr(files, "_renameat2", lambda: None)
     for name in "ab":
         (tmp_path / name).mkdir()
         (tmp_path / name / "file").write_text(name)
-    disk.exchange(tmp_path / "a", tmp_path / "b", tmp_path / "spare")
+    files.exchange(tmp_path / "a", tmp_path / "b", tmp_path / "spare")
     assert (tmp_path / "a" / "file").read_text() == "b"
     assert (tmp_path / "b" / "file").read_text() == "a"
-    assert not disk.rename_new(tmp_path / "a", tmp_path / "b")
-    assert disk.rename_new(tmp_path / "a", tmp_path / "c")
+    assert not files.rename_new(tmp_path / "a", tmp_path / "b")
+    assert files.rename_new(tmp_path / "a", tmp_path / "c")
     assert names(tmp_path) == ["b", "c"]
 
 
 def test_results_are_kept_where_the_system_can_not_exchange(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(disk, "_renameat2", lambda: None)
+    monkeypatch.setattr(files, "_renameat2", lambda: None)
     for text in "123":
         with atomic_folder(tmp_path / "out", "marker") as folder:
             (folder / "marker").write_text(text)
@@ -109,7 +108,7 @@ def test_a_failed_exchange_leaves_what_was_there(tmp_path: Path, monkeypatch: py
         raise PermissionError(13, "Permission denied")
 
     write_text(tmp_path / "f.txt", "1")
-    monkeypatch.setattr(disk, "exchange", fail)
+    monkeypatch.setattr(files, "exchange", fail)
     with pytest.raises(OutputError, match="Permission denied"), atomic_file(tmp_path / "f.txt") as file:
         file.write_text("2")
     assert names(tmp_path) == ["f.txt"]
@@ -119,11 +118,11 @@ def test_a_failed_exchange_leaves_what_was_there(tmp_path: Path, monkeypatch: py
 def test_locks_hold_until_they_are_closed_and_know_what_is_gone(tmp_path: Path) -> None:
     file = tmp_path / "f"
     file.touch()
-    held = disk.lock(file, wait=True)
+    held = files.lock(file, wait=True)
     assert held is not None
-    assert disk.lock(file, wait=False) is None
+    assert files.lock(file, wait=False) is None
     os.close(held)
-    again = disk.lock(file, wait=False)
+    again = files.lock(file, wait=False)
     assert again is not None
     os.close(again)
-    assert disk.lock(tmp_path / "none", wait=True) is None
+    assert files.lock(tmp_path / "none", wait=True) is None

@@ -33,7 +33,7 @@ from pathspace_graph.lengths import scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.run import CycleResult, run_online, split_odometry
-from pathspace_graph.scale.scene import JUDGED, SceneScale, scale_of, width_and_gap
+from pathspace_graph.scale import JUDGED, SceneScale, scale_of, width_and_gap
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import ODOMETRY_SIGMA, short_drive

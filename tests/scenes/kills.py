@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from pathspace_graph.io.disk import RENAME, SYNC
+from pathspace_graph.io.files import RENAME, SYNC
 
 from .pretenders import contents
 

@@ -3,6 +3,7 @@
 import io
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import redirect_stderr
 from dataclasses import MISSING as NO_DEFAULT
@@ -11,7 +12,7 @@ from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
 from types import MappingProxyType
-from typing import Any, Final, get_args, get_type_hints
+from typing import Annotated, Any, Final, NamedTuple, get_args, get_origin, get_type_hints
 
 import docstring_parser
 import tyro
@@ -128,28 +129,68 @@ complete -o default -F _pathspace_graph {program}"""
 def completion(program: str, commands: Mapping[str, type[Any]], common: Iterable[str]) -> str:
     """Return a script for bash and zsh that completes the commands, their options and names of files."""
     shared = ("--help", HELP_ALL, *common)
-    cases = [
-        f'    *:{name}) words="{" ".join((*_names(command), *shared))}" ;;'
-        for name, command in commands.items()
-    ]
+    cases = []
+    for name, command in commands.items():
+        options = [option.flag for option in _options(command) if not option.is_place]
+        words = " ".join((*options, *[SETTINGS] * _estimates(command), *shared))
+        cases.append(f'    *:{name}) words="{words}" ;;')
     return _COMPLETION.format(commands=" ".join(commands), cases="\n".join(cases), program=program)
 
 
-def _names(command: type[Any]) -> Iterator[str]:
-    """Yield the names of all options of a command."""
-    hints = get_type_hints(command)
-    for entry in fields(command):
-        prefix = "" if entry.name == "settings" else f"{entry.name}."
-        if is_dataclass(hints[entry.name]):
-            names = [f"{prefix}{leaf}" for leaf in leaves(hints[entry.name]())]
-        else:
-            names = [] if "Positional" in str(entry.type) else [entry.name]
-        yield from (f"--{name.replace('_', '-')}" for name in names)
-    if _estimates(command):
-        yield SETTINGS
-
-
 # --- help ------------------------------------------------------------------------------------------------
+
+
+class Option(NamedTuple):
+    """An option of a command, as tyro makes it of a field."""
+
+    name: str
+    """Dotted name, or that of a place."""
+    group: tuple[str, str]
+    """Name and text of the group that it is in; two empty ones for an option of the command itself."""
+    text: str
+    hint: Any
+    default: Any
+    is_place: bool
+
+    @property
+    def flag(self) -> str:
+        return f"--{self.name.replace('_', '-')}"
+
+    @property
+    def shown(self) -> str:
+        """Return the option with its default, the first of several words, or with what it takes."""
+        if self.is_place:
+            return self.name.upper()
+        value, inner = self.default, [self.hint, *get_args(self.hint)]
+        if self.hint is bool:
+            return f"--{'.no-'.join(self.flag[2:].rsplit('.', 1))}" if value else self.flag
+        words = [word for one in inner for word in get_args(one) if isinstance(word, str)]
+        if words:
+            return f"{self.flag} {'|'.join(sorted(dict.fromkeys(words), key=lambda word: word != value))}"
+        if value not in (None, NO_DEFAULT, ()):
+            return f"{self.flag} {value}"
+        takes = "PATH" if Path in inner else "TEXT" if str in inner else "NUMBER"
+        return f"{self.flag} {takes}{' (required)' if value is NO_DEFAULT else ''}"
+
+
+def _options(
+    kind: type[Any], values: Any = None, prefix: str = "", group: tuple[str, str] = ("", "")
+) -> Iterator[Option]:
+    """Yield the options of a command, or of settings in it with these values."""
+    hints, texts = get_type_hints(kind, include_extras=True), _texts(kind)
+    for entry in fields(kind):
+        hint, name = hints[entry.name], entry.name
+        if get_origin(hint) is Annotated:
+            hint, *marks = get_args(hint)
+            name = next((mark.name for mark in marks if isinstance(getattr(mark, "name", None), str)), name)
+        text = _first_sentence(texts.get(entry.name, ""))
+        value = getattr(values, entry.name, entry.default)
+        if isinstance(hint, type) and is_dataclass(hint):
+            inside = hint() if values is None else value
+            own = group if group[0] or not name else (name, text)
+            yield from _options(hint, inside, f"{prefix}{name}." if name else prefix, own)
+        else:
+            yield Option(prefix + name, group, text, hint, value, "Positional" in str(entry.type))
 
 
 def short_help(command: type[Any], program: str) -> str:
@@ -157,68 +198,25 @@ def short_help(command: type[Any], program: str) -> str:
 
     Groups of other options have a line each.
     """
-    entries, groups = [*_entries(command)], [*_groups(command)]
+    options = {option.name: option for option in _options(command)}
+    settings = leaves(MapperSettings()) if _estimates(command) else {}
+    others = [option for name, option in options.items() if name not in settings]
+    entries = [(option.shown, option.text) for option in others if not option.group[0]]
+    if settings:
+        entries.append((f"{SETTINGS} FILE", SETTINGS_TEXT))
+        entries += [(options[name].shown, options[name].text) for name in ESSENTIAL]
     width = min(get_terminal_size((MOST_COLUMNS, 50)).columns, MOST_COLUMNS) - COLUMN
     places = [f"{name} " for name, _ in entries if not name.startswith("--")]
     lines = [f"usage: {program} {''.join(places)}[OPTIONS]", "", _first_sentence(_description(command)), ""]
     for name, text in entries:
-        first, *others = wrap(text, width) or [""]
+        first, *rest = wrap(text, width) or [""]
         beside = len(name) <= COLUMN - 2
         lines += [f"{name:<{COLUMN}}{first}" if beside else name]
-        lines += [f"{'':<{COLUMN}}{line}" for line in (others if beside else [first, *others])]
-    lines += ["", *(f"{name}: {text}" for name, text in groups)] if groups else []
+        lines += [f"{'':<{COLUMN}}{line}" for line in (rest if beside else [first, *rest])]
+    groups = Counter(option.group for option in others if option.group[0])
+    lines += [""] * bool(groups)
+    lines += [f"--{name}.* ({count}): {text}" for (name, text), count in groups.items()]
     return "\n".join([*lines, "", f"{program} {HELP_ALL} explains every option.", ""])
-
-
-def _entries(command: type[Any]) -> Iterator[tuple[str, str]]:
-    """Yield the options that are explained, each with what it takes by default, and the first sentence."""
-    hints, texts = get_type_hints(command), _texts(command)
-    for entry in fields(command):
-        if entry.name == "settings" and _estimates(command):
-            yield f"{SETTINGS} FILE", SETTINGS_TEXT
-            settings = MapperSettings()
-            for name in ESSENTIAL:
-                group, _, last = name.rpartition(".")
-                home = getattr(settings, group) if group else settings
-                hint, text = get_type_hints(type(home))[last], _texts(type(home))[last]
-                yield _option(name, hint, getattr(home, last)), _first_sentence(text)
-        elif entry.name == "settings":
-            yield from _entries(hints["settings"])
-        elif not is_dataclass(hints[entry.name]):
-            text = _first_sentence(texts.get(entry.name, ""))
-            if "Positional" in str(entry.type):
-                yield entry.name.upper(), text
-            else:
-                yield _option(entry.name, hints[entry.name], entry.default), text
-
-
-def _groups(command: type[Any]) -> Iterator[tuple[str, str]]:
-    """Yield the groups of options that are not explained, with their number and what they are."""
-    hints, texts = get_type_hints(command), _texts(command)
-    for entry in fields(command):
-        kind: Any = hints[entry.name]
-        if entry.name == "settings":
-            yield from () if _estimates(command) else _groups(kind)
-        elif is_dataclass(kind):
-            yield (
-                f"--{entry.name}.* ({len(leaves(hints[entry.name]()))})",
-                _first_sentence(texts.get(entry.name, "")),
-            )
-
-
-def _option(name: str, hint: Any, value: Any) -> str:
-    """Return an option with its default, or with what it takes; of several words the first is the default."""
-    option = f"--{name.replace('_', '-')}"
-    if hint is bool:
-        return f"--{'.no-'.join(option[2:].rsplit('.', 1))}" if value else option
-    inner = [hint, *get_args(hint)]
-    words = [word for one in inner for word in get_args(one) if isinstance(word, str)]
-    if words:
-        return f"{option} {'|'.join(sorted(dict.fromkeys(words), key=lambda word: word != value))}"
-    if value not in (None, NO_DEFAULT, ()):
-        return f"{option} {value}"
-    takes = "PATH" if Path in inner else "TEXT" if str in inner else "NUMBER"
-    return f"{option} {takes}{' (required)' if value is NO_DEFAULT else ''}"
 
 
 def _first_sentence(text: str) -> str:

@@ -13,17 +13,24 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.export.geojson import LocalPlane, write_geojson
-from pathspace_graph.export.lanelet2 import write_lanelet2
-from pathspace_graph.export.tables import sampled, write_centre_line, write_points, write_profile
-from pathspace_graph.io.csv_table import read_table
+from pathspace_graph.io.export import (
+    LocalPlane,
+    sampled,
+    write_centre_line,
+    write_geojson,
+    write_lanelet2,
+    write_points,
+    write_profile,
+)
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
+from pathspace_graph.io.parsing import read_table
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT
 from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.planning import speed_profile
 
 from ..scenes.maps import open_map, point_map, ring_map
+from .earth import to_map
 
 Array = NDArray[np.float64]
 
@@ -131,7 +138,7 @@ def test_geojson(make: Callable[[], Map], tmp_path: Path) -> None:
         assert geometry["type"] == "LineString"
         degrees = np.array(geometry["coordinates"])
         assert np.array_equal(degrees[0], degrees[-1]) == track.closed
-        there = PLANE.to_map(degrees[: len(points), ::-1])
+        there = to_map(PLANE, degrees[: len(points), ::-1])
         assert there == pytest.approx(points, abs=2e-5)
         assert len(degrees) == len(points) + track.closed
     properties = features["centre"]["properties"]
@@ -145,7 +152,7 @@ def test_landmarks_are_multi_points_in_geojson(tmp_path: Path) -> None:
     write_geojson(file, point_map(), 1.0, PLANE)
     features = json.loads(file.read_text())["features"]
     assert [feature["geometry"]["type"] for feature in features] == ["MultiPoint", "MultiPoint"]
-    there = PLANE.to_map(np.array(features[0]["geometry"]["coordinates"])[:, ::-1])
+    there = to_map(PLANE, np.array(features[0]["geometry"]["coordinates"])[:, ::-1])
     assert there == pytest.approx(np.array([[0.0, 2.0], [4.0, 2.5]]), abs=2e-5)
 
 
@@ -166,7 +173,7 @@ def test_lanelet2(make: Callable[[], Map], tmp_path: Path) -> None:
             assert (refs[-1] == following[0]) == track.closed
         row = [nodes[ref] for refs in own for ref in refs[: len(refs) - track.closed]]
         degrees = np.array([[float(node.get("lat", "")), float(node.get("lon", ""))] for node in row])
-        points = PLANE.to_map(degrees)
+        points = to_map(PLANE, degrees)
         curve = track.curve(label, "a test").spline
         assert curve.foot_points(points).distance == pytest.approx(0.0, abs=2e-5)
         ring = np.concatenate([points, points[:1]]) if track.closed else points

@@ -1,1 +1,0 @@
-../../pathspace_graph/__init__.py

@@ -1,1 +1,0 @@
-"""What planners and other tools read: a map in their formats (FORMATS)."""

@@ -1,0 +1,319 @@
+"""A map in the formats of planners and other tools: CSV, GeoJSON (RFC 7946) and Lanelet2."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import count, pairwise
+from pathlib import Path
+from typing import Any, Final
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.settings.output import SpeedSettings
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.centre_line import find_line
+from pathspace_graph.spline.planning import speed_profile
+
+from .files import to_plain
+from .map import Map, MapBoundary, PointBoundary, SplineBoundary
+
+CENTRE_LINE_HEADER: Final = "# x_m,y_m,w_tr_right_m,w_tr_left_m"
+"""Header of TUM's raceline format; its reader takes the line for a comment."""
+PROFILE_HEADER: Final = "# s_m,x_m,y_m,psi_rad,kappa_radpm,vx_mps,ax_mps2"
+"""Columns of TUM's trajectories."""
+POINTS_HEADER: Final = "x,y,label"
+"""Header of a table of points, as that of a log's true cones."""
+_FEWEST_INTERVALS: Final = 4
+"""Least number of intervals of a sampled boundary."""
+
+
+def write_centre_line(file: Path, track: Map, step: float) -> None:
+    """Write the centre line in TUM's raceline format, in m, `step` (m) apart, to full precision.
+
+    The first point of a closed line isn't repeated.
+    """
+    line = track.centre_line(step)
+    _write_rows(file, CENTRE_LINE_HEADER, line.points, line.width_right, line.width_left)
+
+
+def write_profile(
+    file: Path,
+    track: Map,
+    step: float,
+    settings: SpeedSettings,
+    start: float | None = None,
+    stop: bool = False,
+) -> None:
+    """Write the centre line with heading, curvature, speed and acceleration (m, rad, 1/m, m/s, m/s^2).
+
+    The columns are those of TUM's trajectories. The heading is measured from the x axis of the map. An open
+    line begins at the speed `start` (m/s), where it is given, and may end at a stop. SettingsError is raised
+    where the vehicle cannot begin so fast.
+    """
+    line = track.centre_line(step)
+    profile = speed_profile(line, settings, start, 0.0 if stop else None)
+    if start is not None and profile.speed[0] < start:
+        raise SettingsError(
+            f"expected a start speed of at most {profile.speed[0]:.3g} m/s on this line, found {start:g}"
+        )
+    curve = line.arc_length, line.points, line.heading, line.curvature
+    _write_rows(file, PROFILE_HEADER, *curve, profile.speed, profile.acceleration)
+
+
+def write_points(file: Path, track: Map, step: float) -> None:
+    """Write the boundaries as points in m, `step` (m) apart along each, and orange cones, to full precision.
+
+    The landmarks of a boundary that is no curve are written as they are.
+    """
+    points = [
+        f"{x!r},{y!r},{NAMES[label]}"
+        for label, boundary in sorted([*track.boundaries.items(), *track.points.items()])
+        for x, y in boundary_points(boundary, step).tolist()
+    ]
+    _write_lines(file, [POINTS_HEADER, *points])
+
+
+def boundary_points(boundary: MapBoundary, step: float) -> Array:
+    """Return points (n, 2) of a boundary about `step` (m) apart along it, or its landmarks.
+
+    The points of an open curve begin and end at its ends; the first of a closed one isn't repeated.
+    """
+    return boundary.points if isinstance(boundary, PointBoundary) else sampled(boundary.spline, step)
+
+
+def sampled(spline: BSpline, step: float) -> Array:
+    """Return points (n, 2) of a curve evenly spaced by arc length, about `step` (m) apart."""
+    length = spline.length()
+    at = np.linspace(0.0, length, max(round(length / step), _FEWEST_INTERVALS) + 1)
+    return spline.evaluate(spline.parameters_at(at[:-1] if spline.periodic else at))
+
+
+def _write_rows(file: Path, header: str, *columns: NDArray[Any]) -> None:
+    rows = np.column_stack(columns).tolist()
+    _write_lines(file, [header, *(",".join(map(repr, row)) for row in rows)])
+
+
+def _write_lines(file: Path, lines: Iterable[str]) -> None:
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+# --- latitude and longitude ------------------------------------------------------------------------------
+
+SEMI_MAJOR_AXIS: Final = 6_378_137.0
+"""Radius of the equator of WGS84 (m)."""
+FLATTENING: Final = 1.0 / 298.257223563
+"""Flattening of the ellipsoid of WGS84."""
+_SQUARE: Final = FLATTENING * (2.0 - FLATTENING)
+"""Square e^2 of its eccentricity."""
+_ITERATIONS: Final = 8
+"""Iterations of the latitude, each of which leaves less than a hundredth of the error."""
+_DECIMALS_DEGREES: Final = 10
+"""Number of decimals of degrees, which is 0.01 mm."""
+
+
+@dataclass(frozen=True)
+class LocalPlane:
+    """Plane of the map frame, which touches the ellipsoid WGS84 at the origin of the map.
+
+    A point (x, y) of the map lies `east = x sin h - y cos h` and `north = x cos h + y sin h` of the origin on
+    that plane, where h is the heading of the x axis. It has the latitude and longitude of its foot on the
+    ellipsoid. Distances on the ground differ from those of the map by about d^3 / (3 R^2): 0.01 mm in 1 km,
+    and 8 mm in 10 km.
+    """
+
+    latitude: float
+    """Latitude of the map's origin (degrees), positive to the north."""
+    longitude: float
+    """Longitude of the map's origin (degrees), positive to the east."""
+    heading: float
+    """Direction of the map's x axis (degrees), clockwise from north."""
+
+    def __post_init__(self) -> None:
+        for good, expected, found in (
+            (-90.0 < self.latitude < 90.0, "latitude between -90 and 90", self.latitude),
+            (-180.0 <= self.longitude <= 180.0, "longitude from -180 to 180", self.longitude),
+            (-360.0 <= self.heading <= 360.0, "heading from -360 to 360", self.heading),
+        ):
+            if not good:
+                raise SettingsError(f"origin: expected a {expected} degrees, found {found:g}")
+
+    def to_geodetic(self, points_map: Array) -> Array:
+        """Return latitude and longitude (n, 2), in degrees, of points (n, 2) of the map in m."""
+        origin, axes = self._frame
+        x, y, z = (origin + points_map @ axes).T
+        across = np.hypot(x, y)
+        latitude = np.arctan2(z, across * (1.0 - _SQUARE))
+        for _ in range(_ITERATIONS):
+            sine = np.sin(latitude)
+            latitude = np.arctan2(z + _SQUARE * _normal_radius(sine) * sine, across)
+        return np.asarray(np.degrees(np.column_stack([latitude, np.arctan2(y, x)])))
+
+    @cached_property
+    def _frame(self) -> tuple[Array, Array]:
+        """Return the origin (3,) in m and the axes x and y (2, 3), in the frame fixed to the earth."""
+        latitude, longitude, heading = np.radians([self.latitude, self.longitude, self.heading])
+        sine, cosine = np.sin(latitude), np.cos(latitude)
+        east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+        up = np.array([*(cosine * np.array([np.cos(longitude), np.sin(longitude)])), sine])
+        forward = np.sin(heading) * east + np.cos(heading) * np.cross(up, east)
+        normal = _normal_radius(sine)
+        across = normal * cosine
+        origin = np.array(
+            [across * np.cos(longitude), across * np.sin(longitude), normal * (1.0 - _SQUARE) * sine]
+        )
+        return origin, np.stack([forward, np.cross(up, forward)])
+
+
+def _normal_radius(sine: Any) -> Any:
+    """Return the radius of curvature N across the meridian, in m, at the sine of a latitude."""
+    return SEMI_MAJOR_AXIS / np.sqrt(1.0 - _SQUARE * sine**2)
+
+
+# --- GeoJSON ---------------------------------------------------------------------------------------------
+
+CENTRE: Final = "centre"
+"""Name of the centre line."""
+_PROPERTIES: Final = (
+    ("arc_length_m", "arc_length"),
+    ("curvature_per_m", "curvature"),
+    ("width_left_m", "width_left"),
+    ("width_right_m", "width_right"),
+    ("across_sigma_m", "points_sigma"),
+    ("curvature_sigma_per_m", "curvature_sigma"),
+    ("width_left_sigma_m", "width_left_sigma"),
+    ("width_right_sigma_m", "width_right_sigma"),
+)
+"""Properties of the centre line, each a list with a value of this attribute for each point; it has none for
+the point that a closed line repeats."""
+
+
+def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> None:
+    """Write a FeatureCollection with each boundary and, where both are curves, the centre line.
+
+    A curve is a LineString of points `step` (m) apart, which ends where it begins if it is closed. Landmarks
+    are a MultiPoint, and so are orange cones of each label.
+    """
+
+    def feature(kind: str, points: Array, closed: bool, properties: dict[str, Any]) -> dict[str, Any]:
+        degrees = np.round(plane.to_geodetic(points)[:, ::-1], _DECIMALS_DEGREES)
+        coordinates = np.concatenate([degrees, degrees[:1]]) if closed else degrees
+        geometry = {"type": kind, "coordinates": coordinates}
+        return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+    features = []
+    for label, boundary in sorted([*track.boundaries.items(), *track.points.items()]):
+        kind = "MultiPoint" if isinstance(boundary, PointBoundary) else "LineString"
+        closed = isinstance(boundary, SplineBoundary) and boundary.spline.periodic
+        properties: dict[str, Any] = {"name": NAMES[label], "closed": closed}
+        features.append(feature(kind, boundary_points(boundary, step), closed, properties))
+    if all(isinstance(track.boundaries.get(label), SplineBoundary) for label in BOUNDARIES):
+        line = track.centre_line(step)
+        properties = {"name": CENTRE, "closed": line.closed, "length_m": line.length}
+        properties |= {name: getattr(line, attribute) for name, attribute in _PROPERTIES}
+        features.append(feature("LineString", line.points, line.closed, properties))
+    origin = {"latitude_deg": plane.latitude, "longitude_deg": plane.longitude, "heading_deg": plane.heading}
+    content = {"type": "FeatureCollection", "origin": origin, "features": features}
+    _write_lines(file, [json.dumps(to_plain(content), allow_nan=False)])
+
+
+# --- Lanelet2 --------------------------------------------------------------------------------------------
+
+WAY_TAGS: Final = {"type": "line_thin", "subtype": "solid"}
+"""Tags of a way: a boundary of cones has no kind of its own, and is a line that must not be crossed."""
+LANELET_TAGS: Final = {
+    "type": "lanelet",
+    "subtype": "road",
+    "location": "nonurban",
+    "one_way": "yes",
+    "participant:vehicle": "yes",
+}
+"""Tags of a lanelet: a road for vehicles, in the direction of travel."""
+CONE: Final = "cone"
+"""Type of the node of an orange cone, whose subtype is its label."""
+_PIECES: Final = 4
+"""Number of lanelets of a loop; Lanelet2 knows neither length nor successor of a single one."""
+_FEWEST_WAY_INTERVALS: Final = 2
+_DECIMALS: Final = 5
+"""Number of decimals of local coordinates (m)."""
+
+
+def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> None:
+    """Write both boundaries as ways of points `step` (m) apart, lanelets between them, and orange cones.
+
+    The file is plain OSM XML. Nodes have latitude, longitude and, as tags, their place in the map frame. An
+    open track is one lanelet. A loop is cut where normals of its centre line cross the boundaries;
+    consecutive lanelets share their nodes there.
+    """
+    root, numbers = ET.Element("osm", version="0.6", generator="pathspace-graph"), count(1)
+
+    def add(kind: str, **attributes: str) -> ET.Element:
+        """Add an element with its number; readers of OSM XML expect a version."""
+        shared = {"id": str(next(numbers)), "visible": "true", "version": "1"}
+        return ET.SubElement(root, kind, shared | attributes)
+
+    def add_tags(element: ET.Element, tags: dict[str, str]) -> None:
+        for key, value in tags.items():
+            ET.SubElement(element, "tag", k=key, v=value)
+
+    def add_nodes(points: Array, tags: dict[str, str]) -> list[str]:
+        nodes = []
+        for (x, y), degrees in zip(points.tolist(), plane.to_geodetic(points).tolist(), strict=True):
+            latitude, longitude = (f"{one:.{_DECIMALS_DEGREES}f}" for one in degrees)
+            node = add("node", lat=latitude, lon=longitude)
+            place = {"local_x": f"{x:.{_DECIMALS}f}", "local_y": f"{y:.{_DECIMALS}f}", "ele": "0.0"}
+            add_tags(node, place | tags)
+            nodes.append(node.attrib["id"])
+        return nodes
+
+    def add_way(nodes: list[str]) -> str:
+        way = add("way")
+        for node in nodes:
+            ET.SubElement(way, "nd", ref=node)
+        add_tags(way, WAY_TAGS)
+        return way.attrib["id"]
+
+    left, right = (track.curve(label, "lanelet2").spline for label in BOUNDARIES)
+    if left.periodic != right.periodic:
+        raise SettingsError("lanelet2: expected both boundaries closed or both open, found one of each")
+    closed = left.periodic
+    line = find_line(left, right, closed)
+    cuts = np.linspace(*line.ribbon.domain, _PIECES + 1)[: _PIECES if closed else 0]
+    ways = []
+    for spline, crossing in zip((left, right), line.crossings(cuts), strict=True):
+        pieces = [add_nodes(piece, {}) for piece in _pieces(spline, crossing.u, step)]
+        for piece, following in zip(pieces, pieces[1:] + pieces[:1] if closed else [], strict=False):
+            piece.append(following[0])
+        ways.append(pieces)
+    for label, cones in sorted(track.points.items()):
+        add_nodes(cones.points, {"type": CONE, "subtype": NAMES[label]})
+    for pair in zip(*[[add_way(nodes) for nodes in pieces] for pieces in ways], strict=True):
+        relation = add("relation")
+        for label, way in zip(BOUNDARIES, pair, strict=True):
+            ET.SubElement(relation, "member", type="way", ref=way, role=NAMES[label])
+        add_tags(relation, LANELET_TAGS)
+    ET.indent(root)
+    ET.ElementTree(root).write(file, encoding="UTF-8", xml_declaration=True)
+
+
+def _pieces(spline: BSpline, cuts: Array, step: float) -> list[Array]:
+    """Return the points (n, 2) of each stretch between cuts, without its last one, or of an open curve."""
+    length = spline.length()
+    if len(cuts):
+        low, high = spline.domain
+        begins = spline.arc_length(low + np.mod(cuts - low, high - low))
+        begins = begins[0] + np.mod(begins - begins[0], length)
+        ends = np.append(begins, begins[0] + length)
+    else:
+        ends = np.array([0.0, length])
+    pieces = []
+    for begin, end in pairwise(ends):
+        intervals = max(round((end - begin) / step), _FEWEST_WAY_INTERVALS)
+        at = np.linspace(begin, end, intervals + 1)[: -1 if len(cuts) else None]
+        pieces.append(spline.evaluate(spline.parameters_at(np.mod(at, length) if len(cuts) else at)))
+    return pieces

@@ -1,1 +1,0 @@
-"""Scenes of any size: lengths are divided by one scale on the way in, and multiplied by it on the way out."""
