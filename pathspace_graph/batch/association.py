@@ -7,7 +7,6 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import project
 from pathspace_graph.factors.se2 import rotated, to_map, to_vehicle
 from pathspace_graph.graph.variables import pose_keys
@@ -18,7 +17,7 @@ from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
 from pathspace_graph.settings.batch import AssociationSettings
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
+from pathspace_graph.spline.boundary import SAME_DIRECTION
 
 DENSITY_STEP: Final = 0.1
 """Step at which the density of detections along a curve is sampled (m); cones are its peaks."""
@@ -47,10 +46,7 @@ FOLD_DISTANCE: Final = 1.5
 
 
 def add_drive(state: State, poses: Array, calibration: Array, settings: AssociationSettings) -> None:
-    """Add the poses (P, 3) of all cycles to a state that has its curves already.
-
-    The calibration is that of the odometry (2,), or of odometry and sensor (7,).
-    """
+    """Add the poses (P, 3) of all cycles to a state that has its curves already."""
     state.variables.insert_calibrations(calibration)
     state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
     locate_poses(state, settings)
@@ -147,19 +143,13 @@ def _misfit(
     boundary, poses = state.boundaries[label], state.variables.poses_at(detections.cycle[rows])
     points = to_map(detections.point[rows], poses)
     if whole:
-        foot = find_anywhere(boundary, state.control_points(label), points)
+        foot = boundary.find_anywhere(state.control_points(label), points)
     else:
         begin = _nearest_in_view(state, detections.cycle[rows], points, label, settings)
         foot = boundary.refine(state.control_points(label), points, begin)
     projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
-
-
-def find_anywhere(boundary: Boundary, control_points: Array, points: Array) -> FootPoints:
-    """Return the foot points of points (m, 2) on a whole curve."""
-    low, high = (np.full(len(points), end) for end in (boundary.tables.low, boundary.tables.high))
-    return boundary.find(control_points, points, low, high)
 
 
 def _nearest_in_view(
@@ -280,14 +270,10 @@ def along_drive(cones: Cones, lap: Array, label: int) -> Cones:
 def _beside(
     state: State, points: Array, cycles: IntArray, label: int, settings: MapperSettings
 ) -> tuple[BoolArray, BoolArray, Array]:
-    """Return which points (m, 2) lie beside a curve, which lie about its end, and their foot points u (m,).
-
-    Half of the detections of the cone at which an open curve ends lie beyond its end. On an open curve, a
-    point lies on the stretch that the pose of its cycle (m,) sees.
-    """
+    """Return which points (m, 2) lie beside a curve, which about its end, and their foot points u (m,)."""
     boundary, control_points = state.boundaries[label], state.control_points(label)
     if boundary.periodic:
-        foot = find_anywhere(boundary, control_points, points)
+        foot = boundary.find_anywhere(control_points, points)
     else:
         u = state.pose_u[label][cycles]
         low, high = u - settings.gate.view_behind, u + settings.gate.view_ahead

@@ -32,14 +32,14 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import by_motion, sigma_of_information
 from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.bspline import BSpline, at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.boundary import at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive
-from .gauge import curve_gauge
 from .optimizer import LOOSE_GATE, Convergence, Effort, Optimizer
 from .simplification import associate_again, boundary_of, scatter_of_cones, simplified
 from .start import Recurrence, start_odometry
-from .system import BatchSystem, Biweight, Evaluation, own_settings
+from .system import BatchSystem, Biweight, Evaluation, curve_gauge, own_settings
 
 USED_AGAIN: Final = 0.85
 """Least share of the detections after the first lap on a closed result, over that of the first lap."""
@@ -192,10 +192,7 @@ def marginal_of(
 
 
 def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:
-    """Return the rows of the batch that hold a pose before `first_kept` or no pose at all.
-
-    Those that hold a control point beside a pose are made anew with poses that leave, so that none is lost.
-    """
+    """Return the rows of the batch that hold a pose before `first_kept` or no pose at all."""
     state, sigma = at.state, system.settings.batch.sigma_slide
     gauges = {label: curve_gauge(state, label, sigma, first_kept) for label in state.boundaries}
     groups = system.rows(at, gauges)
@@ -324,10 +321,7 @@ def _rms(values: Array) -> float:
 
 
 def _sigma_of_motion(feet: Sequence[FootPoints], sigma_reading: float) -> float:
-    """Return the largest standard deviation (m) of a rigid motion that detections hold across curves.
-
-    The motion turns about the mean of the foot points. Each detection has this sigma (m).
-    """
+    """Return the largest standard deviation (m) of a rigid motion that detections hold across curves."""
     normal, point = (
         np.concatenate([np.zeros((0, 2)), *(getattr(foot, name) for foot in feet)])
         for name in ("normal_unit", "position")

@@ -20,7 +20,7 @@ from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 
-from .association import MIN_CONES, associate, cones_of_curve, find_anywhere, first_parameter, locate_poses
+from .association import MIN_CONES, associate, cones_of_curve, first_parameter, locate_poses
 
 MIN_SIZE_SHARE: Final = 0.6
 """Least share of the largest number of control points that the map's curves are tried with."""
@@ -77,10 +77,7 @@ def dense_fit_through(points: Array, periodic: bool, settings: MapperSettings) -
 
 
 def _fit(points: Array, periodic: bool, settings: MapperSettings, least: int, most: int) -> BSpline:
-    """Return the curve of `least` to `most` control points that fits best.
-
-    A closed one begins at the cone nearest to the start, so that similar cones give similar knots.
-    """
+    """Return the curve of `least` to `most` control points that fits best."""
     if periodic:
         points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
     fit = FitSettings(degree=settings.spline.degree)
@@ -152,16 +149,12 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
 
 
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
-    """Return F (m_new, m_old): least squares over points of the old curve and their foot points on the new.
-
-    old_points (m_old, 2) and new_points (m_new, 2) are the curves' control points. An open dense curve goes
-    on beyond the ends of the new one, which doesn't count.
-    """
+    """Return F (m_new, m_old): least squares over points of the old curve and their feet on the new."""
     splines = old.spline(old_points), new.spline(new_points)
     if new.periodic:
 
         def nearest_on_new(u: Array) -> Array:
-            return find_anywhere(new, new_points, old.evaluate(old_points, u)).u
+            return new.find_anywhere(new_points, old.evaluate(old_points, u)).u
 
         return refit(*splines, nearest_on_new).new_from_old
     # an open curve that passes the same cones again lies on itself, so it is searched near the same place
@@ -238,11 +231,7 @@ def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperS
 
 
 def cross_validated(points: Array, periodic: bool, settings: MapperSettings, share: float) -> Array:
-    """Return the distance of each cone (k, 2) from a curve that is fitted without it, in m, in any order.
-
-    `share` is the number of control points per cone. The first and the last cone of an open curve are never
-    left out, since nothing is known beyond them.
-    """
+    """Return the distance of each cone (k, 2) from a curve that is fitted without it, in m, in any order."""
     number = np.arange(len(points))
     ends = np.zeros(len(points), bool) if periodic else (number == 0) | (number == len(points) - 1)
     distances = [np.zeros(0)]

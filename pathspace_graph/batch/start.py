@@ -227,11 +227,7 @@ def start_odometry(
     settings: MapperSettings,
     recurrence: Recurrence | None = None,
 ) -> State:
-    """Return poses by dead reckoning, and curves through the cones that were seen in the first lap.
-
-    Where the path recurs, every lap is made to pass the same places first, and the curves are closed;
-    otherwise they are open. By default the path driven says whether it recurs.
-    """
+    """Return poses by dead reckoning, and curves through the cones that were seen in the first lap."""
     calibration = np.array(settings.calibrations)
     poses = chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
     recurrence = recurrence or find_recurrence(poses, settings)
@@ -300,10 +296,7 @@ class LapCorrespondences:
 
 
 def lap_correspondences(recurrence: Recurrence) -> LapCorrespondences:
-    """Return the correspondences of the poses nearest to where each lap passes each reference pose.
-
-    A lap has a whole number of reference poses, equally spaced by REFERENCE_STEP at most.
-    """
+    """Return the correspondences of the poses nearest to where each lap passes each reference pose."""
     count = max(int(np.ceil(recurrence.lap / REFERENCE_STEP)), 1)
     places = recurrence.driven / recurrence.lap * count
     cycles = _nearest_cycles(places)

@@ -263,11 +263,7 @@ def _since(stamps: Array, twists: Array, newest: Newest) -> tuple[Array, Array]:
 
 
 def possible_detections(detections: Detections, t: float, limits: LimitSettings) -> tuple[Detections, str]:
-    """Return the possible detections of a cycle at t (s), and a notice about the others.
-
-    A detection is possible if it is finite, within the ranges and the uncertainties of any sensor, and if its
-    covariance is symmetric and positive definite. Wrong shapes, types or labels are a ReadingError.
-    """
+    """Return the possible detections of a cycle at t (s), and a notice about the others."""
     points = _numbers(detections.points_vehicle, "detections.points_vehicle", (-1, 2))
     count = len(points)
     covariances = _numbers(detections.covariances, "detections.covariances", (count, 2, 2))
@@ -296,10 +292,7 @@ def _has_range(points: Array, most: float) -> BoolArray:
 
 
 def _has_covariance(covariances: Array) -> BoolArray:
-    """Return whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible size.
-
-    The smaller eigenvalue is the determinant by the larger one.
-    """
+    """Return whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible size."""
     xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
         det = xx * yy - xy * yx

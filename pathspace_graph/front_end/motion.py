@@ -224,11 +224,7 @@ class MotionCheck:
     def _best(
         self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float
     ) -> Match | None:
-        """Return the better match of those that begin at two poses (3,), the first going on as before.
-
-        A vehicle that was put down elsewhere sees other cones, which agree with no motion, or with one that
-        no vehicle can make. Nothing is told from them.
-        """
+        """Return the better match of those that begin at two poses (3,), the first going on as before."""
         matches = [self._match(detections, variances, start, reaches()) for start in starts]
         possible = [one for one in matches if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)

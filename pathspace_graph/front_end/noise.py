@@ -139,10 +139,7 @@ class NoiseLearner:
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
     def _contradicted(self, settings: MapperSettings) -> BoolArray:
-        """Return which errors (5,) of the sensor are measured, and contradict their priors.
-
-        What is measured of the scale of the ranges is its ratio to that of the speeds.
-        """
+        """Return which errors (5,) of the sensor are measured, and contradict their priors."""
         measured, sensor = self.measured, settings.calibration
         if not self.of_sensor or measured is None or measured.along is None or not sensor.sensor:
             return np.zeros(SENSOR_SIZE, bool)
@@ -152,10 +149,7 @@ class NoiseLearner:
         return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, prior))
 
     def used(self, settings: MapperSettings) -> RunNoise:
-        """Return the noise that is used, and what sets the size of the map where ranges and speeds disagree.
-
-        They do where `calibrated` finds that the scale of the ranges contradicts its prior.
-        """
+        """Return the noise used, and what sets the size of the map where ranges and speeds disagree."""
         measured = self.measured
         size: Literal["odometry", "ranges"] | None = None
         if self._contradicted(settings)[SCALE]:

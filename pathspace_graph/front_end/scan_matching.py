@@ -66,11 +66,7 @@ def reaches(iterations: int = ITERATIONS) -> list[float]:
 
 
 class RecentDetections:
-    """Detections of the newest cycles in one frame.
-
-    They are corrected by the newest errors of the sensor, so that a cone stays where it is when more is
-    learned.
-    """
+    """Detections of the newest cycles in one frame."""
 
     def __init__(self) -> None:
         self.points: Array = np.zeros((0, 2))
@@ -168,10 +164,7 @@ def _matched(
     reach: float,
     limits: tuple[float, float, float, float],
 ) -> tuple[Array, Array, BoolArray, float]:
-    """Return information (3, 3), gradient (3,), which detections (m,) are matched, and their weighted cost.
-
-    These are of a step of `match`, whose limits are FARTHEST, MIN_WEIGHT, HUBER and SIGMA_CONE.
-    """
+    """Return information (3, 3), gradient (3,), which detections (m,) match, and their weighted cost."""
     farthest, min_weight, huber, sigma_cone = limits
     points = to_map(points_vehicle, pose[None])
     means, weights = _weighted_means(points, recent, reach, farthest)
@@ -185,10 +178,7 @@ def _matched(
 
 
 def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:
-    """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given.
-
-    Each counts at most `MOST_MISFIT`, and as much where nothing was detected before.
-    """
+    """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given."""
     points = to_map(points_vehicle, pose[None])
     means, weights = _means(points, recent.points, REACH_LAST)
     matched = weights > MIN_WEIGHT
@@ -228,11 +218,7 @@ def _normal_equations(off: Array, arm: Array, precision: Array) -> tuple[Array, 
 
 
 def by_errors(points_vehicle: Array, twist: Array) -> Array:
-    """Return the derivatives (m, 2, 2) of detections (m, 2), vehicle frame, by the yaw and by the latency.
-
-    The vehicle moved with the twist (3,), in m/s, m/s and rad/s. They are two columns of
-    `factors.sensor:by_sensor`.
-    """
+    """Return the derivatives (m, 2, 2) of detections (m, 2), vehicle frame, by the yaw and by the latency."""
     columns = np.empty((len(points_vehicle), 2, len(ERRORS)))
     columns[:, :, 0] = left_of(points_vehicle)
     columns[:, :, 1] = -twist[:2] - twist[2] * columns[:, :, 0]

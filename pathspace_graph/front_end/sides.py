@@ -84,8 +84,8 @@ class SideJudge:
     ) -> Detections:
         """Return the detections of a cycle with the labels of their sides.
 
-        The pose (3,) is in the frame of the front end, and the vehicle came there with twists (k, 3). In a
-        lane between orange cones it isn't on the road yet, and the colours of others prove nothing.
+        The vehicle came to the pose (3,), in the frame of the front end, with twists (k, 3). In a lane of
+        orange cones it isn't on the road yet, and the colours of others prove nothing.
         """
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
         if not self.colourless and self._agreeing + self._opposing >= ENOUGH_VOTES:
@@ -160,11 +160,7 @@ class SideJudge:
     def _beginning(
         self, label: int, pose: Array, path: PathAhead, seen: IntArray, stations: Array, lateral: Array
     ) -> Row:
-        """Return the row of a boundary beside the vehicle, where the path tells the side of each cone.
-
-        Of cones beside one another, only the nearest to the path is in the row. The cones `seen` (k,) are at
-        these stations and lateral distances (k,). A row without any cone begins beside the vehicle.
-        """
+        """Return the row of a boundary beside the vehicle, where the path tells the side of each cone."""
         side = SIDES[label] * lateral
         beside = (side > MIN_LATERAL) & (side < MAX_LATERAL)
         beside &= (stations > path.driven - BEHIND) & (stations < path.driven + SURE)
@@ -221,10 +217,7 @@ def follow_rows(rows: Mapping[int, Row], points: Array, votes: IntArray, free: I
 def _costs(
     rows: Mapping[int, Row], label: int, points: Array, votes: IntArray, cones: IntArray
 ) -> tuple[Array, Array]:
-    """Return what it costs a row to lead on to cones (k,), and how far they are from its end (m).
-
-    The cost is infinite where the row may not lead on there.
-    """
+    """Return what it costs a row to lead on to cones (k,), and how far they are from its end (m)."""
     row, other = rows[label], rows[LEFT + RIGHT - label]
     dx, dy = (points[cones] - row.end).T
     distance, turn = np.hypot(dx, dy), wrap_angle(np.arctan2(dy, dx) - row.heading)
@@ -256,12 +249,8 @@ class NearCones:
         cones, known = nearest_within(points, self.points, MERGE_RADIUS)
         new = int((~known).sum())
         cones[~known] = len(self.points) + np.arange(new)
-        if new > 0:
-            self.points = np.concatenate([self.points, np.zeros((new, 2))])
-            self.counts = np.concatenate([self.counts, np.zeros(new, np.intp)])
-            self.votes = np.concatenate([self.votes, np.zeros((new, len(BOUNDARIES)), np.intp)])
-            self.judged = np.concatenate([self.judged, np.zeros(new, bool)])
-            self._last = np.concatenate([self._last, np.full(new, t)])
+        for name, column in vars(self).items():
+            setattr(self, name, np.concatenate([column, np.zeros((new, *column.shape[1:]), column.dtype)]))
         coloured = labels != UNKNOWN
         np.add.at(self.votes, (cones[coloured], labels[coloured]), 1)
         np.add.at(self.counts, cones, 1)
@@ -271,5 +260,5 @@ class NearCones:
 
     def _forget(self, t: float) -> None:
         kept = newest_of(self._last, MAX_CONES) & (self._last > t - FORGET_AFTER)
-        self.points, self.counts, self.votes = self.points[kept], self.counts[kept], self.votes[kept]
-        self.judged, self._last = self.judged[kept], self._last[kept]
+        for name, column in vars(self).items():
+            setattr(self, name, column[kept])

@@ -1,7 +1,7 @@
-"""What lies ahead of a vehicle: the next metres of the track in its own frame, for a controller.
+"""The next metres of the track in the vehicle's own frame, for a controller.
 
-It is the line of `centre_line`, but only its next stretch, and a hundred times faster: each boundary is
-sampled once, and near a sample it is taken as the circle that osculates it there.
+It is the line of `centre_line`, but a hundred times faster: each boundary is sampled once, and near a sample
+it is taken as the circle that osculates it there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,8 +18,6 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from .centre_line import points_across
 from .planning import LEAST_STEP, MOST_POINTS
-
-Bools = BoolArray
 
 _SAMPLE_STEP: Final = 0.5
 """Approximate distance of boundary samples (m). The circle at a sample is right to a millimetre."""
@@ -63,15 +61,9 @@ class TrackAhead:
     known, and fewer than were asked for where the map ends.
     """
 
-    LENGTHS: ClassVar = {
-        "points": 1,
-        "curvature": -1,
-        "arc_length": 1,
-        "width_left": 1,
-        "width_right": 1,
-        "left": 1,
-        "right": 1,
-    }
+    LENGTHS: ClassVar = {"curvature": -1} | dict.fromkeys(
+        ("points", "arc_length", "width_left", "width_right", "left", "right"), 1
+    )
 
     points: Array
     """Points (n, 2) in m; the first one is beside the vehicle."""
@@ -85,7 +77,7 @@ class TrackAhead:
     """Distance (n,) along the normal to the left boundary, in m."""
     width_right: Array
     """Distance (n,) along the normal to the right boundary, in m."""
-    confirmed: Bools
+    confirmed: BoolArray
     """Whether both boundaries are confirmed at each point (n,); another one may be taken back."""
     left: Array
     """Points (k, 2) of the left boundary from beside the vehicle on, in m."""
@@ -119,14 +111,10 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
         to_vehicle(samples[label].beside(distance), pose[None]) if label in samples else np.zeros((0, 2))
         for label in BOUNDARIES
     ]
-    line = None
-    if len(samples) == len(BOUNDARIES):
-        line = _first_line(samples[LEFT], samples[RIGHT])
+    line = _first_line(samples[LEFT], samples[RIGHT]) if len(samples) == len(BOUNDARIES) else None
     if line is None or len(line.points) < 2:
-        none = np.zeros(0)
-        return TrackAhead(
-            np.zeros((0, 2)), none, none, none, none, none, none > 0.0, sides[LEFT], sides[RIGHT]
-        )
+        no, none = np.zeros(0), np.zeros((0, 2))
+        return TrackAhead(none, no, no, no, no, no, no > 0.0, sides[LEFT], sides[RIGHT])
     line = _from_beside(line, pose[:2], distance, step)
     return _settled(samples[LEFT], samples[RIGHT], line, pose, step, sides)
 
@@ -136,18 +124,13 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """A boundary at n places."""
+    """A boundary at n places, map frame; stations count from beside the vehicle."""
 
     points: Array
-    """Points (n, 2) in m, map frame."""
     tangents: Array
-    """Unit tangents (n, 2)."""
     curvature: Array
-    """Curvature (n,) in 1/m."""
     station: Array
-    """Length (n,) along the boundary, from beside the vehicle, in m."""
-    confirmed: Bools
-    """Whether each sample (n,) is confirmed, or may be taken back."""
+    confirmed: BoolArray
 
     def beside(self, distance: float) -> Array:
         """Return the points (k, 2) from beside the vehicle on, along a distance (m)."""
@@ -179,14 +162,9 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
     points, first_order, second = parts
     square = _dot(first_order, first_order)
     speed = np.sqrt(square)
-    ahead = float(u[0] - curve.beside)
-    return _Samples(
-        points=points,
-        tangents=first_order / speed[:, None],
-        curvature=_dot(left_of(first_order), second) / (square * speed),
-        station=ahead + np.cumsum(_distances(points)),
-        confirmed=confirmed,
-    )
+    station = float(u[0] - curve.beside) + np.cumsum(_distances(points))
+    curvature = _dot(left_of(first_order), second) / (square * speed)
+    return _Samples(points, first_order / speed[:, None], curvature, station, confirmed)
 
 
 def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Array]:

@@ -1,18 +1,16 @@
-"""Plane B-spline curves: evaluation, arc length, exact changes of the ends, covariance, and crossings."""
+"""Plane B-spline curves: evaluation, arc length, exact changes of the ends, and covariance."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
-from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import (
     SpanPolynomials,
     clamped_knots,
@@ -22,7 +20,6 @@ from pathspace_graph.factors.bspline import (
 )
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
-from pathspace_graph.labels import LEFT, RIGHT
 
 _PERIODIC_TOLERANCE: Final = 1e-9
 """Largest difference of repeated values of a periodic spline, over (1 + largest value)."""
@@ -33,13 +30,6 @@ _ARC_NEWTON_STEPS: Final = 4
 """Newton steps that invert the arc length, from a table with the same grid."""
 _SHORTEST_EXTENSION: Final = 1e-3
 """Least knot interval of an extension over the mean one, even if the point is the old end."""
-NO_PATH: Final = np.zeros((0, 2))
-PATH_STEP: Final = 1.0
-"""Step at which a driven path is looked at for crossings with itself (m)."""
-LEVEL_SINE: Final = 0.7
-"""Least sine of the angle of a level crossing: laps over the same road meet at smaller ones."""
-LEVEL_CROSSING: Final = 8.0
-"""Largest distance of the crossing boundaries from where the driven path crosses itself there (m)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,9 +183,9 @@ class BSpline:
     def curvature(self, u: Array) -> Array:
         """Return (x' y'' - y' x'') / |S'|^3 (k,) in 1/m: positive in a left turn, zero where S' vanishes."""
         first, second = self.evaluate(u, 1), self.evaluate(u, 2)
-        cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+        bent = cross(first, second)
         cube = np.linalg.norm(first, axis=1) ** 3
-        return np.asarray(np.divide(cross, cube, out=np.zeros_like(cross), where=cube > 0.0))
+        return np.asarray(np.divide(bent, cube, out=np.zeros_like(bent), where=cube > 0.0))
 
     def foot_points(self, points: Array) -> FootPoints:
         """Search the whole curve for the foot points of points (k, 2), map frame."""
@@ -363,55 +353,11 @@ def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
     return np.asarray(weights[0])
 
 
-# --- whether boundaries cross ----------------------------------------------------------------------------
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross products (...) of plane vectors (..., 2)."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-def sampled(spline: BSpline, step: float) -> Array:
-    """Return points (n, 2) of a spline, from its beginning to its end, about this step (m) apart."""
-    low, high = spline.domain
-    return spline.evaluate(np.linspace(low, high, max(int((high - low) / step), 1) + 1))
-
-
-def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array = NO_PATH) -> bool:
-    """Return whether the left and the right boundary cross, sampled at this step (m).
-
-    At a level crossing of the road with itself, where the driven path (n, 2) crosses itself, they do.
-    """
-    found = crossings(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
-    return not at_level_crossing(found, path).all()
-
-
-def at_level_crossing(points: Array, path: Array) -> BoolArray:
-    """Return whether each point (m, 2) is at a place where a driven path (n, 2) crosses itself."""
-    if len(points) == 0 or len(path) < 2:
-        return np.zeros(len(points), bool)
-    station = np.append(0.0, np.hypot(*np.diff(path, axis=0).T).cumsum())
-    _, kept = np.unique(station // PATH_STEP, return_index=True)
-    own = crossings(path[kept], path[kept], LEVEL_SINE)
-    if len(own) == 0:
-        return np.zeros(len(points), bool)
-    return np.asarray(KDTree(own).query(points)[0] < LEVEL_CROSSING)
-
-
-def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
-    """Return the points (k, 2) where segments of the polyline a (n, 2) cross those of the polyline b (m, 2).
-
-    Only those count whose angle has at least this sine.
-    """
-    middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
-    reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
-    near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)
-    i = np.repeat(np.arange(len(near)), [len(own) for own in near])
-    j = np.array([k for own in near for k in own], np.intp)
-    (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
-    crossed = (_side(p, q, r) * _side(p, q, s) < 0.0) & (_side(r, s, p) * _side(r, s, q) < 0.0)
-    p, q, r, s = (points[crossed] for points in (p, q, r, s))
-    turned = np.abs(_side(p, q, p + s - r)) > sine * np.hypot(*(q - p).T) * np.hypot(*(s - r).T)
-    share = _side(r, s, p) / (_side(r, s, p) - _side(r, s, q))
-    return np.asarray((p + share[:, None] * (q - p))[turned])
-
-
-def _side(p: Array, q: Array, point: Array) -> Array:
-    """Return on which side of the lines from p to q (k, 2) the points (k, 2) lie: positive on the left."""
-    along, to = q - p, point - p
-    return np.asarray(along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0])
+def side_of(p: Array, q: Array, point: Array) -> Array:
+    """Return on which side of the lines from p to q (..., 2) the points lie: positive on the left."""
+    return cross(q - p, point - p)

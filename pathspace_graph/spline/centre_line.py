@@ -18,12 +18,12 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.bspline import BSpline, side_of
 
 SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}
 """Side of the centre line on which the edge of each label is."""
-_SAMPLE_STEP: Final = 0.5
-"""Distance of the points of a ribbon to which an edge is fitted (m)."""
+SAMPLE_STEP: Final = 0.5
+"""Distance of the samples of boundaries, of lines, and of edges that are fitted (m)."""
 _EDGE_BREAKS: Final = 2
 """Knot intervals of an edge for each one of the ribbon, since it is no B-spline itself."""
 
@@ -79,11 +79,7 @@ class Ribbon(BSpline):
         return at[:, :2] + half[:, None] * n, by_control.reshape(len(u), 2, -1)
 
     def edge_spline(self, label: int) -> tuple[BSpline, Array]:
-        """Return an edge as a B-spline of m' control points, and their derivatives (2m', 3m).
-
-        The least-squares fit to the edge, on twice the knots, at the same parameters. The derivatives are by
-        the ribbon's control points.
-        """
+        """Return an edge as a B-spline of m' control points, and their derivatives (2m', 3m)."""
         low, high = self.domain
         count = _EDGE_BREAKS * len(self.tables.starts)
         if self.periodic:
@@ -92,7 +88,7 @@ class Ribbon(BSpline):
             blank = BSpline.open_uniform(
                 np.zeros((count + self.degree, 2)), self.degree, (high - low) / count, low
             )
-        steps = int(np.ceil((high - low) / _SAMPLE_STEP))
+        steps = int(np.ceil((high - low) / SAMPLE_STEP))
         u = np.linspace(low, high, steps + 1)[: steps if self.periodic else None]
         points, jacobian = self.edge(u, SIDE[label])
         fit = np.linalg.pinv(blank.basis_matrix(u))
@@ -102,16 +98,10 @@ class Ribbon(BSpline):
 
 # --- the line between two boundaries ---------------------------------------------------------------------
 
-
-Ints = IntArray
-Bools = BoolArray
-
 SPACING: Final = 3.0
 """Distance of the knots of a planner's line (m); shorter kinks of the boundaries are smoothed."""
 MOST_SAMPLES: Final = 200_000
 """Largest number of samples of a boundary, which bounds the memory."""
-SAMPLE_STEP: Final = 0.5
-"""Distance of the samples of boundaries and line (m)."""
 _FEWEST: Final = 4
 """Smallest number of samples of a boundary and of knot intervals of a line."""
 _STARTS: Final = 200
@@ -201,7 +191,7 @@ class Crossing:
     """(k, 2) Unit normals of the line, to the left."""
     offset: Array
     """(k,) Signed distance along the normal, positive to the left (m)."""
-    good: Bools
+    good: BoolArray
     """(k,) Whether the normal crosses the boundary there."""
 
     @cached_property
@@ -327,7 +317,7 @@ def _samples(spline: BSpline, closed: bool) -> Array:
     return spline.parameters_at(np.linspace(0.0, length, count + 1)[: count if closed else None])
 
 
-def _unwrapped(u: Array, index: Ints, spline: BSpline, closed: bool) -> Array:
+def _unwrapped(u: Array, index: IntArray, spline: BSpline, closed: bool) -> Array:
     """Return the parameters of samples whose indices go on past the end of a loop."""
     low, high = spline.domain
     return np.asarray(u[index % len(u)] + (high - low) * (index // len(u)) if closed else u[index])
@@ -335,7 +325,7 @@ def _unwrapped(u: Array, index: Ints, spline: BSpline, closed: bool) -> Array:
 
 def _paired(
     sides: tuple[BSpline, BSpline], samples: list[Array], points: list[Array], closed: bool
-) -> tuple[Ints, Ints]:
+) -> tuple[IntArray, IntArray]:
     """Return the samples of both boundaries that face each other, in the direction of travel."""
     i, j = _first_pair(sides, samples, points, closed)
     lefts, rights = ([tuple(point) for point in side.tolist()] for side in points)
@@ -377,7 +367,7 @@ def _first_pair(
 
 def points_across(
     points: tuple[Array, Array], tangents: tuple[Array, Array], lengths: tuple[Array, Array], apart: float
-) -> tuple[Ints, Ints]:
+) -> tuple[IntArray, IntArray]:
     """Return the samples of the first curve that have a point across, and that sample of the second curve.
 
     The point across is the nearest one to the right of the first curve, which is to the left of the second
@@ -396,10 +386,7 @@ def points_across(
 def _march(
     lefts: list[tuple[float, ...]], rights: list[tuple[float, ...]], to_the_end: bool
 ) -> list[tuple[int, int]]:
-    """Return the pairs of a march along two rows, which always goes on over the shorter diagonal.
-
-    It ends at the end of both rows or, by default, of the one where the other row comes no nearer.
-    """
+    """Return the pairs of a march along two rows, which always goes on over the shorter diagonal."""
     i = j = 0
     pairs = [(0, 0)]
     last = len(lefts) - 1, len(rights) - 1
@@ -421,12 +408,12 @@ def _square(a: tuple[float, ...], b: tuple[float, ...]) -> float:
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2
 
 
-def _check_apart(lefts: Array, rights: Array, i: Ints, j: Ints, closed: bool) -> None:
+def _check_apart(lefts: Array, rights: Array, i: IntArray, j: IntArray, closed: bool) -> None:
     """Raise a SettingsError where the boundaries cross near a pair of samples that face each other."""
     near = j[:, None] + np.arange(-_NEAR, _NEAR + 1)
     p, q = _segments(lefts, i[:, None], closed)
     r, s = _segments(rights, near, closed)
-    cross = (_turn(p, q, r) * _turn(p, q, s) < 0.0) & (_turn(r, s, p) * _turn(r, s, q) < 0.0)
+    cross = (side_of(p, q, r) * side_of(p, q, s) < 0.0) & (side_of(r, s, p) * side_of(r, s, q) < 0.0)
     if cross.any():
         x, y = p[np.flatnonzero(cross.any(axis=1))[0], 0]
         raise SettingsError(
@@ -434,15 +421,9 @@ def _check_apart(lefts: Array, rights: Array, i: Ints, j: Ints, closed: bool) ->
         )
 
 
-def _segments(points: Array, index: Ints, closed: bool) -> tuple[Array, Array]:
+def _segments(points: Array, index: IntArray, closed: bool) -> tuple[Array, Array]:
     """Return both ends of the segments that begin at some indices; beyond an open end they are points."""
     if closed:
         return points[index % len(points)], points[(index + 1) % len(points)]
     last = len(points) - 1
     return points[np.clip(index, 0, last)], points[np.clip(index + 1, 0, last)]
-
-
-def _turn(p: Array, q: Array, point: Array) -> Array:
-    """Return on which side of the lines from p to q the points lie: positive on the left."""
-    along, to = q - p, point - p
-    return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])

@@ -110,10 +110,7 @@ def refit(
 
 
 def _least_squares(matrix: Array, right: Array) -> Array:
-    """Return argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned.
-
-    Where a stretch has no sample, X is the least of all that are as good.
-    """
+    """Return argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned."""
     try:
         factor = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
     except np.linalg.LinAlgError:
@@ -187,13 +184,10 @@ def _fit_on(
     points: Array, u: Array, breaks: Array, periodic: bool, settings: FitSettings
 ) -> tuple[BSpline, Array, float]:
     """Fit on given breaks and refresh foot points; return spline, parameters (k,) and rmse (m)."""
-    p = settings.degree
-    count = len(breaks) - 1
-    build = BSpline.periodic_from if periodic else BSpline.clamped_from
-    frame = build(breaks, np.zeros((count if periodic else count + p, 2)), p)
+    frame = _frame(breaks, periodic, settings.degree)
     bending = np.sqrt(settings.smoothness) * energy_rows(frame)
     zeros = np.zeros((len(bending), 2))
-    reach = (breaks[-1] - breaks[0]) / max(count, len(points))
+    reach = (breaks[-1] - breaks[0]) / max(len(breaks) - 1, len(points))
     rmse = np.inf
     for _ in range(settings.refits):
         stacked = np.concatenate([frame.basis_matrix(u), bending])

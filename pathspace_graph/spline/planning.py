@@ -10,7 +10,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.settings.output import SpeedSettings
-from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.bspline import BSpline, cross
 from pathspace_graph.spline.centre_line import CentreCurve, Crossing, find_line
 
 
@@ -226,10 +226,10 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
     for apart in range(1, min(_NEIGHBOURS, count - 1) + 1):
         i = np.arange(count if closed else count - apart)
         j = (i + apart) % count
-        turn, way = _cross(normal[i], normal[j]), points[j] - points[i]
+        turn, way = cross(normal[i], normal[j]), points[j] - points[i]
         known = np.abs(turn) > np.finfo(float).eps
-        a = np.divide(_cross(way, normal[j]), turn, out=np.full(len(i), np.inf), where=known)
-        b = np.divide(_cross(way, normal[i]), turn, out=np.full(len(i), np.inf), where=known)
+        a = np.divide(cross(way, normal[j]), turn, out=np.full(len(i), np.inf), where=known)
+        b = np.divide(cross(way, normal[i]), turn, out=np.full(len(i), np.inf), where=known)
         for width, side in ((left, 1.0), (right, -1.0)):
             meet = (side * a > 0.0) & (side * b > 0.0) & (side * a <= width[i]) & (side * b <= width[j])
             np.minimum.at(width, i[meet], _SHORT * np.abs(a[meet]))
@@ -263,7 +263,7 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
     cube = (speed**3)[:, None]
     bent = _dot(-left_of(second) / cube - 3.0 * curvature / speed[:, None] * tangent, moved[1])
     bent = bent + _dot(left_of(first) / cube, moved[2])
-    by_parameter = _cross(first, third) / cube[:, 0]
+    by_parameter = cross(first, third) / cube[:, 0]
     by_parameter -= 3.0 * curvature[:, 0] * np.einsum("kd,kd->k", first, second) / speed**2
     bent = bent - (by_parameter / speed)[:, None] * along
     intervals = centre.arc_length(u)
@@ -281,7 +281,3 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
 def _dot(a: Array, moved: Array) -> Array:
     """Return a . dC (n, M) of vectors a (n, 2) and derivatives (n, 2, M)."""
     return np.asarray(np.einsum("kd,kdm->km", a, moved))
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

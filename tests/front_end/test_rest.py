@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.ckf.mapper import CkfMapper
+from pathspace_graph.baselines.filters import CkfMapper
+from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.motion import MotionCheck, Rest, mean_bias
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, Odometry
-from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.mapping.motion import BiasMeasurement
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online, split_odometry
