@@ -212,7 +212,10 @@ class Expansion:
             rows = np.flatnonzero(free & (detections.labels == label))
             found = self._candidates(state, label, detections, rows, path_ahead)
             if label not in state.curves:
-                self._begin(state, label, detections, found)
+                found = found.where(found.sides < self.settings.growth.max_lateral)
+                if len(found.points) > 1:
+                    begin, rows = detections.points_vehicle[found.indices], found.indices
+                    state.begin(label, begin, self._covariances(detections, rows))
             elif self._extend(state, label, detections, found):
                 extended.add(label)
                 self._carried[label] = 0.0
@@ -250,17 +253,11 @@ class Expansion:
 
     def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> BoolArray:
         """Return which candidates (m,) meet the paper's three conditions, and lie ahead of the end."""
-        foot = state.foot_points(label, found.points, *_last_stretch(state, label, len(found.points)))
         high, control_points = state.curves[label].domain[1], state.control_points(label)
+        low, _ = state.visible_range(label, len(found.points))
+        foot = state.foot_points(label, found.points, np.minimum(low, high), np.full(len(low), high))
         ahead = found.stations > end.station + STATION_MARGIN
         return ahead & beyond_end(found.points, foot.u, high, control_points, self.settings.ckf)
-
-    def _begin(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> None:
-        """Begin a curve along at least two candidates."""
-        found = found.where(found.sides < self.settings.growth.max_lateral)
-        if len(found.points) > 1:
-            rows = found.indices
-            state.begin(label, detections.points_vehicle[rows], self._covariances(detections, rows))
 
     def _extend(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> bool:
         """Extend a curve to the last candidate of the proximity chain; return whether there is any."""
@@ -322,13 +319,6 @@ def proximity_chain(points: Array, start: Array) -> IntArray:
         order.append(remaining.pop(int(distances.argmin())))
         last = points[order[-1]]
     return np.array(order, np.intp)
-
-
-def _last_stretch(state: CurveState, label: int, count: int) -> tuple[Array, Array]:
-    """Return the limits (count,) of the visible stretch of an open curve, prolonged to its end."""
-    high = state.curves[label].domain[1]
-    low, _ = state.visible_range(label, count)
-    return np.minimum(low, high), np.full(count, high)
 
 
 def _end_position(state: CurveState, label: int) -> Array:

@@ -78,22 +78,17 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     normals = in_vehicle(foot.normal_unit, poses)
     by_calibration = np.einsum("mi,mik->mk", normals, state.belief.by_sensor(expected))
     gradient = np.concatenate([projected.by_pose, by_calibration, by_control], axis=1)
-    variance = projected.sigma**2 + gate.sigma_floor**2 + _joint_variance(state, label, control, gradient)
+    points_of = point_columns(state.offset(label) + control.ravel())
+    points_of = points_of.reshape(len(rows), POINT * control.shape[1])
+    head = np.tile(np.append(np.arange(POSE), SENSOR_COLUMNS), (len(rows), 1))
+    columns = np.concatenate([head, points_of], axis=1)
+    joint = state.belief.covariance[columns[:, :, None], columns[:, None, :]]
+    variance = projected.sigma**2 + gate.sigma_floor**2
+    variance = variance + np.einsum("mi,mij,mj->m", gradient, joint, gradient)
     squared = foot.distance**2 / variance
     passes = foot.interior & (np.abs(foot.distance) < gate.rough) & (squared < gate.chi**2)
     basis = scatter(foot.basis, foot.span - curve.degree, curve.size, curve.periodic)
     return OnCurve(rows, basis, foot.tangent_unit, squared).where(passes)
-
-
-def _joint_variance(state: CurveState, label: int, control: IntArray, gradient: Array) -> Array:
-    """Return `g' Sigma g` (m,) of gradients (m, 8 + 2 (p + 1)) by pose, sensor and control points."""
-    points = point_columns(state.offset(label) + control.ravel()).reshape(
-        len(control), POINT * control.shape[1]
-    )
-    head = np.append(np.arange(POSE), SENSOR_COLUMNS)
-    columns = np.concatenate([np.tile(head, (len(control), 1)), points], axis=1)
-    block = state.belief.covariance[columns[:, :, None], columns[:, None, :]]
-    return np.asarray(np.einsum("mi,mij,mj->m", gradient, block, gradient))
 
 
 # --- the fit of S_z --------------------------------------------------------------------------------------

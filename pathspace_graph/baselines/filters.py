@@ -27,7 +27,7 @@ from pathspace_graph.mapping.registration import (
     near_start,
     register,
 )
-from pathspace_graph.mapping.seam import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, PeriodicCurve, make_periodic
+from pathspace_graph.mapping.seam import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.scale.door import at_scale
@@ -253,19 +253,12 @@ def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
         periodic = make_periodic(
             boundary, state.control_points(label), state.settings, state.settings.ckf.knots
         )
-        curve, matrix = periodic_refit(state.spline(label), periodic, state.settings)
+        degree = state.settings.spline.degree
+        points = np.concatenate([periodic.points, periodic.points[:degree]])
+        curve = BSpline(periodic.knots, points, degree, periodic=True)
+        matrix = refit(state.spline(label), curve, periodic.overlap.new_parameter).new_from_old
         state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
         state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
-
-
-def periodic_refit(
-    spline: BSpline, periodic: PeriodicCurve, settings: MapperSettings
-) -> tuple[BSpline, Array]:
-    """Return the closed curve, and the matrix (m, n) from the open curve's control points to its own."""
-    degree = settings.spline.degree
-    points = np.concatenate([periodic.points, periodic.points[:degree]])
-    curve = BSpline(periodic.knots, points, degree, periodic=True)
-    return curve, refit(spline, curve, periodic.overlap.new_parameter).new_from_old
 
 
 # --- the baseline ----------------------------------------------------------------------------------------

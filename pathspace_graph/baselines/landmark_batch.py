@@ -140,11 +140,6 @@ class LandmarkSystem:
         detections = LandmarkDetections.of(judged.cycles, twists=judged.chain.twists)
         return cls(detections, judged.chain, judged.settings, judged.noise)
 
-    def believing(self, settings: MapperSettings) -> "LandmarkSystem":
-        """Return the same problem with the priors of the calibrations that other settings have."""
-        sigma = np.array(settings.odometry.sigmas_calibration)
-        return replace(self, settings=settings, chain=replace(self.chain, calibration_sigma=sigma))
-
     def cost(self, state: LandmarkState) -> float:
         """Return half the sum of squares at a state, with Huber's loss of the detections."""
         poses, calibration = state.variables.poses, state.variables.calibration
@@ -216,7 +211,10 @@ def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[L
     state.add(track.state.landmarks, track.state.labels, track.state.numbers)
     state.votes, state.next_number = track.state.votes, track.state.next_number
     insert_drive(state, smoother.variables.calibrations, poses)
-    return system.believing(online.believed), state
+    chain = replace(
+        system.chain, calibration_sigma=np.array(online.believed.odometry.sigmas_calibration)
+    )  # with the priors that the online run believed in the end
+    return replace(system, settings=online.believed, chain=chain), state
 
 
 # --- associations between two rounds ---------------------------------------------------------------------

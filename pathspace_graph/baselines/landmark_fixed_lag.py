@@ -115,7 +115,12 @@ class LandmarkFixedLag:
         return replace(self._result(detections.t, watch.laps), readings=used)
 
     def _use(self, new: slice, t: float, watch: Stopwatch, cycle: int | None = None) -> None:
-        associate_newest(self.smoother, new, self._eligible(), cycle)
+        eligible = np.ones(len(self.smoother.map.state), bool)
+        if (
+            not self.closed and self._near_start()
+        ):  # one detection alone can't tell which old landmark it shows
+            eligible = ~self._old()
+        associate_newest(self.smoother, new, eligible, cycle)
         watch.lap("associate")
         created = self._create(new, t)
         watch.lap("create")
@@ -149,14 +154,6 @@ class LandmarkFixedLag:
         numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
         detections.take(rows[chosen], numbers)
         state.vote(detections.label[rows[chosen]], numbers)
-
-    def _eligible(self) -> BoolArray:
-        """Return which landmarks (n,) may be associated. Near the start they exclude the old ones.
-
-        Until the loop has closed, one detection alone can't tell which of the old landmarks it shows.
-        """
-        every = np.ones(len(self.smoother.map.state), bool)
-        return every if self.closed or not self._near_start() else ~self._old()
 
     def _near_start(self) -> bool:
         return near_start(self.path, self.smoother.variables.poses[-1], self.settings.closing)
@@ -325,16 +322,14 @@ def detect_loop(
     hypotheses = [test.grow(int(i), int(j), gate) for i, j in seeds]
     best = max(hypotheses, key=lambda pairs: pairs.score(gate))
     others = [pairs.score(gate) for pairs in hypotheses if not pairs.overlaps(best)]
-    clear = best.score(gate) - max(others, default=0.0) >= MIN_LEAD * gate
-    return best if clear and _is_acceptable(smoother, best) else None
-
-
-def _is_acceptable(smoother: LandmarkSmoother, pairs: LoopPairs) -> bool:
-    """Return whether there are enough pairs of either label, which are compatible as a whole."""
-    settings, labels = smoother.map.settings.landmark, smoother.map.state.labels[pairs.recent]
+    if best.score(gate) - max(others, default=0.0) < MIN_LEAD * gate:
+        return None
+    labels = smoother.map.state.labels[best.recent]
     enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
-    joint = chi2_quantile(settings.create, POINT * len(labels)) if len(labels) else 0.0
-    return bool(enough and len(labels) >= MIN_PAIRS and pairs.distance < joint)
+    if not enough or len(labels) < MIN_PAIRS:
+        return None
+    joint = chi2_quantile(smoother.map.settings.landmark.create, POINT * len(labels))
+    return best if best.distance < joint else None
 
 
 def optimize_loop(smoother: LandmarkSmoother, pairs: LoopPairs) -> None:

@@ -198,7 +198,10 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     hairpin the curve may have two in the wrong order.
     """
     boundary, begin = state.boundaries[label], first_parameter(state, label)
-    rows = sharp(np.flatnonzero(detections.label == label), detections)
+    rows = np.flatnonzero(detections.label == label)
+    sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
+    if (sigma < SHARP).sum() >= SHARP_SHARE * len(rows):  # far detections are smeared
+        rows = rows[sigma < SHARP]
     points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     used = detections.used[rows] & (detections.boundary[rows] == label)
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
@@ -219,7 +222,8 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     others = clustered(beside & ~on_curve & ~near)
     cones = cones.merged(others.where(others.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
-        cones = along_drive(cones, last_lap(state, label), label)
+        pose_u = state.pose_u[label]
+        cones = along_drive(cones, state.poses[pose_u > pose_u[-1] - boundary.length], label)  # the last lap
     return without_folds(cones, boundary.periodic)
 
 
@@ -233,23 +237,10 @@ def covariances_map(detections: DetectionTable, rows: IntArray, poses: Array) ->
     return rotated(detections.covariance[rows], poses[detections.cycle[rows], 2])
 
 
-def sharp(rows: IntArray, detections: DetectionTable) -> IntArray:
-    """Return the rows whose detections say where a cone stands; those of far ones are smeared."""
-    sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
-    certain = rows[sigma < SHARP]
-    return certain if len(certain) >= SHARP_SHARE * len(rows) else rows
-
-
 def first_parameter(state: State, label: int) -> float:
     """Return the parameter of a curve from which those of its cones are counted."""
     boundary = state.boundaries[label]
     return float(state.pose_u[label][0]) if boundary.periodic else boundary.tables.low
-
-
-def last_lap(state: State, label: int) -> Array:
-    """Return the poses (l, 3) of the last lap around a closed curve, map frame."""
-    pose_u = state.pose_u[label]
-    return np.asarray(state.poses[pose_u > pose_u[-1] - state.boundaries[label].length])
 
 
 def along_drive(cones: Cones, lap: Array, label: int) -> Cones:

@@ -21,7 +21,7 @@ from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
@@ -196,14 +196,12 @@ def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Ro
     state, sigma = at.state, system.settings.batch.sigma_slide
     gauges = {label: curve_gauge(state, label, sigma, first_kept) for label in state.boundaries}
     groups = system.rows(at, gauges)
-    return [rows.where(_is_before(rows.keys, first_kept)) for rows in groups if len(rows)]
-
-
-def _is_before(keys: IntArray, cycle: int) -> BoolArray:
-    """Return whether each row's first pose is of an earlier cycle than this, or it has no pose."""
-    cycles = np.where(are_poses(keys), indices(keys), -1)
-    first = np.where(are_poses(keys), cycles, np.iinfo(np.intp).max).min(axis=1)
-    return np.asarray((first < cycle) | ~are_poses(keys).any(axis=1))
+    before = []
+    for rows in (rows for rows in groups if len(rows)):
+        poses = are_poses(rows.keys)
+        first = np.where(poses, indices(rows.keys), np.iinfo(np.intp).max).min(axis=1)
+        before.append(rows.where((first < first_kept) | ~poses.any(axis=1)))
+    return before
 
 
 # --- when a loop is tried, and believed ------------------------------------------------------------------
@@ -241,7 +239,12 @@ def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSetting
     """Return the evidence for or against an optimum whose curves are closed."""
     state = at.state
     coloured = np.isin(detections.label, list(state.boundaries))
-    again = _is_after_first_lap(state)[detections.cycle] & coloured
+    second = np.ones(
+        len(state.poses), bool
+    )  # poses beside a stretch of every boundary that was driven before
+    for label, boundary in state.boundaries.items():
+        second &= state.pose_u[label] - state.pose_u[label][0] >= boundary.length
+    again = second[detections.cycle] & coloured
     chosen = {label: again[projected.rows] for label, projected in at.projected.items()}
     feet = [p.foot.where(chosen[label]) for label, p in at.projected.items()]
     whitened = [p.whitened[chosen[label]] for label, p in at.projected.items()]
@@ -293,15 +296,6 @@ def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, set
     if found.used < settings.batch.closure.used:
         return f"only {found.used:.0%} of the detections lie on its boundaries".replace("%", " %")
     return ""
-
-
-def _is_after_first_lap(state: State) -> BoolArray:
-    """Return which poses (P,) are beside a stretch of every boundary that was driven a lap before."""
-    again = np.ones(len(state.poses), bool)
-    for label, boundary in state.boundaries.items():
-        u = state.pose_u[label]
-        again &= u - u[0] >= boundary.length
-    return again
 
 
 def _longest_gap(u: Array, length: float) -> float:

@@ -39,7 +39,6 @@ from pathspace_graph.lengths import POSE as POSE_LENGTHS
 from pathspace_graph.lengths import scaled
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import doubted, known_noise
-from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict
@@ -289,7 +288,11 @@ class BatchMapper:
             online = None
             at, convergence = find_optimum_from_odometry(optimizer)
         else:
-            state, online, system.revisits = self._start_online(log)
+            if self.online is None:
+                raise SettingsError("start online: expected an online mapper to begin with, found none")
+            mapper = self.online(replace(self.settings, scale=1.0), self.noise)
+            state, online = start_online(log, mapper)
+            system.revisits = mapper.revisits
             watch.lap("start")
             at, convergence = optimizer.find(state)
         at, convergence = _with_doubt(optimizer, at, convergence)
@@ -321,12 +324,6 @@ class BatchMapper:
             system=system,
             optimum=at,
         )
-
-    def _start_online(self, log: Log) -> tuple[State, RunResult, tuple[Revisit, ...]]:
-        if self.online is None:
-            raise SettingsError("start online: expected an online mapper to begin with, found none")
-        mapper = self.online(replace(self.settings, scale=1.0), self.noise)
-        return *start_online(log, mapper), mapper.revisits
 
 
 def find_optimum_from_odometry(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:

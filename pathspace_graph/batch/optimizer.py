@@ -45,17 +45,12 @@ SHARES: Final = (0.3, 0.97)
 """Shares of the step before between which a step is extended to the sum of those that would follow it."""
 
 
-REASONS: Final = {True: "nothing changes any more", False: "no round left"}
-"""Why an optimization ended, by whether it has converged."""
-
-
 @dataclass(frozen=True, eq=False)
 class Convergence:
     """End of an optimization."""
 
     converged: bool
     """Whether nothing changed any more."""
-    reason: str
     rounds: int
     """Times that foot points, gates and weights were refreshed."""
     steps: int
@@ -66,6 +61,11 @@ class Convergence:
     """Norm `sqrt(g' H^-1 g)` of the gradient g at the end, with H the information of all variables: the
     distance of the linear problem's optimum in joint sigmas. A slow common motion of the whole map counts as
     much in it as that of a control point."""
+
+    @property
+    def reason(self) -> str:
+        """Why the optimization ended."""
+        return "nothing changes any more" if self.converged else "no round left"
 
 
 @dataclass(frozen=True)
@@ -214,8 +214,8 @@ class Optimizer:
         return -0.5 * float(gradient(self.system.rows(at), layout) @ step)
 
     def _report(self, at: Evaluation, rounds: int, decrease: float, converged: bool) -> Convergence:
-        norm, reason = float(np.sqrt(2.0 * max(decrease, 0.0))), REASONS[converged]
-        return Convergence(converged, reason, rounds, self.steps, at.cost, norm)
+        norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
+        return Convergence(converged, rounds, self.steps, at.cost, norm)
 
     def _step(self, at: Evaluation) -> Evaluation:
         """Return the problem after the least damped step that makes the cost smaller, or the same one."""

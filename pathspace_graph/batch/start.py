@@ -299,18 +299,13 @@ def lap_correspondences(recurrence: Recurrence) -> LapCorrespondences:
     """Return the correspondences of the poses nearest to where each lap passes each reference pose."""
     count = max(int(np.ceil(recurrence.lap / REFERENCE_STEP)), 1)
     places = recurrence.driven / recurrence.lap * count
-    cycles = _nearest_cycles(places)
-    reference = np.mod(np.round(places[cycles]).astype(np.intp), count)
-    turns = recurrence.whole_turn * np.round((places[cycles] - reference) / count)
-    return LapCorrespondences(cycles, reference, turns)
-
-
-def _nearest_cycles(places: Array) -> IntArray:
-    """Return the cycle nearest to each whole number that the increasing places (P,) pass."""
     whole = np.arange(np.ceil(places[0]), np.floor(places[-1]) + 1.0)
     after = np.clip(np.searchsorted(places, whole), 1, len(places) - 1)
     nearer = np.abs(places[after - 1] - whole) < np.abs(places[after] - whole)
-    return np.unique(np.where(nearer, after - 1, after))
+    cycles = np.unique(np.where(nearer, after - 1, after))
+    reference = np.mod(np.round(places[cycles]).astype(np.intp), count)
+    turns = recurrence.whole_turn * np.round((places[cycles] - reference) / count)
+    return LapCorrespondences(cycles, reference, turns)
 
 
 def _begin_boundary(

@@ -289,7 +289,10 @@ class BatchSystem:
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
         odometry = self.chain.terms(state.poses, state.calibration)
-        cost = self._detections_cost(projected) + 0.5 * float((odometry[0] ** 2).sum())
+        used = sum(int(p.inside.sum()) for p in projected.values())
+        losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
+        cost = losses + self.kernel.ceiling * (len(self.detections) - used)
+        cost += 0.5 * float((odometry[0] ** 2).sum())
         cost += sum(
             self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
         )
@@ -313,11 +316,6 @@ class BatchSystem:
         rates = self._rates[rows]
         by = sensor_rows(foot.normal_unit, foot.distance, poses, measured, twists, sensor, rates)
         return Projected(rows, foot, projection, self._sigma[rows], self._inside[rows], by)
-
-    def _detections_cost(self, projected: dict[int, Projected]) -> float:
-        used = sum(int(p.inside.sum()) for p in projected.values())
-        losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
-        return losses + self.kernel.ceiling * (len(self.detections) - used)
 
     def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
         """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights."""

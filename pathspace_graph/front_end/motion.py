@@ -102,10 +102,9 @@ class MotionCheck:
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
     def believe(self, sigma: Array) -> None:
-        """Take other standard deviations (3,) of a twist (m/s, m/s, rad/s) from now on.
+        """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten.
 
-        The errors of the sensor are taken out of the detections from now on, so what was learned of them is
-        forgotten.
+        Its errors are taken out of the detections from now on.
         """
         self.sigma = self._rest.sigma = sigma
         self._recent, self.errors = RecentDetections(), SensorErrors(self.settings)
@@ -191,7 +190,8 @@ class MotionCheck:
         if near is not None and near.misfit > MAX_MISFIT * self._excess:
             near = None
         told = near is not None and near.matched >= MIN_DOUBTING
-        stuck = motion.stuck and not told and self._has_jumped(odometry, going_on, dt)
+        jumped = (np.abs(odometry.delta - going_on) > np.array(SIGMAS_CHANGE) * dt).any()
+        stuck = motion.stuck and not told and bool(jumped)  # no vehicle changes its velocity so
         failed = motion.missing or (stuck and self.settings.doubt < np.inf)
         if near is not None and not failed:
             difference = self._difference(odometry, predicted, near)
@@ -204,11 +204,9 @@ class MotionCheck:
             return motion
         best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
         denied = best is not None and self._denies(best, self._difference(odometry, predicted, best))
-        if failed or (
-            best is not None and denied and self._fits_better(best, predicted, detections, variances)
-        ):
-            return self._replaced(motion, best, going_on, dt)
-        return motion
+        if denied and not failed:
+            failed = best is not None and self._fits_better(best, predicted, detections, variances)
+        return self._replaced(motion, best, going_on, dt) if failed else motion
 
     def _fits_better(self, best: Match, predicted: Array, detections: Detections, variances: Array) -> bool:
         """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match.
@@ -241,10 +239,6 @@ class MotionCheck:
         off, covariance = difference.off, self.errors.covariance_of(difference)
         enough = matched.matched >= MIN_DOUBTING
         return enough and bool(off @ np.linalg.solve(covariance, off) > self._limit**2)
-
-    def _has_jumped(self, odometry: IntegratedOdometry, going_on: Array, dt: float) -> bool:
-        """Return whether a motion differs from going on (3,) as before by more than a vehicle can do."""
-        return bool((np.abs(odometry.delta - going_on) > np.array(SIGMAS_CHANGE) * dt).any())
 
     def _match(
         self, detections: Detections, variances: Array, start: Array, reaches: Sequence[float]
@@ -279,7 +273,7 @@ class MotionCheck:
             difference = self._difference(odometry, compose(self.pose, odometry.delta), best)
             near = DOUBT_RATE * np.sqrt(self.errors.covariance_of(difference)[2, 2])
             gyro_is_right = abs(difference.off[2]) <= near
-            if gyro_is_right and not motion.missing and not motion.stuck:
+            if gyro_is_right and not (motion.missing or motion.stuck):
                 mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
             turn = _to_vehicle(best.pose[2])
             information = turn @ best.information @ turn.T / (WIDENING**2 * self._excess)

@@ -103,7 +103,7 @@ class RecentDetections:
 
     def has(self, points: Array) -> BoolArray:
         """Return whether each point (m, 2) lies where an earlier detection does."""
-        return np.asarray(_means(points, self.points, REACH_LAST)[1] > MIN_WEIGHT)
+        return np.asarray(_weighted_means(points, self.points, REACH_LAST, FARTHEST)[1] > MIN_WEIGHT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,45 +173,37 @@ def _matched(
     precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + sigma_cone**2)
     square = (off * off).sum(axis=1)
     precision *= huber_weights(np.sqrt(square * precision), huber)
-    information, gradient = _normal_equations(off, arm, precision)
-    return information, gradient, matched, float(square @ precision)
-
-
-def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:
-    """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given."""
-    points = to_map(points_vehicle, pose[None])
-    means, weights = _means(points, recent.points, REACH_LAST)
-    matched = weights > MIN_WEIGHT
-    variance = variances * (1.0 + 1.0 / np.where(matched, weights, 1.0)) + SIGMA_CONE**2
-    square = np.where(matched, ((points - means) ** 2).sum(axis=1) / variance, MOST_MISFIT)
-    return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
-
-
-def _means(points: Array, recent: Array, reach: float) -> tuple[Array, Array]:
-    """Return the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights."""
-    return _weighted_means(points, recent, reach, FARTHEST)
-
-
-@compiled
-def _weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
-    """Return `_means`, with weights `exp(-d^2 / 2 reach^2)` below a distance of `farthest` reaches."""
-    dx = points[:, 0, None] - recent[:, 0]
-    dy = points[:, 1, None] - recent[:, 1]
-    square = (dx * dx + dy * dy) / reach**2
-    weights = np.where(square < farthest**2, np.exp(-0.5 * square), 0.0)
-    total = weights.sum(axis=1)
-    return (weights @ recent) / np.maximum(total, _TINY)[:, None], total
-
-
-def _normal_equations(off: Array, arm: Array, precision: Array) -> tuple[Array, Array]:
-    """Return the information (3, 3) and the gradient (3,) of offsets (m, 2) by (x, y, theta)."""
     ax, ay = arm.T
     ex, ey = off.T
     w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
     turning = precision @ (ax * ax + ay * ay)
     information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
     gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
-    return information, gradient
+    return information, gradient, matched, float(square @ precision)
+
+
+def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:
+    """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given."""
+    points = to_map(points_vehicle, pose[None])
+    means, weights = _weighted_means(points, recent.points, REACH_LAST, FARTHEST)
+    matched = weights > MIN_WEIGHT
+    variance = variances * (1.0 + 1.0 / np.where(matched, weights, 1.0)) + SIGMA_CONE**2
+    square = np.where(matched, ((points - means) ** 2).sum(axis=1) / variance, MOST_MISFIT)
+    return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
+
+
+@compiled
+def _weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
+    """Return the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights.
+
+    The weights are `exp(-d^2 / 2 reach^2)` below a distance of `farthest` reaches.
+    """
+    dx = points[:, 0, None] - recent[:, 0]
+    dy = points[:, 1, None] - recent[:, 1]
+    square = (dx * dx + dy * dy) / reach**2
+    weights = np.where(square < farthest**2, np.exp(-0.5 * square), 0.0)
+    total = weights.sum(axis=1)
+    return (weights @ recent) / np.maximum(total, _TINY)[:, None], total
 
 
 # --- errors of the sensor --------------------------------------------------------------------------------

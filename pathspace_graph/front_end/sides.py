@@ -245,7 +245,9 @@ class NearCones:
 
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:
         """Add detections at points (m, 2) with labels (m,), seen at t (s); return the cone (m,) of each."""
-        self._forget(t)
+        kept = newest_of(self._last, MAX_CONES) & (self._last > t - FORGET_AFTER)
+        for name, column in vars(self).items():
+            setattr(self, name, column[kept])
         cones, known = nearest_within(points, self.points, MERGE_RADIUS)
         new = int((~known).sum())
         cones[~known] = len(self.points) + np.arange(new)
@@ -257,8 +259,3 @@ class NearCones:
         np.add.at(self.points, cones, (points - self.points[cones]) / self.counts[cones, None])
         self._last[cones] = t
         return cones
-
-    def _forget(self, t: float) -> None:
-        kept = newest_of(self._last, MAX_CONES) & (self._last > t - FORGET_AFTER)
-        for name, column in vars(self).items():
-            setattr(self, name, column[kept])

@@ -141,15 +141,6 @@ class Follower:
             self._by_bias = self._by_bias + np.array([-moved[1] * middle, moved[0] * middle, -(t - self._t)])
         self._pose, self._t = pose.copy(), t
 
-    def _gates(self, ranges: Array) -> tuple[Array, Array]:
-        """Return how far along and across its ray a detection (m,) may be from its cone (m)."""
-        known = self._known
-        if known.along is None or known.across is None:
-            round_gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
-            return round_gate, round_gate
-        along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
-        return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
-
     def _nearest_cone(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array
     ) -> tuple[IntArray, Array]:
@@ -163,7 +154,13 @@ class Follower:
 
     def _square(self, points: Array, others: Array, ranges: Array, pose: Array) -> Array:
         """Return the square (m, n) of the distances of points (m, 2) from others (n, 2) in their gates."""
-        return _gated_squares(points, others, pose[:2], *self._gates(ranges))
+        known = self._known
+        if known.along is None or known.across is None:
+            along = across = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
+        else:
+            rays = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
+            along, across = (np.clip(gate, GATE_LEAST, GATE_MOST) for gate in rays)
+        return _gated_squares(points, others, pose[:2], along, across)
 
     def _assign(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float

@@ -256,12 +256,13 @@ def _settled(
     n = len(good) if good.all() else int(good.argmin())
     normal = both / np.sqrt(square)
     heading = np.arctan2(-normal[:, 0], normal[:, 1]) - pose[2]
+    half_turn = 0.5 * wrap_angle(np.diff(heading[:n], prepend=heading[:n][:1]))
     bend = 0.5 * _dot(normal, feet[0].normal) * (feet[0].offset_curvature + feet[1].offset_curvature)
     return TrackAhead(
         points=to_vehicle(points[:n], pose[None]),
         heading=wrap_angle(heading[:n]),
         curvature=bend[:n],
-        arc_length=_lengths(points[:n], heading[:n]),
+        arc_length=np.cumsum(_distances(points[:n]) / np.sinc(half_turn / np.pi)),  # along circular arcs
         width_left=feet[0].width(points, normal)[:n],
         width_right=feet[1].width(points, -normal)[:n],
         confirmed=(feet[0].confirmed & feet[1].confirmed)[:n],
@@ -339,9 +340,3 @@ def _distances(points: Array) -> Array:
     """Return the distance (n,) of each point from the one before, and 0 for the first."""
     edges = np.diff(points, axis=0, prepend=points[:1])
     return np.asarray(np.hypot(edges[:, 0], edges[:, 1]))
-
-
-def _lengths(points: Array, heading: Array) -> Array:
-    """Return the arc length (n,) at points (n, 2), which are joined by circular arcs."""
-    half = 0.5 * wrap_angle(np.diff(heading, prepend=heading[:1]))
-    return np.asarray(np.cumsum(_distances(points) / np.sinc(half / np.pi)))

@@ -235,27 +235,27 @@ def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPAC
     )
     values = np.column_stack([0.5 * (a + b), 0.5 * np.hypot(*(a - b).T)])
     lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(values[:, :2], axis=0).T)))
-    blank = _blank(lengths[-1], closed, spacing)
+    intervals = max(round(lengths[-1] / spacing), _FEWEST)
+    if closed:
+        breaks = np.linspace(0.0, lengths[-1], intervals + 1)
+        blank = Ribbon.periodic_from(breaks, np.zeros((intervals, RIBBON)))
+    else:
+        blank = Ribbon.open_uniform(np.zeros((intervals + 3, RIBBON)), interval=lengths[-1] / intervals)
     count = max(int(np.ceil(lengths[-1] / SAMPLE_STEP)), RIBBON * (len(blank.breaks) - 1))
     u = np.linspace(0.0, lengths[-1], count + 1)[: count if closed else None]
     middles = np.column_stack([np.interp(u, lengths, column) for column in values.T])
     beside = np.interp(u, lengths, paired[0]), np.interp(u, lengths, paired[1])
     fit = _Fit(blank, u)
     line = CentreCurve(blank.with_points(fit.solve(middles)), u, sides, beside)
-    for _ in range(_ROUNDS):
-        line = _centred(line, fit, middles)
+    for _ in range(_ROUNDS):  # to the middle between the crossings of its normals, where these cross both
+        one, other = line.crossings(u)
+        good = one.good & other.good
+        middle = 0.5 * (one.offset + other.offset)[:, None] * one.normal + line.ribbon.centre.evaluate(u)
+        half = 0.5 * (one.offset - other.offset)
+        values = np.where(good[:, None], np.column_stack([middle, half]), middles)
+        beside = np.where(good, one.u, line.beside[0]), np.where(good, other.u, line.beside[1])
+        line = CentreCurve(blank.with_points(fit.solve(values)), u, sides, beside)
     return line
-
-
-def _centred(line: CentreCurve, fit: _Fit, middles: Array) -> CentreCurve:
-    """Return the line moved to the middle between the crossings of its normals, where these cross both."""
-    left, right = line.crossings(line.u)
-    good = left.good & right.good
-    middle = 0.5 * (left.offset + right.offset)[:, None] * left.normal + line.ribbon.centre.evaluate(line.u)
-    half = 0.5 * (left.offset - right.offset)
-    values = np.where(good[:, None], np.column_stack([middle, half]), middles)
-    beside = tuple(np.where(good, one.u, old) for one, old in zip((left, right), line.beside, strict=True))
-    return CentreCurve(line.ribbon.with_points(fit.solve(values)), line.u, line.sides, (beside[0], beside[1]))
 
 
 def _crossing(ribbon: Ribbon, at: Array, spline: BSpline, u: Array, side: float) -> Crossing:
@@ -276,17 +276,6 @@ def _crossing(ribbon: Ribbon, at: Array, spline: BSpline, u: Array, side: float)
     return Crossing(
         spline, np.where(good, u, begin), normal, np.where(good, across, side * ribbon.half_width(at)), good
     )
-
-
-# --- the fit ---------------------------------------------------------------------------------------------
-
-
-def _blank(length: float, closed: bool, spacing: float) -> Ribbon:
-    """Return a ribbon from 0 to a length (m), with evenly spaced knots and all control points at zero."""
-    count = max(round(length / spacing), _FEWEST)
-    if closed:
-        return Ribbon.periodic_from(np.linspace(0.0, length, count + 1), np.zeros((count, RIBBON)))
-    return Ribbon.open_uniform(np.zeros((count + 3, RIBBON)), interval=length / count)
 
 
 class _Fit:

@@ -9,7 +9,7 @@ import scipy.linalg
 from scipy.linalg import cho_factor, cho_solve
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.settings.batch import BreakSettings, FitSettings
 from pathspace_graph.spline.bspline import BSpline
@@ -103,7 +103,12 @@ def refit(
     inside = (u >= within[0]) & (u <= within[1])
     w = u if u_map is None else u_map(u)
     B_old, B_new = old.basis_matrix(u), new.basis_matrix(w)
-    bridge = _BRIDGE * _bending_rows(new)[np.repeat(_sparse_spans(new, w[inside]), _BENDING_PER_SPAN)]
+    within_new = w[inside]
+    if new.periodic:
+        begin, end = new.domain
+        within_new = begin + np.mod(within_new - begin, end - begin)
+    sparse = np.histogram(within_new, new.breaks)[0] <= new.degree  # fewer samples than control points
+    bridge = _BRIDGE * _bending_rows(new)[np.repeat(sparse, _BENDING_PER_SPAN)]
     stacked = np.concatenate([B_new[inside], bridge])
     target = np.concatenate([B_old[inside], np.zeros((len(bridge), old.size))])
     return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
@@ -124,13 +129,6 @@ def _refit_samples(old: BSpline, new: BSpline) -> Array:
     parts = _SAMPLES_PER_SPAN * min(max(1, finer), _SAMPLES_PER_SPAN)
     offsets = (np.arange(parts) + 0.5) / parts
     return (old.breaks[:-1, None] + widths[:, None] * offsets).ravel()
-
-
-def _sparse_spans(spline: BSpline, u: Array) -> BoolArray:
-    """Return (spans,) whether a span has fewer samples than control points."""
-    low, high = spline.domain
-    inside = low + np.mod(u - low, high - low) if spline.periodic else u
-    return np.histogram(inside, spline.breaks)[0] <= spline.degree
 
 
 def _bending_rows(spline: BSpline) -> Array:
@@ -279,7 +277,9 @@ def thin(
     while periodic and len(breaks) <= fit.degree + 1:
         breaks = np.sort(np.append(breaks, 0.5 * (breaks[1:] + breaks[:-1])))
     frame = _frame(breaks, periodic, fit.degree)
-    B, bending, jumps = frame.basis_matrix(u), energy_rows(frame), _jumps(frame)
+    B, bending = frame.basis_matrix(u), energy_rows(frame)
+    highest = frame.basis_matrix(0.5 * (frame.breaks[1:] + frame.breaks[:-1]), frame.degree)
+    jumps = np.diff(highest, axis=0)  # of the highest derivative at each inner break, by control point
     factor = cho_factor(B.T @ B + fit.smoothness * bending.T @ bending)
     watched, n, remaining = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
     spread, values = watched @ cho_solve(factor, jumps.T), watched @ cho_solve(factor, B.T @ points)
@@ -308,10 +308,3 @@ def _frame(breaks: Array, periodic: bool, degree: int) -> BSpline:
     count = len(breaks) - 1
     build = BSpline.periodic_from if periodic else BSpline.clamped_from
     return build(breaks, np.zeros((count if periodic else count + degree, 2)), degree)
-
-
-def _jumps(frame: BSpline) -> Array:
-    """Return (b - 1, m) the jump of the highest derivative at each inner break, by control point."""
-    breaks = frame.breaks
-    highest = frame.basis_matrix(0.5 * (breaks[1:] + breaks[:-1]), frame.degree)
-    return np.asarray(np.diff(highest, axis=0))
