@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.batch.association import headings
 from pathspace_graph.batch.mapper import (
     BatchMapper,
     BatchResult,
@@ -17,7 +18,7 @@ from pathspace_graph.batch.mapper import (
     factor_beside,
 )
 from pathspace_graph.batch.start import CurveMapper
-from pathspace_graph.batch.system import CurveGauge, headings
+from pathspace_graph.batch.system import CurveGauge
 from pathspace_graph.errors import SettingsError, solving
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.gtsam_factors import pose_array, ribbon_factor

@@ -21,7 +21,7 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import judge_log
-from pathspace_graph.front_end.log_odometry import LogOdometry, half_square, sensor_prior
+from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph, owners
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import POINT, POSE, indices, pose_keys
@@ -142,18 +142,14 @@ class LandmarkSystem:
 
     def cost(self, state: LandmarkState) -> float:
         """Return half the sum of squares at a state, with Huber's loss of the detections."""
-        poses, calibration = state.variables.poses, state.variables.calibration
-        residual, _ = self.chain.terms(poses, calibration)
         losses = huber_loss(self._detection_rows(state, np.inf).residual, self.settings.gate.huber)
-        cost = 0.5 * (residual**2).sum() + losses.sum() + self.chain.prior_cost(poses[0], calibration)
-        return float(cost) + half_square(sensor_prior(state.variables, self.settings.calibration))
+        drive = self.chain.rows_at(state.variables, self.settings.calibration)
+        return half_square(drive) + float(losses.sum())
 
     def rows(self, state: LandmarkState) -> list[Rows]:
         """Return the Gauss-Newton rows at a state, where each row of a detection has its Huber weight."""
-        poses, calibration = state.variables.poses, state.variables.calibration
-        rows = self.chain.rows(self.chain.terms(poses, calibration), poses[0], calibration)
-        rows += sensor_prior(state.variables, self.settings.calibration)
-        return [*rows, self._detection_rows(state, self.settings.gate.huber)]
+        drive = self.chain.rows_at(state.variables, self.settings.calibration)
+        return [*drive, self._detection_rows(state, self.settings.gate.huber)]
 
     def eliminated(self, state: LandmarkState) -> Elimination:
         """Return the linear problem at a state, with the poses eliminated."""

@@ -60,7 +60,7 @@ def locate_poses(state: State, settings: AssociationSettings) -> None:
     pose is put.
     """
     poses = state.poses
-    heading = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    heading = headings(poses)
     for label, boundary in state.boundaries.items():
         count = int(np.ceil(boundary.length / settings.step))
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
@@ -89,6 +89,11 @@ def _along(square: Array, steps: Array) -> IntArray:
         low = max(samples[k] - reach[k - 1], 0)
         samples[k - 1] = low + total[k - 1, low : samples[k] + reach[k - 1] + 1].argmin()
     return samples
+
+
+def headings(poses: Array) -> Array:
+    """Return the unit vectors (m, 2) of the headings of poses (m, 3)."""
+    return np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
 
 def path_lengths(poses: Array) -> Array:

@@ -37,9 +37,9 @@ from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive
 from .optimizer import LOOSE_GATE, Convergence, Effort, Optimizer
-from .simplification import associate_again, boundary_of, scatter_of_cones, simplified
+from .simplification import associate_again, boundary_of, own_settings, scatter_of_cones, simplified
 from .start import Recurrence, start_odometry
-from .system import BatchSystem, Biweight, Evaluation, curve_gauge, own_settings
+from .system import BatchSystem, Biweight, Evaluation, curve_gauge
 
 USED_AGAIN: Final = 0.85
 """Least share of the detections after the first lap on a closed result, over that of the first lap."""

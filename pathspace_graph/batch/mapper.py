@@ -49,9 +49,9 @@ from pathspace_graph.spline.boundary import Boundary
 
 from .lap import evidence, is_true_closure
 from .optimizer import LOOSE_GATE, Convergence, Optimizer
-from .simplification import Scatter, map_block, scatter_of_cones, simplify
+from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplify
 from .start import CurveMapper, find_recurrence, start_odometry, start_online
-from .system import BatchSystem, Biweight, CurveGauge, Evaluation, own_settings
+from .system import BatchSystem, Biweight, CurveGauge, Evaluation
 
 ROOM: Final = 4.0
 """Distance from its foot points in which a factor searches them (m along the curve)."""

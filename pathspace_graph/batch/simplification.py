@@ -50,9 +50,10 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
             continue
         if dense:
             beyond = 0.0 if boundary.periodic else settings.growth.merge_radius
-            spline = dense_fit_through(extended(points, beyond), boundary.periodic, settings)
+            points, share_of = extended(points, beyond), (settings.batch.dense_share, 1.0)
         else:
-            spline = fit_through(points, boundary.periodic, settings, share)
+            share_of = share, MIN_SIZE_SHARE
+        spline = fit_through(points, boundary.periodic, settings, *share_of)
         state.replace_boundary(label, *boundary_of(spline, settings))
     return state
 
@@ -63,25 +64,20 @@ def size_share(cones: Mapping[int, int], batch: BatchSettings) -> float:
     return batch.size_share if batch.size is None or total == 0 else batch.size / total
 
 
-def fit_through(points: Array, periodic: bool, settings: MapperSettings, share: float) -> BSpline:
-    """Return a curve through ordered cones (k, 2), which has at most `share` control points for each."""
-    least_size = settings.spline.min_size
-    most = max(least_size, int(share * len(points)))
-    return _fit(points, periodic, settings, max(least_size, int(MIN_SIZE_SHARE * most)), most)
+def fit_through(
+    points: Array, periodic: bool, settings: MapperSettings, share: float, least_share: float = MIN_SIZE_SHARE
+) -> BSpline:
+    """Return the best curve through ordered cones (k, 2), with at most `share` control points for each.
 
-
-def dense_fit_through(points: Array, periodic: bool, settings: MapperSettings) -> BSpline:
-    """Return a curve through cones (k, 2) on nearly a knot for each."""
-    size = max(settings.spline.min_size, int(settings.batch.dense_share * len(points)))
-    return _fit(points, periodic, settings, size, size)
-
-
-def _fit(points: Array, periodic: bool, settings: MapperSettings, least: int, most: int) -> BSpline:
-    """Return the curve of `least` to `most` control points that fits best."""
+    It has at least `least_share` of these. A closed one begins at the cone nearest to the start, so that
+    similar cones give similar knots.
+    """
+    smallest = settings.spline.min_size
+    most = max(smallest, int(share * len(points)))
     if periodic:
         points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
     fit = FitSettings(degree=settings.spline.degree)
-    chosen = chosen_breaks(points, periodic, fit, least, most)
+    chosen = chosen_breaks(points, periodic, fit, max(smallest, int(least_share * most)), most)
     return fit_spline(points, chosen.size, periodic, fit, chosen.breaks)
 
 
@@ -110,6 +106,16 @@ def boundary_of(spline: BSpline, settings: MapperSettings) -> tuple[Boundary, Ar
 def exact_settings(spline: SplineSettings) -> SplineSettings:
     """Return a curve's settings with foot points that are more exact than online: an optimum needs it."""
     return replace(spline, refine_iterations=2, refine_room=8.0, search_iterations=4)
+
+
+def own_settings(settings: MapperSettings) -> MapperSettings:
+    """Return the settings with the batch's own values in the groups that it shares with online mapping."""
+    batch = settings.batch
+    return replace(
+        settings,
+        spline=replace(settings.spline, sigma_model=batch.sigma_model),
+        gauge=replace(settings.gauge, sigma_smoothness=batch.sigma_smoothness),
+    )
 
 
 # --- simplification --------------------------------------------------------------------------------------

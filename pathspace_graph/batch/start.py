@@ -256,7 +256,7 @@ def align_laps(chain: LogOdometry, recurrence: Recurrence) -> tuple[Array, Array
     count = len(chain)
     for _ in range(ALIGN_STEPS):
         poses, calibration = variables.poses[:count], variables.calibration
-        rows = chain.rows(chain.terms(poses, calibration), poses[0], calibration)
+        rows = chain.rows(poses, calibration)
         rows.append(correspondences.rows(poses, variables.poses[count:]))
         step = Elimination(linear_graph(rows, variables), variables.layout).step(np.zeros(CALIBRATION_SIZE))
         variables.values = variables.values + step

@@ -1,7 +1,7 @@
 """The least-squares problem of a whole log: its cost at a state, and its linear factors there."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import gtsam
@@ -12,7 +12,7 @@ from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import ProjectionRows, project, smoothness_matrix
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
-from pathspace_graph.front_end.log_odometry import LogOdometry, half_square, sensor_prior
+from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import POINT, POSE, SENSOR_KEY, Layout, are_poses, indices, pose_keys
@@ -20,6 +20,8 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
+
+from .association import headings
 
 POINTS_A_FACTOR: Final = 8
 """Neighbouring control points in one factor of their anchors. One factor for all of them would join the whole
@@ -161,10 +163,6 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
     )
 
 
-def headings(poses: Array) -> Array:
-    return np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
-
-
 def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
     """Return (m,) the pose nearest to where each control point acts, of those with the curve's direction.
 
@@ -182,16 +180,6 @@ def _nearest_poses(state: State, label: int, until: int | None, room: float) -> 
         away = np.abs(u[:, None] - state.pose_u[label][:until])
         square[away > away.min(axis=1, keepdims=True) + room] = np.inf
     return np.asarray(square.argmin(axis=1))
-
-
-def own_settings(settings: MapperSettings) -> MapperSettings:
-    """Return the settings with the batch's own values in the groups that it shares with online mapping."""
-    batch = settings.batch
-    return replace(
-        settings,
-        spline=replace(settings.spline, sigma_model=batch.sigma_model),
-        gauge=replace(settings.gauge, sigma_smoothness=batch.sigma_smoothness),
-    )
 
 
 @dataclass(frozen=True)
@@ -215,7 +203,7 @@ class Biweight:
     @property
     def ceiling(self) -> float:
         """Return the loss of a detection that isn't used, which is that at the gate."""
-        return float(self.loss(np.array([self.gate]))[0])
+        return self.gate**2 / 6.0
 
     def _inner(self, whitened: Array) -> Array:
         return np.maximum(1.0 - (whitened / self.gate) ** 2, 0.0)
@@ -253,8 +241,8 @@ class Evaluation:
     state: State
     projected: dict[int, Projected]
     """Used detections of each boundary."""
-    odometry: tuple[Array, Array]
-    """Residuals and derivatives of `LogOdometry.terms`."""
+    drive: list[Rows]
+    """Rows of odometry, priors and revisits."""
     cost: float
     """Half the sum of squares, with the robust losses of the detections."""
 
@@ -288,18 +276,15 @@ class BatchSystem:
         direction of the curve.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
-        odometry = self.chain.terms(state.poses, state.calibration)
+        drive = self.chain.rows_at(state.variables, self.settings.calibration)
+        drive += [one.rows(state.poses) for one in self.revisits]
         used = sum(int(p.inside.sum()) for p in projected.values())
         losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
-        cost = losses + self.kernel.ceiling * (len(self.detections) - used)
-        cost += 0.5 * float((odometry[0] ** 2).sum())
+        cost = losses + self.kernel.ceiling * (len(self.detections) - used) + half_square(drive)
         cost += sum(
             self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
         )
-        cost += self.chain.prior_cost(state.poses[0], state.calibration)
-        cost += half_square(sensor_prior(state.variables, self.settings.calibration))
-        cost += sum(0.5 * float((one.residual(state.poses) ** 2).sum()) for one in self.revisits)
-        return Evaluation(state, projected, odometry, cost)
+        return Evaluation(state, projected, drive, cost)
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
         detections, sensor = self.detections, state.variables.sensor
@@ -320,9 +305,7 @@ class BatchSystem:
     def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
         """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights."""
         state = at.state
-        groups = self.chain.rows(at.odometry, state.poses[0], state.calibration)
-        groups += sensor_prior(state.variables, self.settings.calibration)
-        groups += [one.rows(state.poses) for one in self.revisits]
+        groups = [*at.drive]
         for label, gauge in (gauges or self.gauges).items():
             points = state.control_points(label)
             groups += [

@@ -51,16 +51,18 @@ class LogOdometry:
         """Return whitened residuals (P - 1, 3), derivatives (P - 1, 3, 8) by [calibration | pose | next]."""
         return self.odometry.terms(slice(None), poses, calibration)
 
-    def prior_cost(self, first: Array, calibration: Array) -> float:
-        """Return the cost of the priors on the first pose (3,) and on the calibration (2,)."""
-        return half_square(self._priors(first, calibration))
-
-    def rows(self, terms: tuple[Array, Array], first: Array, calibration: Array) -> list[Rows]:
-        """Return the rows of `terms`, and of both priors at a first pose (3,) and a calibration (2,)."""
+    def rows(self, poses: Array, calibration: Array) -> list[Rows]:
+        """Return the rows of `terms` and `priors` at poses (P, 3) and a calibration (2,)."""
         start = np.arange(len(self.odometry))
-        return [odometry_rows(start, terms, owners(start)), *self._priors(first, calibration)]
+        odometry = odometry_rows(start, self.terms(poses, calibration), owners(start))
+        return [odometry, *self.priors(poses[0], calibration)]
 
-    def _priors(self, first: Array, calibration: Array) -> list[Rows]:
+    def rows_at(self, variables: Variables, settings: CalibrationSettings) -> list[Rows]:
+        """Return all rows at the values of variables, with the prior of the sensor's calibration."""
+        return self.rows(variables.poses, variables.calibration) + sensor_prior(variables, settings)
+
+    def priors(self, first: Array, calibration: Array) -> list[Rows]:
+        """Return the rows of the priors at a first pose (3,) and a calibration (2,)."""
         root = np.asarray(np.linalg.cholesky(self.first_information).T, np.float64)
         weights = np.diag(1.0 / self.calibration_sigma)
         priors = [

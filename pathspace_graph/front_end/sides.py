@@ -6,8 +6,6 @@ no colour, two rows of cones are followed from beside the vehicle ahead, each co
 better. What is in neither of them stays unknown.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
@@ -159,7 +157,7 @@ class SideJudge:
 
     def _beginning(
         self, label: int, pose: Array, path: PathAhead, seen: IntArray, stations: Array, lateral: Array
-    ) -> Row:
+    ) -> "Row":
         """Return the row of a boundary beside the vehicle, where the path tells the side of each cone."""
         side = SIDES[label] * lateral
         beside = (side > MIN_LATERAL) & (side < MAX_LATERAL)
@@ -251,7 +249,7 @@ class NearCones:
         cones, known = nearest_within(points, self.points, MERGE_RADIUS)
         new = int((~known).sum())
         cones[~known] = len(self.points) + np.arange(new)
-        for name, column in vars(self).items():
+        for name, column in vars(self).items() if new else ():
             setattr(self, name, np.concatenate([column, np.zeros((new, *column.shape[1:]), column.dtype)]))
         coloured = labels != UNKNOWN
         np.add.at(self.votes, (cones[coloured], labels[coloured]), 1)

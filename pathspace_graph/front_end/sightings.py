@@ -1,7 +1,5 @@
 """Sightings of cones, followed by dead reckoning, and the twists of a drive: what noise is measured from."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
@@ -53,18 +51,18 @@ class Sightings:
     """(n, 3) Derivative of that pose by the bias of the yaw rate."""
 
     @classmethod
-    def none(cls) -> Sightings:
+    def none(cls) -> "Sightings":
         empty = np.zeros(0)
         return cls(
             empty.astype(np.intp), empty, empty.reshape(0, 2), *(empty.reshape(0, 3) for _ in range(3))
         )
 
-    def where(self, rows: IntArray | BoolArray | slice) -> Sightings:
+    def where(self, rows: IntArray | BoolArray | slice) -> "Sightings":
         """Return some of the rows."""
         return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     @classmethod
-    def stacked(cls, tables: list[Sightings]) -> Sightings:
+    def stacked(cls, tables: "list[Sightings]") -> "Sightings":
         """Return the rows of several tables, one after the other."""
         return cls(*(np.concatenate([getattr(one, column.name) for one in tables]) for column in fields(cls)))
 

@@ -21,18 +21,13 @@ from .planning import LEAST_STEP, MOST_POINTS
 
 _SAMPLE_STEP: Final = 0.5
 """Approximate distance of boundary samples (m). The circle at a sample is right to a millimetre."""
-_ACROSS: Final = 2
-"""Stride of the samples among which the points across are searched."""
-_BEHIND: Final = 3.0
-"""Distance behind the vehicle at which the samples begin (m), since it may stand askew."""
-_OUTER: Final = 1.8
-"""Largest ratio of the length of a turn's outer boundary to that of the centre line."""
-_SETTLING_STEPS: Final = 8
-"""Largest number of Newton steps that settle the stations; mostly two are enough."""
+_ACROSS: Final = 2  # stride of the samples among which the points across are searched
+_BEHIND: Final = 3.0  # distance behind the vehicle at which the samples begin (m), since it may stand askew
+_OUTER: Final = 1.8  # largest ratio of the length of a turn's outer boundary to that of the centre line
+_SETTLING_STEPS: Final = 8  # largest number of Newton steps that settle the stations; mostly two are enough
 _SETTLED: Final = 1e-3
 """Largest difference of a point's distances from both boundaries where it is on the line (m)."""
-_LARGEST_GAP: Final = 2.0
-"""Largest number of steps between neighbours."""
+_LARGEST_GAP: Final = 2.0  # largest number of steps between neighbours
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,5 @@
 """A boundary as the mappers hold it: an open spline that grows, periodic after closing; and crossings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -198,7 +196,7 @@ class Boundary:
         values, span = self.tables.evaluate(np.asarray(u, float), derivative)
         return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
-    def closed(self, knots: Array) -> Boundary:
+    def closed(self, knots: Array) -> "Boundary":
         """Return the boundary on periodic knots: all of it is confirmed, and its keys are new."""
         boundary = Boundary(knots, True, self.settings, self.gauge, self.first + self.size)
         boundary.confirmed_end = boundary.tables.high

@@ -1,7 +1,5 @@
 """Plane B-spline curves: evaluation, arc length, exact changes of the ends, and covariance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Final, Literal, Self
@@ -23,11 +21,9 @@ from pathspace_graph.factors.se2 import left_of
 
 _PERIODIC_TOLERANCE: Final = 1e-9
 """Largest difference of repeated values of a periodic spline, over (1 + largest value)."""
-_GRID_PER_SPAN: Final = 8
-"""Grid points on each span of a foot-point search over the whole curve."""
+_GRID_PER_SPAN: Final = 8  # grid points on each span of a foot-point search over the whole curve
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
-_ARC_NEWTON_STEPS: Final = 4
-"""Newton steps that invert the arc length, from a table with the same grid."""
+_ARC_NEWTON_STEPS: Final = 4  # Newton steps that invert the arc length, from a table with the same grid
 _SHORTEST_EXTENSION: Final = 1e-3
 """Least knot interval of an extension over the mean one, even if the point is the old end."""
 
@@ -106,7 +102,7 @@ class BSpline:
         return cls(uniform_knots(len(control_points), degree, interval, start), control_points, degree)
 
     @classmethod
-    def clamped_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> BSpline:
+    def clamped_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> "BSpline":
         """Return a clamped curve on breaks (k + 1,) with k + p control points."""
         return cls(clamped_knots(breaks, degree), control_points, degree)
 
@@ -120,6 +116,15 @@ class BSpline:
             )
         unwrapped = np.concatenate([control_points, control_points[:degree]])
         return cls(periodic_knots(breaks, degree), unwrapped, degree, periodic=True)
+
+    @classmethod
+    def even(cls, low: float, high: float, intervals: int, periodic: bool, degree: int = 3) -> Self:
+        """Return a curve of zeros on equally spaced knots; the ends of an open one float."""
+        if periodic:
+            breaks = np.linspace(low, high, intervals + 1)
+            return cls.periodic_from(breaks, np.zeros((intervals, cls.DIMENSION)), degree)
+        zeros = np.zeros((intervals + degree, cls.DIMENSION))
+        return cls.open_uniform(zeros, degree, (high - low) / intervals, low)
 
     @property
     def domain(self) -> tuple[float, float]:
@@ -229,13 +234,13 @@ class BSpline:
         speed = np.linalg.norm(self.evaluate(nodes.ravel(), 1), axis=1).reshape(nodes.shape)
         return np.asarray(half * (speed @ _GAUSS_WEIGHTS))
 
-    def with_end_knots(self, knots: Array) -> BSpline:
+    def with_end_knots(self, knots: Array) -> "BSpline":
         """Return the same curve on knots that differ only outside the domain; the change is exact."""
         self._refuse_periodic("change the ends of")
         matrix = end_change_matrix(self.knots, self.degree, knots)
         return BSpline(knots, matrix @ self.control_points, self.degree)
 
-    def clamp(self, start: bool = True, end: bool = True) -> BSpline:
+    def clamp(self, start: bool = True, end: bool = True) -> "BSpline":
         """Return the same curve with (p + 1)-fold knots at the chosen ends, which become control points."""
         knots, p = self.knots.copy(), self.degree
         if start:
@@ -244,7 +249,7 @@ class BSpline:
             knots[-p:] = knots[-p - 1]
         return self.with_end_knots(knots)
 
-    def unclamp(self, start: bool = True, end: bool = True) -> BSpline:
+    def unclamp(self, start: bool = True, end: bool = True) -> "BSpline":
         """Return the same curve with floating ends: p knots repeat the chosen end's interval outward."""
         knots, p = self.knots.copy(), self.degree
         outward = np.arange(1, p + 1)
@@ -265,7 +270,7 @@ class BSpline:
         kept = self.knots[: len(self.control_points) + 1]
         return np.concatenate([kept, np.full(self.degree + 1, new_end)])
 
-    def extend_to(self, point: Array) -> BSpline:
+    def extend_to(self, point: Array) -> "BSpline":
         """Return the curve extended to a point (2,), unchanged on its old domain and clamped at the point.
 
         The old end is unclamped, and the point becomes the last control point (Hu et al. 2002).
@@ -275,7 +280,7 @@ class BSpline:
         kept = end_change_matrix(self.knots, self.degree, knots) @ self.control_points
         return BSpline(knots, np.concatenate([kept, np.reshape(point, (1, 2))]), self.degree)
 
-    def grow(self, control_points: Array, interval: float | None = None) -> BSpline:
+    def grow(self, control_points: Array, interval: float | None = None) -> "BSpline":
         """Return the curve with control points (k, 2) appended at its floating end.
 
         No basis function and no other control point changes. Each new point appends a knot, `interval` after
@@ -290,7 +295,7 @@ class BSpline:
         knots = np.concatenate([self.knots, added])
         return BSpline(knots, np.concatenate([self.control_points, control_points]), self.degree)
 
-    def reversed(self) -> BSpline:
+    def reversed(self) -> "BSpline":
         """Return the same curve in the opposite direction: S(-u) on [-high, -low]."""
         return BSpline(-self.knots[::-1], self.control_points[::-1], self.degree, self.periodic)
 

@@ -3,8 +3,6 @@
 It is kept as a ribbon, one B-spline of the centre line and half the width.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -81,13 +79,7 @@ class Ribbon(BSpline):
     def edge_spline(self, label: int) -> tuple[BSpline, Array]:
         """Return an edge as a B-spline of m' control points, and their derivatives (2m', 3m)."""
         low, high = self.domain
-        count = _EDGE_BREAKS * len(self.tables.starts)
-        if self.periodic:
-            blank = BSpline.periodic_from(np.linspace(low, high, count + 1), np.zeros((count, 2)))
-        else:
-            blank = BSpline.open_uniform(
-                np.zeros((count + self.degree, 2)), self.degree, (high - low) / count, low
-            )
+        blank = BSpline.even(low, high, _EDGE_BREAKS * len(self.tables.starts), self.periodic, self.degree)
         steps = int(np.ceil((high - low) / SAMPLE_STEP))
         u = np.linspace(low, high, steps + 1)[: steps if self.periodic else None]
         points, jacobian = self.edge(u, SIDE[label])
@@ -102,22 +94,16 @@ SPACING: Final = 3.0
 """Distance of the knots of a planner's line (m); shorter kinks of the boundaries are smoothed."""
 MOST_SAMPLES: Final = 200_000
 """Largest number of samples of a boundary, which bounds the memory."""
-_FEWEST: Final = 4
-"""Smallest number of samples of a boundary and of knot intervals of a line."""
-_STARTS: Final = 200
-"""Number of samples of the left boundary among which the march begins."""
-_NEAR: Final = 12
-"""Distance in samples from a pair within which segments are tested for a crossing."""
+_FEWEST: Final = 4  # smallest number of samples of a boundary and of knot intervals of a line
+_STARTS: Final = 200  # number of samples of the left boundary among which the march begins
+_NEAR: Final = 12  # distance in samples from a pair within which segments are tested for a crossing
 _ROUNDS: Final = 3
 """Number of times that the line is moved to the middle between the crossings of its normals."""
 _SMOOTHNESS: Final = 1e-3
 """Weight of second differences in the fit, which decides only what the samples leave open."""
-_CROSSING_STEPS: Final = 8
-"""Number of Newton steps to the crossing of a normal and a boundary."""
-_CROSSED: Final = 1e-6
-"""Distance of the point found from a boundary below which a normal crosses it (m)."""
-_LEAST_COSINE: Final = 0.1
-"""Least cosine of the angle between boundary and line at a crossing."""
+_CROSSING_STEPS: Final = 8  # number of Newton steps to the crossing of a normal and a boundary
+_CROSSED: Final = 1e-6  # distance of the point found from a boundary below which a normal crosses it (m)
+_LEAST_COSINE: Final = 0.1  # least cosine of the angle between boundary and line at a crossing
 _FARTHEST: Final = 1.5
 """Distance of a crossing, over that of the paired sample, beyond which it belongs to another stretch."""
 
@@ -155,7 +141,7 @@ class CentreCurve:
             u = table[0, 0] + np.mod(u - table[0, 0], high - low)
         return np.interp(u, table[:, 0], table[:, 1])
 
-    def crossings(self, u: Array) -> list[Crossing]:
+    def crossings(self, u: Array) -> "list[Crossing]":
         """Return where the normals at parameters u (k,) of the line cross the left and the right boundary."""
         found = []
         for side, spline in enumerate(self.sides):
@@ -230,17 +216,12 @@ def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPAC
     i, j = _paired(sides, samples, points, closed)
     _check_apart(points[0], points[1], i, j, closed)
     a, b = points[0][i % len(points[0])], points[1][j % len(points[1])]
-    paired = tuple(
-        _unwrapped(u, k, spline, closed) for u, k, spline in zip(samples, (i, j), sides, strict=True)
-    )
+    paired = []
+    for u, k, (low, high) in zip(samples, (i, j), (left.domain, right.domain), strict=True):
+        paired.append(u[k % len(u)] + (high - low) * (k // len(u)))  # indices go on past the end of a loop
     values = np.column_stack([0.5 * (a + b), 0.5 * np.hypot(*(a - b).T)])
     lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(values[:, :2], axis=0).T)))
-    intervals = max(round(lengths[-1] / spacing), _FEWEST)
-    if closed:
-        breaks = np.linspace(0.0, lengths[-1], intervals + 1)
-        blank = Ribbon.periodic_from(breaks, np.zeros((intervals, RIBBON)))
-    else:
-        blank = Ribbon.open_uniform(np.zeros((intervals + 3, RIBBON)), interval=lengths[-1] / intervals)
+    blank = Ribbon.even(0.0, lengths[-1], max(round(lengths[-1] / spacing), _FEWEST), closed)
     count = max(int(np.ceil(lengths[-1] / SAMPLE_STEP)), RIBBON * (len(blank.breaks) - 1))
     u = np.linspace(0.0, lengths[-1], count + 1)[: count if closed else None]
     middles = np.column_stack([np.interp(u, lengths, column) for column in values.T])
@@ -304,12 +285,6 @@ def _samples(spline: BSpline, closed: bool) -> Array:
     length = spline.length()
     count = max(int(np.ceil(length / SAMPLE_STEP)), _FEWEST)
     return spline.parameters_at(np.linspace(0.0, length, count + 1)[: count if closed else None])
-
-
-def _unwrapped(u: Array, index: IntArray, spline: BSpline, closed: bool) -> Array:
-    """Return the parameters of samples whose indices go on past the end of a loop."""
-    low, high = spline.domain
-    return np.asarray(u[index % len(u)] + (high - low) * (index // len(u)) if closed else u[index])
 
 
 def _paired(

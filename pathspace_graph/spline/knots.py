@@ -14,14 +14,11 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.settings.batch import BreakSettings, FitSettings
 from pathspace_graph.spline.bspline import BSpline
 
-_SAMPLES_PER_BREAK: Final = 40
-"""Equally spaced samples of the curvature for each requested break."""
-_SAMPLES_PER_SPAN: Final = 8
-"""Least-squares samples of a refit on each span: enough for any degree up to 7."""
+_SAMPLES_PER_BREAK: Final = 40  # equally spaced samples of the curvature for each requested break
+_SAMPLES_PER_SPAN: Final = 8  # least-squares samples of a refit on each span: enough for any degree up to 7
 _BRIDGE: Final = 1e-3
 """Weight of second derivatives beside the samples of a refit, on spans that have too few samples."""
-_BENDING_PER_SPAN: Final = 3
-"""Places on each such span at which the second derivative is taken."""
+_BENDING_PER_SPAN: Final = 3  # places on each such span at which the second derivative is taken
 
 
 def quantile_breaks(u: Array, curvature: Array, count: int, settings: BreakSettings) -> Array:
@@ -231,11 +228,6 @@ class Thinned:
     """(k, 2) Offset from the spline to each point, at the point's parameter (m)."""
     leverage: Array
     """(k,) Share of each point in the curve there: the diagonal of the hat matrix."""
-
-    @property
-    def rss(self) -> float:
-        """Return the residual sum of squares (m^2)."""
-        return float((self.residual**2).sum())
 
     @property
     def crossed(self) -> float:

@@ -123,12 +123,9 @@ LEAST_STEP: Final = 0.01
 """Least distance of the points of a line (m)."""
 MOST_POINTS: Final = 200_000
 """Largest number of points of a line, which bounds the memory."""
-_FEWEST: Final = 4
-"""Smallest number of points of a line."""
-_NEIGHBOURS: Final = 10
-"""Number of points apart up to which normals must not cross."""
-_SHORT: Final = 0.95
-"""Share of the way to where two normals would cross that is left to both widths."""
+_FEWEST: Final = 4  # smallest number of points of a line
+_NEIGHBOURS: Final = 10  # number of points apart up to which normals must not cross
+_SHORT: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
 
 
 @dataclass(frozen=True, eq=False)
