@@ -157,20 +157,16 @@ class LandmarkMap:
         return rows
 
     def changed(self) -> IntArray:
-        """Return the cycles (k,) whose detections in use have changed since they were linearized last."""
         return self.detections.cycle[self.detections.changed]
 
     def rows(self, cycles: IntArray) -> list[Rows]:
-        """Return two rows for each detection in use of some cycles."""
         chosen = self.detections.used & self.detections.in_cycles(cycles)
         return [landmark_rows(self.state, self.detections, np.flatnonzero(chosen), self.settings.gate.huber)]
 
     def correct(self) -> None:
-        """Correct the detections by the present calibration of the sensor."""
         self.detections.correct(self.variables.sensor)
 
     def linearized(self, cycles: IntArray) -> None:
-        """Note that the graph holds the present rows of these cycles."""
         self.detections.mark_linearized()
 
     @property
@@ -199,7 +195,6 @@ class LandmarkMap:
         """Do nothing, since every landmark is always active."""
 
     def drop_cycle(self, cycle: int) -> None:
-        """Remove the detections of a cycle, whose pose was the oldest of the window."""
         self.detections.keep_from(cycle + 1)
 
     def merge(self, gone: IntArray, kept: IntArray) -> None:
