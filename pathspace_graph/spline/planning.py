@@ -15,23 +15,20 @@ from pathspace_graph.spline.centre_line import CentreCurve, Crossing, find_line
 
 
 class SampledLine(Protocol):
-    """A line that is sampled at n points, such as `CentreLine` and `TrackAhead`."""
+    """A line that is sampled at n points, such as `CentreLine` and `TrackAhead`.
+
+    It has the curvature (n,) in 1/m, the length (n,) from its first point, and the whole length (m), with the
+    way back to the first point where the line is closed, a loop.
+    """
 
     @property
-    def curvature(self) -> Array:
-        """Return the curvature (n,) in 1/m."""
-
+    def curvature(self) -> Array: ...
     @property
-    def arc_length(self) -> Array:
-        """Return the length (n,) of the line from its first point, in m."""
-
+    def arc_length(self) -> Array: ...
     @property
-    def length(self) -> float:
-        """Return the whole length in m, with the way back to the first point where the line is closed."""
-
+    def length(self) -> float: ...
     @property
-    def closed(self) -> bool:
-        """Return whether the line is a loop."""
+    def closed(self) -> bool: ...
 
 
 @dataclass(frozen=True, eq=False)
