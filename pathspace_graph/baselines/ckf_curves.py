@@ -33,13 +33,11 @@ from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
 SIGMA_START: Final = 0.3
-"""Standard deviation (m) of each control point of a new curve, beyond the uncertainty of its first
-detections."""
+"""Standard deviation (m) of each control point of a new curve, beyond that of its first detections."""
 
 
 class CurveState:
-    """The state `x = [pose | calibration | left control points | right control points]` and the curves'
-    knots."""
+    """State `x = [pose | calibration | left control points | right control points]`, and the knots."""
 
     def __init__(self, belief: Belief, settings: MapperSettings) -> None:
         self.settings = settings
@@ -85,8 +83,7 @@ class CurveState:
         )
 
     def locate_vehicle(self) -> None:
-        """Update the vehicle's parameter on each curve: near the last one, or on the whole curve if it has
-        left."""
+        """Update the vehicle's parameter on each curve: near the last one, or anywhere if it has left."""
         gate = self.settings.gate
         heading = np.array([np.cos(self.pose[2]), np.sin(self.pose[2])])
         for label, last in self.pose_u.items():
@@ -178,9 +175,8 @@ AT_END: Final = 1e-6
 class Expansion:
     """What was detected beyond the curves, which expands them.
 
-    The paper's front end has no false detections. Here a detection expands a curve only if it belongs to a
-    confirmed track that comes next along the path. An end that the vehicle has passed is extended beside the
-    path, as in the other estimators.
+    A detection expands a curve only if it belongs to a confirmed track that comes next along the path. An end
+    that the vehicle has passed is extended beside the path, as in the other estimators.
     """
 
     def __init__(self, settings: MapperSettings) -> None:

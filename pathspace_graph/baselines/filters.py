@@ -43,18 +43,15 @@ from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 REACH: Final = 9.0
 """A curve is extended up to this far ahead of the vehicle (m along the predicted path)."""
 SIGMA_MATCH: Final = 0.6
-"""Standard deviation (m) of a detection in the registration with the early segment. It is larger than
-`closing.sigma_reading`, since the filter's early segment is worse."""
+"""Sigma (m) of a detection in the registration with the early segment, which is worse than online."""
 PATIENCE: Final = 30.0
 """Once this length of the beginning has been driven again (m), it closes the loop, however uncertain the
 position is: `SIGMA_PATIENCE` (m) replaces `closing.sigma_max`."""
 SIGMA_PATIENCE: Final = 1000.0
 SIGMA_TIE: Final = 0.15
-"""Standard deviation (m) of the distance between the end of a curve and its beginning where the loop
-closes."""
+"""Standard deviation (m) of the distance between the ends of a curve where the loop closes."""
 TIE_REACH: Final = 1.0
-"""Points of the end that the registration leaves farther from the beginning than this (m) are no
-correspondences."""
+"""Points of the end that stay farther from the beginning than this (m) are no correspondences."""
 
 
 class _Filter:
@@ -204,11 +201,9 @@ def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveM
 def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
     """Make one Kalman update: the end of each curve lies on its beginning, at the correspondences.
 
-    `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where u is a parameter near the end, w that of the
-    point of the early segment on which the motion moves S(u), and n the normal there. Along the tangent the
-    residual is the same, but all k correspondences there are one result of the registration. So each of them
-    has sqrt(k) times its sigma. Returns False, and does nothing, if the end of a curve has not reached its
-    beginning yet.
+    `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where the motion moves S(u), near the end, on S(w), with
+    the normal n. Along the tangent all k correspondences are one result of the registration, so each has
+    sqrt(k) times its sigma. Returns False, and does nothing, if an end has not reached its beginning yet.
     """
     overlaps = {label: _overlap(state, label, motion) for label in state.curves}
     if not all(len(u) for u, _ in overlaps.values()):

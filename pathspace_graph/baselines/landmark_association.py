@@ -27,8 +27,7 @@ from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother
 ROUGH: Final = 5.0
 """A landmark farther from every detection of a cycle than this (m) is not tested at all."""
 HELD_MARGIN: Final = 1e-9
-"""The cost of a held pair is reduced to this share below the match gate. Exactly at the gate, round-off in
-the sums of an assignment would decide whether the pair is kept."""
+"""Cost of a held pair below the match gate, as a share: exactly at the gate, round-off would decide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +93,7 @@ def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_co
 def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates) -> Array:
     """Return the costs, where pairs that are `held` already stay in the match gate up to the create gate.
 
-    Else detections at the edge would change their association forever. And as covariances grow with the
-    range, repeated cuts at the gate would favour detections that are measured too far away.
+    Else detections at the edge would change for ever, and cuts would favour those measured too far away.
     """
     inside = (1.0 - HELD_MARGIN) * gates.match
     return np.where(held & (cost < gates.create), np.minimum(cost, inside), cost)
@@ -115,8 +113,8 @@ def associate_newest(
     """Associate the rows `new` of the newest pose, or late ones of a `cycle`, with landmarks.
 
     Only landmarks whose entry in `eligible` (n,) is set take part. A detection between the gates becomes
-    AMBIGUOUS. So does one in the match gate of a landmark with another label, since it must not create a
-    second landmark for the same cone. It is a vote for its own label.
+    AMBIGUOUS, and so does one in the match gate of a landmark with another label, for whose own label it
+    votes.
     """
     detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings.landmark
     rows = np.arange(new.start, new.stop)
@@ -205,8 +203,8 @@ def compatible_pairs(
 ) -> IntArray:
     """Return the indices of the pairs (k,) that are one cone, by the gate on their Mahalanobis distance.
 
-    offset (k, 2) is the difference of each pair, and covariances (k, 2, 2) are those of the offset. The pairs
-    are taken nearest first, and each landmark is in one pair at most.
+    offset (k, 2) and covariances (k, 2, 2) are those of the differences. The nearest pair is taken first, and
+    each landmark is in one pair at most.
     """
     distance = squared_mahalanobis(offset, covariances + SIGMA_MERGE**2 * np.eye(POINT))
     taken: set[int] = set()

@@ -46,13 +46,11 @@ from .landmark_association import (
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 
 UNSEEN: Final = 40.0
-"""A landmark that was not detected along this length of the driven path (m) belongs to an earlier stretch.
-Until the loop has closed, no detection near the start is associated with it."""
+"""Path length (m) without a detection after which a landmark is old: none is associated near the start."""
 MIN_PAIRS: Final = 4
 """Landmarks that must be recognized together to close the loop, a third of them of each colour."""
 MIN_LEAD: Final = 2.0
-"""The recognized pairs must score this much better than any other set, where each landmark counts as one gate
-(landmarks)."""
+"""Least lead of the recognized pairs over any other set, where each landmark counts as one gate."""
 
 
 @at_scale
@@ -257,8 +255,7 @@ class LoopPairs:
 class JointCompatibility:
     """Tests sets of pairs against the joint Gaussian of some recent and some old landmarks.
 
-    `scale` multiplies all standard deviations. Two estimates of one cone may differ a little more than their
-    covariance says (SIGMA_MERGE).
+    `scale` multiplies all standard deviations. Two estimates of one cone may differ by SIGMA_MERGE more.
     """
 
     def __init__(self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float) -> None:
@@ -308,8 +305,7 @@ class JointCompatibility:
 def detect_loop(
     smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach: float
 ) -> LoopPairs | None:
-    """Return the pairs, within `reach` (m), of the best hypothesis; None if it is not clear or has too
-    few."""
+    """Return the pairs, within `reach` (m), of the best hypothesis; None if it is not clear or too small."""
     points = smoother.map.state.landmarks
     old = old[nearest_within(points[old], points[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
@@ -333,7 +329,6 @@ def detect_loop(
 
 
 def optimize_loop(smoother: LandmarkSmoother, pairs: LoopPairs) -> None:
-    """Solve the whole loop with the pairs held together, each submap in its own frame; the caller merges
-    them."""
+    """Solve the whole loop with the pairs held together, each submap in its own frame; merge them later."""
     smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([pairs.recent, pairs.old])]
     smoother.solve_loop(smoother.map.settings.closing.iterations, None)

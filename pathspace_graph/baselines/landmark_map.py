@@ -86,7 +86,7 @@ class LandmarkState:
     def vote(self, labels: IntArray, numbers: IntArray) -> None:
         """Count detections with labels (k,) on landmarks (k,), which take the label of their majority.
 
-        Otherwise a landmark that was created by a few detections with the wrong label would keep it forever.
+        Else a landmark created by a few detections with the wrong label would keep it for ever.
         """
         known = np.isin(labels, BOUNDARIES)
         np.add.at(self.votes, (self.positions(numbers[known]), labels[known]), 1)

@@ -22,8 +22,7 @@ from pathspace_graph.spline.boundary import SAME_DIRECTION
 DENSITY_STEP: Final = 0.1
 """Step at which the density of detections along a curve is sampled (m); cones are its peaks."""
 SEPARATION: Final = 0.6
-"""Least distance of two cones along a curve, as a share of `growth.merge_radius`. It is less than 1, as the
-inner curve of a bend is shorter than the distances of its cones add up to."""
+"""Least distance of two cones along a curve over `growth.merge_radius`: inner curves of bends are shorter."""
 BANDWIDTH: Final = 0.4
 """Standard deviation of the Gaussian that smooths the density, as a share of that least distance."""
 SHARP: Final = 0.6
@@ -55,9 +54,8 @@ def add_drive(state: State, poses: Array, calibration: Array, settings: Associat
 def locate_poses(state: State, settings: AssociationSettings) -> None:
     """Set `pose_u`: the parameter of each curve's nearest point that runs in the direction of each pose.
 
-    Without the heading, a pose in a hairpin could be put beside the other leg. On a closed curve the
-    parameter goes on from lap to lap. An open one may have drifted over a stretch of itself, beside which no
-    pose is put.
+    On a closed curve it goes on from lap to lap. No pose is beside a stretch that an open curve has drifted
+    over.
     """
     poses = state.poses
     heading = headings(poses)
@@ -199,8 +197,7 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     """Return the cones of a boundary whose curve the state has.
 
     A cone that is often detected beside the curve, but too far from it to be used, belongs to it as well: the
-    curve cuts a corner there. The cones of a closed curve are ordered as the vehicle passed them, since in a
-    hairpin the curve may have two in the wrong order.
+    curve cuts a corner there. Those of a closed curve are in the order in which the vehicle passed them.
     """
     boundary, begin = state.boundaries[label], first_parameter(state, label)
     rows = np.flatnonzero(detections.label == label)
@@ -251,8 +248,7 @@ def first_parameter(state: State, label: int) -> float:
 def along_drive(cones: Cones, lap: Array, label: int) -> Cones:
     """Return the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
 
-    A cone is passed at the path length of its nearest pose, plus its distance ahead of that pose. What stands
-    behind the row belongs to another stretch, or is smeared between two rows by far detections.
+    What stands behind the row belongs to another stretch, or is smeared between two rows by far detections.
     """
     offset = cones.points[:, None] - lap[:, :2]
     nearest = (offset**2).sum(axis=2).argmin(axis=1)
@@ -302,10 +298,9 @@ def cluster(
 ) -> Cones:
     """Return a cone at each peak of the density of detections (m, 2) along a curve or a path.
 
-    u (m,) in [0, length] are the parameters of the detections (m), which are weighed by the inverse traces of
-    their covariances (m, 2, 2), map frame. A cone has at least `growth.sightings` detections, all within the
-    merge radius of their peak, and stands where these together say: what is smeared along one ray counts
-    across it.
+    u (m,) in [0, length] are their parameters (m); the inverse traces of their covariances (m, 2, 2), map
+    frame, weigh them. A cone has at least `growth.sightings` detections within the merge radius of its peak,
+    and stands where they together say: what is smeared along one ray counts across it.
     """
     radius, weight = settings.growth.merge_radius, 1.0 / np.trace(covariances, axis1=1, axis2=2)
     peaks = _peaks(u, weight, length, periodic, SEPARATION * radius)

@@ -279,8 +279,8 @@ def is_true_closure(found: Evidence, settings: MapperSettings) -> bool:
 def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, settings: MapperSettings) -> str:
     """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
 
-    The boundaries of a road don't cross, the vehicle crosses neither and has driven beside all of both, and
-    the detections of the lap lie on them. At a level crossing of the road with itself all of these cross.
+    Boundaries don't cross but at level crossings, the vehicle crosses neither and has driven beside all of
+    both, and the detections lie on them.
     """
     step, driven = SAMPLE, poses[:, :2]
     if boundaries_cross(splines, step, driven):

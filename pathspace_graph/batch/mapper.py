@@ -64,9 +64,9 @@ SAME: Final = 1e-3
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
     """Return every factor of the problem, on the keys of `graph.variables`.
 
-    It is a graph of plain least squares, and holds the associations as they are at `at`, and the sigmas
-    across the curve divided by the root of their robust weights. Each control point is anchored where it is.
-    At an optimum its linearization is that of the optimization; its error isn't the robust cost.
+    A graph of plain least squares, with the associations of `at` and the sigmas across the curve over the
+    roots of their robust weights. Each control point is anchored where it is. At an optimum its linearization
+    is that of the optimization; its error isn't the robust cost.
     """
     graph = gtsam.NonlinearFactorGraph()
     for factor in drive_factors(system, at):

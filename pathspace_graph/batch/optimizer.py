@@ -37,8 +37,7 @@ TOLERANCE_COST: Final = 1e-5
 TOLERANCE_CURVE: Final = 2e-3
 """Largest move of a point of a curve across it in a round then, as seen from its poses (m)."""
 TOLERANCE_DECREASE: Final = 5e-3
-"""Largest decrease of the cost by an undamped step then. A step of one sigma in any direction makes it
-smaller by 1/2, also where it swings a whole map by metres."""
+"""Largest decrease of the cost by an undamped step then; a step of one sigma decreases it by 1/2."""
 CURVE_SAMPLES: Final = 2
 """Points in each knot interval at which the movement of a curve is measured."""
 SHARES: Final = (0.3, 0.97)
@@ -51,6 +50,7 @@ class Convergence:
 
     converged: bool
     """Whether nothing changed any more."""
+    reason: str
     rounds: int
     """Times that foot points, gates and weights were refreshed."""
     steps: int
@@ -61,11 +61,6 @@ class Convergence:
     """Norm `sqrt(g' H^-1 g)` of the gradient g at the end, with H the information of all variables: the
     distance of the linear problem's optimum in joint sigmas. A slow common motion of the whole map counts as
     much in it as that of a control point."""
-
-    @property
-    def reason(self) -> str:
-        """Why the optimization ended."""
-        return "nothing changes any more" if self.converged else "no round left"
 
 
 @dataclass(frozen=True)
@@ -130,7 +125,7 @@ class Optimizer:
 
         Each round takes one step. The gate (sigmas) shrinks to that of the settings (graduated robust
         weights), and only then may it end. After `SEARCH` rounds, or half of them, associations and sigmas
-        stay as they are: where two rows are near, some would change for ever.
+        stay: where two rows are near, some would change for ever.
         """
         system = self.system
         locate_poses(state, self.settings.association)
@@ -204,8 +199,7 @@ class Optimizer:
         return farthest
 
     def predicted_decrease(self, at: Evaluation) -> float:
-        """Return `1/2 g' H^-1 g` with gradient g and information H: the gain of an undamped step if it were
-        linear.
+        """Return `1/2 g' H^-1 g`, with gradient g and information H: the linear gain of an undamped step.
 
         A step of one sigma in any direction has 1/2, however far it leads in metres.
         """
@@ -215,7 +209,8 @@ class Optimizer:
 
     def _report(self, at: Evaluation, rounds: int, decrease: float, converged: bool) -> Convergence:
         norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
-        return Convergence(converged, rounds, self.steps, at.cost, norm)
+        reason = "nothing changes any more" if converged else "no round left"
+        return Convergence(converged, reason, rounds, self.steps, at.cost, norm)
 
     def _step(self, at: Evaluation) -> Evaluation:
         """Return the problem after the least damped step that makes the cost smaller, or the same one."""
@@ -256,9 +251,8 @@ class Optimizer:
 def extrapolation_factor(step: Array, before: Array) -> float:
     """Return `1 / (1 - r)`: how much longer a step (n,) is made, r being its share of the step before.
 
-    This is Aitken's process for vectors, with r by least squares. The result is 1 where r isn't between
-    `SHARES`. Robust weights, held sigmas and foot points on a curve that bends let Gauss-Newton converge only
-    linearly, slowest where few detections hold the curve.
+    Aitken's process for vectors, with r by least squares, and 1 where r isn't between `SHARES`. Robust
+    weights, held sigmas and foot points on a bend let Gauss-Newton converge only linearly.
     """
     square = float(before @ before)
     share = float(step @ before) / square if square > 0.0 else 0.0

@@ -27,8 +27,7 @@ MIN_SIZE_SHARE: Final = 0.6
 ALIKE: Final = (3.0, 0.01)
 """Parameters of two curves through the same cones differ by less than `a + b L` (m), with L their length."""
 FOLDS: Final = 4
-"""Groups of the cross-validation, which the cones are dealt to in turn. So the neighbours of a cone that is
-left out are always there."""
+"""Groups of the cross-validation, dealt in turn: the neighbours of a cone left out are always there."""
 FOOT_ROOM: Final = 1.5
 """Distance from its own place in which the foot point of a cone is searched (m along the curve)."""
 
@@ -82,10 +81,10 @@ def fit_through(
 
 
 def extended(points: Array, beyond: float) -> Array:
-    """Return cones (k, 2) with a point before the first and one after the last, `beyond` metres straight on.
+    """Return cones (k, 2) with a point before the first and one after the last, `beyond` (m) straight on.
 
-    There are at least two cones. Half of the detections of the last one lie beyond it, and any motion of an
-    end there would put some of them into use and others out of it. Nothing is added where `beyond` is zero.
+    Half of the detections of the last one lie beyond it, and any motion of an end there would put some of
+    them into use and others out of it.
     """
     if beyond == 0.0:
         return points
@@ -124,13 +123,11 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
 def simplify(
     state: State, covariance: Array, detections: DetectionTable, settings: MapperSettings
 ) -> tuple[State, Array]:
-    """Return the same poses beside curves on few knots, and the joint covariance (n, n) of their control
-    points (paper: Simplification).
+    """Return the same poses beside curves on few knots, and the covariance (n, n) of their control points.
 
-    `C_new = F C_old`, so the covariance is `F Sigma F'`, with Sigma that of the state's control points. The
-    optimum isn't solved for on few knots: such a curve passes its cones by a decimetre, on the same side in
-    every lap. In the first seconds that turns vehicle and map by up to a degree, several times the claimed
-    sigma.
+    The paper's Simplification: `C_new = F C_old`, so the covariance is `F Sigma F'`. The optimum isn't solved
+    for on few knots: such a curve passes its cones by a decimetre, on the same side in every lap, which turns
+    vehicle and map by up to a degree in the first seconds.
     """
     few, change = simplified(state, detections, settings)
     associate_again(few, detections, settings)
@@ -190,10 +187,8 @@ class Scatter:
     """Distance of cones from the simplified curves: a variance to be added to that of the curves.
 
     `sigma^2(u) = seen^2 + (d / s)^2 (unseen^2 - seen^2)`, where d is the distance along the curve from u to
-    the nearest detected cone, and s is the usual distance of two such cones. A cone that was never detected
-    (d = s) is missed by as much as a detected one that is left out of knots and fit (cross-validation).
-    Without the scatter, the claimed covariance is right at detected cones, and several times too small at the
-    others.
+    the nearest detected cone, and s the usual distance of two such cones. A cone that was never detected (d =
+    s) is missed by as much as a detected one that is left out of knots and fit.
     """
 
     LENGTHS: ClassVar = {"seen": 1, "unseen": 1, "places": 1, "lengths": 1}

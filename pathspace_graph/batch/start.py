@@ -144,7 +144,7 @@ def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
     """Return the shortest path length after which the curvature of dead-reckoned poses (P, 3) recurs.
 
     From the first lag whose correlation is a large share of the best one's, the search climbs to a lag that
-    is the best within `closing.radius` after it. That is the lap.
+    is the best within `closing.radius` after it.
     """
     closing, driven = settings.closing, path_lengths(poses)
     profile = profile_of(poses, driven)
@@ -176,9 +176,8 @@ class Profile:
     def correlations(self, lags: IntArray, settings: ClosingSettings) -> Array:
         """Return how well the curvature agrees with itself each of the lags (l,) later, in samples.
 
-        The result (l,) is `1 - mean((a - b)^2) / (mean(a^2) + mean(b^2))`, 1 where both are the same. It is
-        -inf where the path isn't back at about the same place and heading after that lag, by the limits of a
-        loop closure. All sums over the overlap come from a Fourier transform.
+        `1 - mean((a - b)^2) / (mean(a^2) + mean(b^2))`, and -inf where the path isn't back at about the same
+        place and heading, by the limits of a loop closure. The sums come from a Fourier transform.
         """
         off = self.position - self.position.mean(axis=0)
         place, curvature = off[:, 0] + 1j * off[:, 1], self.curvature.astype(complex)
@@ -243,9 +242,8 @@ def start_odometry(
 def align_laps(chain: LogOdometry, recurrence: Recurrence) -> tuple[Array, Array]:
     """Return the poses (P, 3) and the calibration (2,) at which every lap passes the same reference poses.
 
-    Gauss-Newton minimizes the odometry's cost and that of the lap correspondences. The reference poses are
-    unknown, too: their keys are those of cycles after the last one. The search begins at the yaw-rate bias by
-    which the heading changes by whole turns in a lap.
+    Gauss-Newton on the odometry and the lap correspondences, from the yaw-rate bias by which the heading
+    changes by whole turns in a lap. The keys of the reference poses, also unknown, follow the last cycle's.
     """
     seconds = (chain.stamps[-1] - chain.stamps[0]) / (recurrence.driven[-1] / recurrence.lap)
     calibration = np.array([0.0, (recurrence.turn - recurrence.whole_turn) / seconds])

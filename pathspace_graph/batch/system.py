@@ -24,8 +24,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .association import headings
 
 POINTS_A_FACTOR: Final = 8
-"""Neighbouring control points in one factor of their anchors. One factor for all of them would join the whole
-curve in the elimination. The number changes the speed, not the result."""
+"""Neighbouring control points in one factor of their anchors; it changes the speed, not the result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +32,8 @@ class CurveGauge:
     """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness` of a curve.
 
     p_k is the position of the pose that control point c_j began beside, h_k its heading, R_k its rotation,
-    and D is `smoothness_matrix`. A detection constrains nothing along a curve, so control points would slide
-    along it, by metres in a hundred steps. Held beside a pose they don't, and the map is as free as before.
+    and D is `smoothness_matrix`. Detections constrain nothing along a curve, so control points would slide
+    along it; held beside a pose they don't, and the map is as free as before.
     """
 
     label: int
@@ -72,8 +71,7 @@ class CurveGauge:
         """Return the second differences as the poses beside their middles see them, whitened (r, 2).
 
         Also return their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
-        map frame a second difference turns with the map, and Gauss-Newton would take that turn for a change
-        of shape. It would know the heading at the end of a winding road better than any measurement does.
+        map frame they would turn with the map, and Gauss-Newton would take that turn for a change of shape.
         """
         neighbours, theta = self.neighbours, poses[self.middle_cycle, 2]
         c, s = np.cos(theta), np.sin(theta)
@@ -121,8 +119,8 @@ class CurveGauge:
     def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
         """Return rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
 
-        They damp how a control point moves as seen from the pose beside it, in 1/m^2, and not a map that
-        swings with its poses, as an error of the yaw rate swings it. J is the quarter turn.
+        They damp how it moves as seen from the pose beside it, in 1/m^2, and not a map that swings with its
+        poses.
         """
         arm = control_points - poses[self.cycle, :2]
         by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
@@ -166,8 +164,8 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
 def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
     """Return (m,) the pose nearest to where each control point acts, of those with the curve's direction.
 
-    On an open curve, it is one of those whose places along the curve are nearest, give or take `room` (m): a
-    curve that has drifted over itself would else be tied to a pose of another stretch.
+    On an open curve, which may have drifted over itself, it is within `room` (m) of the nearest along the
+    curve.
     """
     boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
     u = boundary.abscissae
@@ -272,8 +270,8 @@ class BatchSystem:
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
         """Return the problem at a state; foot points are refined from those that the detections have.
 
-        `hold` sets what later evaluations keep. The derivatives leave out that the sigma depends on the
-        direction of the curve.
+        `hold` sets what later evaluations keep. That the sigma depends on the curve's direction has no
+        derivative.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
         drive = self.chain.rows_at(state.variables, self.settings.calibration)

@@ -31,8 +31,7 @@ UNIT: Final = ("m/s", "m/s", "rad/s")
 MAX_STAMP: Final = 1e11
 """Largest stamp, s: some three thousand years. Stamps in nanoseconds are larger."""
 MIN_INTERVAL: Final = 1e-3
-"""Least time from a cycle to the next, s. Between nearer ones the odometry is so certain that the system
-loses its digits."""
+"""Least time from a cycle to the next, s: between nearer ones the odometry is too certain for doubles."""
 MAX_TWISTS: Final = 100_000
 MAX_DETECTIONS: Final = 500
 """Largest numbers of twists and detections in a cycle, which bound its time."""
@@ -90,10 +89,9 @@ def admit(
 ) -> Admitted:
     """Return a cycle as an estimator may use it, or raise a ReadingError.
 
-    A cycle that is older than the newest one is late. It is admitted where it lies between the stamps (s) of
-    the `window`, whose poses can still take detections, unless its stamp is among those `used`. The twists
-    are a stream, and need not begin at the newest cycle: each is held until the next one, and what was in
-    force before the newest cycle is left out.
+    A late cycle, older than the newest one, is admitted between the stamps (s) of the `window`, whose poses
+    can still take detections, unless its stamp is among those `used`. Each twist is held until the next one,
+    and what was in force before the newest cycle is left out.
     """
     t = _stamp(_of_type(Detections, detections, "detections").t)
     try:

@@ -42,8 +42,7 @@ MISFIT: Final = 1.5
 MISFIT_GAIN: Final = 0.02
 """Smoothing gain of the mean-square misfit."""
 MAX_MISFIT: Final = 3.0
-"""Largest misfit that tells a motion. It is about 1 where the vehicle has moved, and 4 and more where it was
-put down elsewhere."""
+"""Largest misfit that tells a motion: about 1 where the vehicle moved, 4 where it was put down elsewhere."""
 MISFIT_ODOMETRY: Final = 2.0
 """Least misfit at the odometry's own pose in a contradiction."""
 MISFIT_RATIO: Final = 1.3
@@ -53,8 +52,7 @@ MAX_CHANGE: Final = 3.5
 SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)
 """Standard deviations (m/s, m/s, rad/s) of a velocity's change in a cycle whose odometry is not believed."""
 BEFORE: Final = 0.5
-"""Share of a contradiction's size that is added to the standard deviation of its motion, since it may have
-begun a few cycles before it was noticed."""
+"""Share of a contradiction's size added to its motion's sigma: it may have begun a few cycles before."""
 WIDENING: Final = 1.5
 """Factor of the standard deviations of a motion told from detections, since the estimator uses them again."""
 HOLD: Final = 0.15
@@ -62,8 +60,7 @@ HOLD: Final = 0.15
 HOLD_INTERVALS: Final = 3.0
 """Shortest intervals between two twists for which it is held so; the longer time counts."""
 STUCK: Final = 3
-"""Twists in a cycle that are equal to the one before, to the last digit, from which readings have stuck where
-the vehicle could not change its velocity so."""
+"""Twists in a cycle equal to the one before from which readings are stuck, if no vehicle moves so."""
 REST: Final = 1.0
 """Time of standing from which the vehicle is at rest, s: its mean yaw rate measures the bias then."""
 REST_TWIST: Final = (0.1, 0.1, 0.05)
@@ -305,7 +302,7 @@ class Rest:
     def update(self, odometry: Odometry, t: float) -> bool:
         """Return whether the vehicle has stood for long enough at t (s), by the twists since the last cycle.
 
-        Its mean twist must be zero within its own noise, and within the limits of a vehicle that stands.
+        Its mean twist is zero within its own noise, and within the limits of a vehicle that stands.
         """
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
         if (

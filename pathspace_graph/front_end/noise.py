@@ -115,9 +115,8 @@ class NoiseLearner:
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
         """Return settings with measured priors of the calibrations where one of the old ones is contradicted.
 
-        An error b is contradicted where `|b - m| > doubt hypot(sigma, sigma_prior)`. Then the sensor is not
-        what it was said to be, and all of its errors are what was measured. Of ranges and speeds only the
-        ratio can be seen: the scale of one is held, that of the other is what was measured.
+        `|b - m| > doubt hypot(sigma, sigma_prior)` contradicts the prior of an error b, and then all errors
+        are what was measured. Of ranges and speeds only the ratio can be seen: the scale of one is held.
         """
         measured, sensor = self.measured, settings.calibration
         contradicted = self._contradicted(settings)

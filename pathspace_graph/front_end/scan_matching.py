@@ -37,8 +37,7 @@ MOST_REMEMBERED: Final = 2000
 """Largest number of remembered detections, which bounds the time of a match."""
 REACH: Final = 1.0
 REACH_LAST: Final = 0.4
-"""Reach in the first and in the last iteration, m: a remembered detection at distance d has the weight
-`exp(-d^2 / 2 reach^2)`. Cones of a row are some 3 m apart."""
+"""Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
 ITERATIONS: Final = 6
 REACHES_CHECK: Final = (REACH, REACH_LAST)
 """Reaches in the check of the odometry, which begins near the solution."""
@@ -136,10 +135,9 @@ def match(
 ) -> Match:
     """Lay detections (m, 2), vehicle frame, on the recent ones by Gauss-Newton steps from a pose (3,).
 
-    Each step minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2` with m_i the weighted mean of the recent
-    detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) + SIGMA_CONE^2` with n_i the sum of
-    the weights. There is a step for each of the reaches (m). The variances (m,) are those of one coordinate
-    (m^2).
+    Each step, one for each of the reaches (m), minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2`, m_i being
+    the weighted mean of the recent detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) +
+    SIGMA_CONE^2` with n_i the sum of the weights. The variances (m,) are those of one coordinate (m^2).
     """
     pose = start.copy()
     for reach in reaches:
@@ -232,12 +230,9 @@ class Difference:
 class SensorErrors:
     """Kalman filter of the errors e = (yaw, latency) of the sensor, in rad and s.
 
-    Detections are corrected by the mean. What is left of the errors shifts a match by
-
-        (d_y, -d_x, 0) (yaw),   mean v - v (latency)
-
-    in the vehicle frame, where d is the way from the place from which the remembered detections were seen in
-    the mean, v the velocity, and mean v that while they were seen.
+    Detections are corrected by the mean. What is left shifts a match, in the vehicle frame, by `(d_y, -d_x,
+    0)` (yaw) and `mean v - v` (latency). d is the way from the mean place from which the remembered
+    detections were seen, v the velocity, and mean v that while they were seen.
     """
 
     def __init__(self, settings: MotionSettings) -> None:
@@ -270,8 +265,8 @@ class SensorErrors:
     def shifts(self, way: Array, velocity: Array) -> Array:
         """Return the derivatives (3, 2) of how far a match is off the odometry, by the errors.
 
-        The way (2,) and the velocity (3,) are in the vehicle frame, in m, m/s, m/s and rad/s. No vehicle
-        changes its velocity by more than its accelerations: that is slip, and not to be taken for latency.
+        Way (2,) and velocity (3,) are in the vehicle frame (m, m/s, m/s, rad/s). Changes of the velocity
+        beyond the accelerations of a vehicle are slip, and not latency.
         """
         shifts = np.empty((3, len(ERRORS)))
         shifts[:, 0] = way[1], -way[0], 0.0

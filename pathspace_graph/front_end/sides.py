@@ -48,7 +48,7 @@ SURE: Final = 3.0
 BESIDE: Final = 2.0
 """Distance along the path within which cones stand beside each other, m."""
 LATERAL_GAP: Final = 0.8
-"""Distance from a cone beside it that is nearer to the path, beyond which a cone is of another stretch, m."""
+"""Distance from a nearer cone beside it beyond which a cone is of another stretch, m."""
 HALF_WIDTH: Final = 1.5
 """Distance beside the vehicle at which a row without any cone begins, m."""
 GAP: Final = 8.0
@@ -194,10 +194,9 @@ class Row:
 def follow_rows(rows: Mapping[int, Row], points: Array, votes: IntArray, free: IntArray) -> None:
     """Lead both rows on through free cones (k,), as long as it is clear which cone comes next.
 
-    All cones (n,) have points (n, 2) in m, and votes (n, 2) for the left and the right boundary. The next
-    cone is the one with the least `distance (1 + TURN_COST turn^2)` from the end of its row. It must be far
-    cheaper for that row than for the other one. Where it is not, both rows end: two rows could be confused
-    there.
+    All cones (n,) have points (n, 2) in m, and votes (n, 2) for left and right. The next cone has the least
+    `distance (1 + TURN_COST turn^2)` from the end of its row, and is far dearer for the other row. Else both
+    rows end: they could be confused there.
     """
     left = free.tolist()
     while left:

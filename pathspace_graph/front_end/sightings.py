@@ -165,8 +165,7 @@ class Follower:
     ) -> tuple[IntArray, IntArray]:
         """Return which detections (m,), nearest first, are sightings, and of which cones.
 
-        Several cameras may see a cone at once, and each sighting counts: the one that fits best would pull
-        the errors of the sensor towards what is known of them already.
+        Several cameras may see a cone at once, and each counts: the best one alone would favour known errors.
         """
         place, square = self._nearest_cone(points, labels, ranges, pose)
         near = square < 1.0
@@ -251,7 +250,7 @@ class TwistRecord:
     def orders(self) -> Array | None:
         """Return the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
 
-        The median absolute difference over that of white noise, `sqrt(binomial(2 k, k))`. Where the orders
+        The median absolute difference over `sqrt(binomial(2 k, k))`, that of white noise. Where the orders
         differ, the noise is not white, or the motion itself is in it.
         """
         _, twists = self._newest

@@ -43,8 +43,8 @@ class Gauge:
 class Placement:
     """How an extension places control points: a linear map of what they are fitted to.
 
-    The control points from index `kept` on are `by_known @ known[first:] + by_target @ targets`, and the
-    second differences that the fit assumes to be zero would move them by `by_bend`.
+    Those from index `kept` on are `by_known @ known[first:] + by_target @ targets`, and the second
+    differences that the fit assumes to be zero would move them by `by_bend`.
     """
 
     first: int
@@ -205,10 +205,9 @@ class Boundary:
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
         """Extend the curve through targets (k, 2) at parameters (k,); return its control points (n', 2).
 
-        Knots are appended until the domain holds the last parameter, which becomes `confirmed_end`. Old basis
-        functions stay. The old control points that act only beyond the last cone before `confirmed_end` are
-        placed again with the new ones: the direction at the end was a guess, which over a long gap would lead
-        the curve astray.
+        Knots are appended until the domain holds the last parameter, the new `confirmed_end`; old basis
+        functions stay. The control points that act only beyond the last cone before are placed again: the
+        direction at the end was a guess.
         """
         before = int(np.searchsorted(self.cone_parameters, self.confirmed_end - ROUND_OFF))
         from_u = self.cone_parameters[before - 1] if before else self.confirmed_end
@@ -283,8 +282,7 @@ def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
     """Return the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
 
-    A closed curve is searched everywhere. An open one, which grows with the vehicle, is searched on its last
-    `room` metres; its end is returned if no tangent there agrees with the heading.
+    A closed curve is searched everywhere, an open one on its last `room` metres, whose end is the default.
     """
     low, high = boundary.tables.low, boundary.tables.high
     if not boundary.periodic:

@@ -44,9 +44,9 @@ def curvature_weighted_breaks(
 ) -> Array:
     """Return breaks (count + 1,) in the spline's own parameter between low and high (default: its domain).
 
-    As in the paper's Simplification, the curvature at equal distances along the curve is a probability
-    density, to which the linear baseline is added; the knots are its equal quantiles. An open curve counts
-    as straight beyond its ends. SettingsError is raised if the stretch is empty.
+    The paper's Simplification: the curvature at equal distances along the curve, plus the linear baseline, is
+    a density, and the knots are its quantiles. An open curve counts as straight beyond its ends.
+    SettingsError is raised if the stretch is empty.
     """
     first, last = spline.domain
     low, high = first if low is None else low, last if high is None else high
@@ -91,10 +91,9 @@ def refit(
 ) -> Refit:
     """Fit the bases of two splines to each other; only the knots of `new` are used, not its control points.
 
-    `u_map` maps increasing parameters of the old spline to those of the new one (default: the same ones). A
-    periodic new spline wraps them, so the beginning of an open curve and an end that overlaps it lie on the
-    same stretch. Where the new domain has no sample of the old one, F fills the gap smoothly. What lies
-    outside the parameters `within` of the old spline doesn't count for F, as a shorter new one ends there.
+    `u_map` maps increasing parameters of the old spline to those of the new one (default: the same), wrapped
+    if that is periodic. Where the new domain has no sample, F fills the gap smoothly. What lies outside the
+    parameters `within` of the old spline doesn't count for F.
     """
     u = _refit_samples(old, new)
     inside = (u >= within[0]) & (u <= within[1])
@@ -144,10 +143,10 @@ def fit_spline(
 ) -> BSpline:
     """Fit a spline of `size` distinct control points to ordered points (k, 2) in m, by least squares.
 
-    The points' parameters begin as chord lengths and are moved to the foot points. Knots follow the
-    curvature, unless `breaks` are given (in chord lengths from the first point). The fit with the smallest
-    rmse is returned. A weak bending energy makes two points enough (three for a periodic curve).
-    SettingsError is raised if there are fewer distinct points, or too few control points for the degree.
+    Parameters begin as chord lengths and move to the foot points. Knots follow the curvature, unless `breaks`
+    are given (in chord lengths). The fit with the smallest rmse is returned; a weak bending energy makes two
+    points enough (three for a periodic curve). SettingsError is raised if there are fewer distinct points, or
+    too few control points for the degree.
     """
     settings = FitSettings() if settings is None else settings
     u, high = _chord_lengths(points, periodic)
@@ -208,13 +207,11 @@ def energy_rows(spline: BSpline) -> Array:
 
 
 EVEN: Final = 1e-9
-"""Weight of the square of the interval (m^2) that a removal leaves against the cost of the removal (m^2):
-among knots that cost nothing, the one that leaves the shortest interval is removed."""
+"""Weight of the square of the interval (m^2) that a removal leaves against its cost (m^2), for ties."""
 MARGIN: Final = 0.1
 """Least share by which the sum of squares of a smaller curve must be smaller for it to be chosen."""
 COINCIDENT: Final = 1e-9
-"""Largest difference of parameters of cones that share one knot (m). Two knots so close to each other impose
-the same constraint up to rounding, and the cost of the second one would be 0 / 0."""
+"""Largest difference of parameters of cones that share one knot (m); the cost of a second would be 0 / 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,11 +235,9 @@ class Thinned:
 def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, most: int) -> Thinned:
     """Choose, among the curves of `thin` with `least` to `most` control points, by cross-validation.
 
-    The largest curve is chosen, unless a smaller one predicts a point left out better by `MARGIN`: which of
-    nearly equal curves is best is chance. The other criterion, `n log(rss / n) + p log(n)` (BIC), took a knot
-    for every cone on all 22 boundaries of eleven tracks: with so many knots rss vanishes, and with it BIC's
-    estimate of the noise. At a given size the curve is nearer to the cones than one whose knots follow the
-    curvature: 0.066 m in place of 0.107 m on cones with 3 cm of noise.
+    The largest curve is chosen, unless a smaller one predicts a point left out better by `MARGIN`. BIC, `n
+    log(rss / n) + p log(n)`, took a knot for every cone on all 22 boundaries of eleven tracks: rss vanishes.
+    Knots by curvature leave 0.107 m to cones with 3 cm of noise, these 0.066 m at the same size.
     """
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))

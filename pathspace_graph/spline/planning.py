@@ -127,10 +127,9 @@ _SHORT: Final = 0.95  # share of the way to where two normals would cross that i
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
-    """Centre line of a track at n points, evenly spaced, in the map frame.
+    """Centre line of a track at n points, evenly spaced, in the map frame; smooth, by `find_line`.
 
-    The line is in the middle between the boundaries, and smooth (`find_line`). A standard deviation is that
-    of the quantity where the line crosses its normal at the point; it is NaN where the map has no covariance.
+    A standard deviation is that where the line crosses its normal at the point; NaN without covariance.
     """
 
     points: Array
