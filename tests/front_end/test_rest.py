@@ -88,8 +88,9 @@ def test_a_log_has_the_mean_of_all_that_was_measured_at_rest(log: Log) -> None:
     at_mean = half_square(chain.priors(chain.first, np.array([0.0, chain.bias.value])))
     prior = 0.5 * (off[1] ** 2 - chain.bias.value**2) / chain.calibration_sigma[1] ** 2
     assert half_square(chain.priors(chain.first, off)) - at_mean == pytest.approx(0.5 + prior)
-    rows = [rows for rows in chain._measured_bias(off) if rows.keys[0, 0] == CALIBRATION_KEY]
-    np.testing.assert_allclose(rows[0].residual, [1.0])
+    *_, measured = chain.priors(chain.first, off)
+    assert measured.keys[0, 0] == CALIBRATION_KEY
+    np.testing.assert_allclose(measured.residual, [1.0])
 
 
 def test_means_are_weighted_by_information() -> None:
