@@ -6,16 +6,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pathspace_graph.baselines.centerline import CenterlineBatch, CenterlineMapper
+    from pathspace_graph.baselines.filters import CkfMapper, LandmarkCkf
+    from pathspace_graph.baselines.landmark_batch import LandmarkBatch
+    from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
     from pathspace_graph.batch.mapper import BatchMapper
-    from pathspace_graph.centerline.batch import CenterlineBatch
-    from pathspace_graph.centerline.online import CenterlineMapper
-    from pathspace_graph.ckf.mapper import CkfMapper
     from pathspace_graph.io.log import Detections, Log, Odometry, read_log, write_log
     from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, read_map
     from pathspace_graph.io.results import CycleRecord, RunResult, write_result
-    from pathspace_graph.landmark.batch import LandmarkBatch
-    from pathspace_graph.landmark.ckf import LandmarkCkf
-    from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
     from pathspace_graph.online.fixed_lag import FixedLagMapper
     from pathspace_graph.plausibility.hint import Hint
     from pathspace_graph.plausibility.judge import hints
@@ -72,9 +70,8 @@ __all__ = [
 # imported when first asked for: the command line's help, and sim, need no estimator
 _HOMES = {
     "batch.mapper": ("BatchMapper",),
-    "centerline.batch": ("CenterlineBatch",),
-    "centerline.online": ("CenterlineMapper",),
-    "ckf.mapper": ("CkfMapper",),
+    "baselines.centerline": ("CenterlineBatch", "CenterlineMapper"),
+    "baselines.filters": ("CkfMapper", "LandmarkCkf"),
     "errors": ("InputError", "OutputError", "PathspaceError", "ReadingError", "SettingsError", "SolveError"),
     "estimators": ("make_batch", "make_online"),
     "frames": ("read_cycles", "read_study"),
@@ -82,9 +79,8 @@ _HOMES = {
     "io.map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),
     "io.results": ("CycleRecord", "RunResult", "write_result"),
     "labels": ("LEFT", "RIGHT"),
-    "landmark.batch": ("LandmarkBatch",),
-    "landmark.ckf": ("LandmarkCkf",),
-    "landmark.fixed_lag": ("LandmarkFixedLag",),
+    "baselines.landmark_batch": ("LandmarkBatch",),
+    "baselines.landmark_fixed_lag": ("LandmarkFixedLag",),
     "online.fixed_lag": ("FixedLagMapper",),
     "plausibility.hint": ("Hint",),
     "plausibility.judge": ("hints",),

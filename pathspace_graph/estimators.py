@@ -9,15 +9,13 @@ from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final, Literal
 
+from pathspace_graph.baselines import centerline
+from pathspace_graph.baselines.filters import CkfMapper, LandmarkCkf
+from pathspace_graph.baselines.landmark_batch import LandmarkBatch
+from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.centerline import batch as centerline_batch
-from pathspace_graph.centerline import online as centerline_online
-from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Log
-from pathspace_graph.landmark.batch import LandmarkBatch
-from pathspace_graph.landmark.ckf import LandmarkCkf
-from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -58,7 +56,7 @@ ONLINE: Final[dict[str, MakeOnline]] = {
     "landmark-fixed-lag": LandmarkFixedLag,
     "ckf": CkfMapper,
     "landmark-ckf": LandmarkCkf,
-    centerline_online.NAME: centerline_online.CenterlineMapper,
+    centerline.ONLINE_NAME: centerline.CenterlineMapper,
 }
 """Makers of online estimators, from settings and what is known of the noise; one of another package is given
 the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
@@ -67,7 +65,7 @@ BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
     DEFAULT_BATCH: lambda settings, noise: BatchMapper(settings, noise, FixedLagMapper),
     "landmark-batch": LandmarkBatch,
-    centerline_batch.NAME: partial(centerline_batch.CenterlineBatch, online=FixedLagMapper),
+    centerline.NAME: partial(centerline.CenterlineBatch, online=FixedLagMapper),
 }
 """Makers of batch estimators, from settings and what is known of the noise; one of another package is given
 the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
@@ -88,7 +86,7 @@ def for_map(name: str, kind: MapKind) -> str:
 
     SettingsError is raised where the named estimator has no such map.
     """
-    lines = {DEFAULT: centerline_online.NAME, DEFAULT_BATCH: centerline_batch.NAME}
+    lines = {DEFAULT: centerline.ONLINE_NAME, DEFAULT_BATCH: centerline.NAME}
     if kind == "boundaries" or name in lines.values():
         return name
     if name not in lines:

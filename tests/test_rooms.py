@@ -23,7 +23,7 @@ ASKED = {"io.brief"}
 
 LEAVES = {"errors", "labels", "console", "lengths"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
-ESTIMATORS = {"online", "batch", "ckf", "landmark", "centerline"}
+ESTIMATORS = {"online", "batch", "baselines"}
 BELOW_MAPPING = {
     *("factors", "settings", "spline", "io", "graph", "laps", "health", "run", "checkpoint", "snapshot"),
     "scale",
@@ -52,7 +52,7 @@ ARROWS: dict[str, set[str]] = {
     **dict.fromkeys(sorted(ESTIMATORS), BELOW_ESTIMATORS),
     "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "online": BELOW_ESTIMATORS | {"loop"},
-    "centerline": BELOW_ESTIMATORS | {"loop", "batch", "online"},
+    "baselines": BELOW_ESTIMATORS | {"loop", "batch", "online"},
     "estimators": BELOW_ESTIMATORS | ESTIMATORS,
     "eval.metrics": BELOW_EVAL,
     "eval.figures": BELOW_EVAL | {"eval.metrics"},
@@ -157,15 +157,15 @@ ASSIGNED = {
     "batch.association": {"state.pose_u"},
     "batch.mapper": {"system.settings", "system.chain"},
     "batch.optimizer": {"system.kernel"},
-    "ckf.mapper": {"track.detections.used", "state.pose_u"},
+    "baselines.filters": {"track.detections.used", "state.pose_u"},
     "commands.online": {"column.justify"},  # of rich
     "eval.view.film": {"self.writer.fig"},  # of matplotlib
     "front_end.motion": {"self._rest.sigma"},
     "front_end.sides": {"near.judged"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
-    "landmark.association": {"detections.landmark"},
-    "landmark.batch": {"state.votes", "detections.landmark"},
-    "landmark.fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
+    "baselines.landmark_association": {"detections.landmark"},
+    "baselines.landmark_batch": {"state.votes", "detections.landmark"},
+    "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
     "mapping.smoother": {"self.window.exact"},
     "online.fixed_lag": {"self.recovery.failures"},
     "online.outlook": {"row.ended"},

@@ -12,11 +12,10 @@ from joblib.externals.loky import Future
 from scipy.spatial import KDTree
 
 from pathspace_graph import FixedLagMapper, MapperSettings
-from pathspace_graph.ckf.mapper import CkfMapper
+from pathspace_graph.baselines.filters import CkfMapper, LandmarkCkf
+from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.errors import InputError
 from pathspace_graph.graph.variables import Layout, pose_keys
-from pathspace_graph.landmark.ckf import LandmarkCkf
-from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.run import split_odometry
 from pathspace_graph.snapshot import Decoder, Encoder, archive, known_classes, read, restore, save, write
 

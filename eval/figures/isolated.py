@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.linalg import block_diag
 
-from pathspace_graph.ckf.expansion import beyond_end, proximity_chain
-from pathspace_graph.ckf.update import SplineMeasurement, fit_detections
+from pathspace_graph.baselines.ckf_curves import beyond_end, proximity_chain
+from pathspace_graph.baselines.ckf_update import SplineMeasurement, fit_detections
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.files import atomic_folder
 from pathspace_graph.io.map import SplineBoundary

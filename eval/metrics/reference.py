@@ -6,13 +6,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from pathspace_graph.baselines.landmark_batch import LandmarkSolution, solve_landmarks
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import inverse, left_of, to_map
 from pathspace_graph.io.log import Detections, Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
-from pathspace_graph.landmark.batch import LandmarkSolution, solve_landmarks
 from pathspace_graph.settings.batch import FitSettings
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings

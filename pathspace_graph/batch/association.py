@@ -7,7 +7,6 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import project
 from pathspace_graph.factors.se2 import rotated, to_map, to_vehicle
 from pathspace_graph.graph.variables import pose_keys
@@ -18,13 +17,12 @@ from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
 from pathspace_graph.settings.batch import AssociationSettings
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
+from pathspace_graph.spline.boundary import SAME_DIRECTION
 
 DENSITY_STEP: Final = 0.1
 """Step at which the density of detections along a curve is sampled (m); cones are its peaks."""
 SEPARATION: Final = 0.6
-"""Least distance of two cones along a curve, as a share of `growth.merge_radius`. It is less than 1, as the
-inner curve of a bend is shorter than the distances of its cones add up to."""
+"""Least distance of two cones along a curve over `growth.merge_radius`: inner curves of bends are shorter."""
 BANDWIDTH: Final = 0.4
 """Standard deviation of the Gaussian that smooths the density, as a share of that least distance."""
 SHARP: Final = 0.6
@@ -47,10 +45,7 @@ FOLD_DISTANCE: Final = 1.5
 
 
 def add_drive(state: State, poses: Array, calibration: Array, settings: AssociationSettings) -> None:
-    """Add the poses (P, 3) of all cycles to a state that has its curves already.
-
-    The calibration is that of the odometry (2,), or of odometry and sensor (7,).
-    """
+    """Add the poses (P, 3) of all cycles to a state that has its curves already."""
     state.variables.insert_calibrations(calibration)
     state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
     locate_poses(state, settings)
@@ -59,12 +54,11 @@ def add_drive(state: State, poses: Array, calibration: Array, settings: Associat
 def locate_poses(state: State, settings: AssociationSettings) -> None:
     """Set `pose_u`: the parameter of each curve's nearest point that runs in the direction of each pose.
 
-    Without the heading, a pose in a hairpin could be put beside the other leg. On a closed curve the
-    parameter goes on from lap to lap. An open one may have drifted over a stretch of itself, beside which no
-    pose is put.
+    On a closed curve it goes on from lap to lap. No pose is beside a stretch that an open curve has drifted
+    over.
     """
     poses = state.poses
-    heading = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    heading = headings(poses)
     for label, boundary in state.boundaries.items():
         count = int(np.ceil(boundary.length / settings.step))
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
@@ -93,6 +87,11 @@ def _along(square: Array, steps: Array) -> IntArray:
         low = max(samples[k] - reach[k - 1], 0)
         samples[k - 1] = low + total[k - 1, low : samples[k] + reach[k - 1] + 1].argmin()
     return samples
+
+
+def headings(poses: Array) -> Array:
+    """Return the unit vectors (m, 2) of the headings of poses (m, 3)."""
+    return np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
 
 def path_lengths(poses: Array) -> Array:
@@ -147,19 +146,13 @@ def _misfit(
     boundary, poses = state.boundaries[label], state.variables.poses_at(detections.cycle[rows])
     points = to_map(detections.point[rows], poses)
     if whole:
-        foot = find_anywhere(boundary, state.control_points(label), points)
+        foot = boundary.find_anywhere(state.control_points(label), points)
     else:
         begin = _nearest_in_view(state, detections.cycle[rows], points, label, settings)
         foot = boundary.refine(state.control_points(label), points, begin)
     projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
-
-
-def find_anywhere(boundary: Boundary, control_points: Array, points: Array) -> FootPoints:
-    """Return the foot points of points (m, 2) on a whole curve."""
-    low, high = (np.full(len(points), end) for end in (boundary.tables.low, boundary.tables.high))
-    return boundary.find(control_points, points, low, high)
 
 
 def _nearest_in_view(
@@ -204,11 +197,13 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     """Return the cones of a boundary whose curve the state has.
 
     A cone that is often detected beside the curve, but too far from it to be used, belongs to it as well: the
-    curve cuts a corner there. The cones of a closed curve are ordered as the vehicle passed them, since in a
-    hairpin the curve may have two in the wrong order.
+    curve cuts a corner there. Those of a closed curve are in the order in which the vehicle passed them.
     """
     boundary, begin = state.boundaries[label], first_parameter(state, label)
-    rows = sharp(np.flatnonzero(detections.label == label), detections)
+    rows = np.flatnonzero(detections.label == label)
+    sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
+    if (sigma < SHARP).sum() >= SHARP_SHARE * len(rows):  # far detections are smeared
+        rows = rows[sigma < SHARP]
     points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
     used = detections.used[rows] & (detections.boundary[rows] == label)
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
@@ -229,7 +224,8 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     others = clustered(beside & ~on_curve & ~near)
     cones = cones.merged(others.where(others.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
-        cones = along_drive(cones, last_lap(state, label), label)
+        pose_u = state.pose_u[label]
+        cones = along_drive(cones, state.poses[pose_u > pose_u[-1] - boundary.length], label)  # the last lap
     return without_folds(cones, boundary.periodic)
 
 
@@ -243,30 +239,16 @@ def covariances_map(detections: DetectionTable, rows: IntArray, poses: Array) ->
     return rotated(detections.covariance[rows], poses[detections.cycle[rows], 2])
 
 
-def sharp(rows: IntArray, detections: DetectionTable) -> IntArray:
-    """Return the rows whose detections say where a cone stands; those of far ones are smeared."""
-    sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
-    certain = rows[sigma < SHARP]
-    return certain if len(certain) >= SHARP_SHARE * len(rows) else rows
-
-
 def first_parameter(state: State, label: int) -> float:
     """Return the parameter of a curve from which those of its cones are counted."""
     boundary = state.boundaries[label]
     return float(state.pose_u[label][0]) if boundary.periodic else boundary.tables.low
 
 
-def last_lap(state: State, label: int) -> Array:
-    """Return the poses (l, 3) of the last lap around a closed curve, map frame."""
-    pose_u = state.pose_u[label]
-    return np.asarray(state.poses[pose_u > pose_u[-1] - state.boundaries[label].length])
-
-
 def along_drive(cones: Cones, lap: Array, label: int) -> Cones:
     """Return the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
 
-    A cone is passed at the path length of its nearest pose, plus its distance ahead of that pose. What stands
-    behind the row belongs to another stretch, or is smeared between two rows by far detections.
+    What stands behind the row belongs to another stretch, or is smeared between two rows by far detections.
     """
     offset = cones.points[:, None] - lap[:, :2]
     nearest = (offset**2).sum(axis=2).argmin(axis=1)
@@ -280,14 +262,10 @@ def along_drive(cones: Cones, lap: Array, label: int) -> Cones:
 def _beside(
     state: State, points: Array, cycles: IntArray, label: int, settings: MapperSettings
 ) -> tuple[BoolArray, BoolArray, Array]:
-    """Return which points (m, 2) lie beside a curve, which lie about its end, and their foot points u (m,).
-
-    Half of the detections of the cone at which an open curve ends lie beyond its end. On an open curve, a
-    point lies on the stretch that the pose of its cycle (m,) sees.
-    """
+    """Return which points (m, 2) lie beside a curve, which about its end, and their foot points u (m,)."""
     boundary, control_points = state.boundaries[label], state.control_points(label)
     if boundary.periodic:
-        foot = find_anywhere(boundary, control_points, points)
+        foot = boundary.find_anywhere(control_points, points)
     else:
         u = state.pose_u[label][cycles]
         low, high = u - settings.gate.view_behind, u + settings.gate.view_ahead
@@ -320,10 +298,9 @@ def cluster(
 ) -> Cones:
     """Return a cone at each peak of the density of detections (m, 2) along a curve or a path.
 
-    u (m,) in [0, length] are the parameters of the detections (m), which are weighed by the inverse traces of
-    their covariances (m, 2, 2), map frame. A cone has at least `growth.sightings` detections, all within the
-    merge radius of their peak, and stands where these together say: what is smeared along one ray counts
-    across it.
+    u (m,) in [0, length] are their parameters (m); the inverse traces of their covariances (m, 2, 2), map
+    frame, weigh them. A cone has at least `growth.sightings` detections within the merge radius of its peak,
+    and stands where they together say: what is smeared along one ray counts across it.
     """
     radius, weight = settings.growth.merge_radius, 1.0 / np.trace(covariances, axis1=1, axis2=2)
     peaks = _peaks(u, weight, length, periodic, SEPARATION * radius)

@@ -21,7 +21,7 @@ from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
@@ -32,14 +32,14 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import by_motion, sigma_of_information
 from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.bspline import BSpline, at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.boundary import at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive
-from .gauge import curve_gauge
 from .optimizer import LOOSE_GATE, Convergence, Effort, Optimizer
-from .simplification import associate_again, boundary_of, scatter_of_cones, simplified
+from .simplification import associate_again, boundary_of, own_settings, scatter_of_cones, simplified
 from .start import Recurrence, start_odometry
-from .system import BatchSystem, Biweight, Evaluation, own_settings
+from .system import BatchSystem, Biweight, Evaluation, curve_gauge
 
 USED_AGAIN: Final = 0.85
 """Least share of the detections after the first lap on a closed result, over that of the first lap."""
@@ -192,21 +192,16 @@ def marginal_of(
 
 
 def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:
-    """Return the rows of the batch that hold a pose before `first_kept` or no pose at all.
-
-    Those that hold a control point beside a pose are made anew with poses that leave, so that none is lost.
-    """
+    """Return the rows of the batch that hold a pose before `first_kept` or no pose at all."""
     state, sigma = at.state, system.settings.batch.sigma_slide
     gauges = {label: curve_gauge(state, label, sigma, first_kept) for label in state.boundaries}
     groups = system.rows(at, gauges)
-    return [rows.where(_is_before(rows.keys, first_kept)) for rows in groups if len(rows)]
-
-
-def _is_before(keys: IntArray, cycle: int) -> BoolArray:
-    """Return whether each row's first pose is of an earlier cycle than this, or it has no pose."""
-    cycles = np.where(are_poses(keys), indices(keys), -1)
-    first = np.where(are_poses(keys), cycles, np.iinfo(np.intp).max).min(axis=1)
-    return np.asarray((first < cycle) | ~are_poses(keys).any(axis=1))
+    before = []
+    for rows in (rows for rows in groups if len(rows)):
+        poses = are_poses(rows.keys)
+        first = np.where(poses, indices(rows.keys), np.iinfo(np.intp).max).min(axis=1)
+        before.append(rows.where((first < first_kept) | ~poses.any(axis=1)))
+    return before
 
 
 # --- when a loop is tried, and believed ------------------------------------------------------------------
@@ -244,7 +239,12 @@ def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSetting
     """Return the evidence for or against an optimum whose curves are closed."""
     state = at.state
     coloured = np.isin(detections.label, list(state.boundaries))
-    again = _is_after_first_lap(state)[detections.cycle] & coloured
+    second = np.ones(
+        len(state.poses), bool
+    )  # poses beside a stretch of every boundary that was driven before
+    for label, boundary in state.boundaries.items():
+        second &= state.pose_u[label] - state.pose_u[label][0] >= boundary.length
+    again = second[detections.cycle] & coloured
     chosen = {label: again[projected.rows] for label, projected in at.projected.items()}
     feet = [p.foot.where(chosen[label]) for label, p in at.projected.items()]
     whitened = [p.whitened[chosen[label]] for label, p in at.projected.items()]
@@ -279,8 +279,8 @@ def is_true_closure(found: Evidence, settings: MapperSettings) -> bool:
 def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, settings: MapperSettings) -> str:
     """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
 
-    The boundaries of a road don't cross, the vehicle crosses neither and has driven beside all of both, and
-    the detections of the lap lie on them. At a level crossing of the road with itself all of these cross.
+    Boundaries don't cross but at level crossings, the vehicle crosses neither and has driven beside all of
+    both, and the detections lie on them.
     """
     step, driven = SAMPLE, poses[:, :2]
     if boundaries_cross(splines, step, driven):
@@ -296,15 +296,6 @@ def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, set
     if found.used < settings.batch.closure.used:
         return f"only {found.used:.0%} of the detections lie on its boundaries".replace("%", " %")
     return ""
-
-
-def _is_after_first_lap(state: State) -> BoolArray:
-    """Return which poses (P,) are beside a stretch of every boundary that was driven a lap before."""
-    again = np.ones(len(state.poses), bool)
-    for label, boundary in state.boundaries.items():
-        u = state.pose_u[label]
-        again &= u - u[0] >= boundary.length
-    return again
 
 
 def _longest_gap(u: Array, length: float) -> float:
@@ -324,10 +315,7 @@ def _rms(values: Array) -> float:
 
 
 def _sigma_of_motion(feet: Sequence[FootPoints], sigma_reading: float) -> float:
-    """Return the largest standard deviation (m) of a rigid motion that detections hold across curves.
-
-    The motion turns about the mean of the foot points. Each detection has this sigma (m).
-    """
+    """Return the largest standard deviation (m) of a rigid motion that detections hold across curves."""
     normal, point = (
         np.concatenate([np.zeros((0, 2)), *(getattr(foot, name) for foot in feet)])
         for name in ("normal_unit", "position")

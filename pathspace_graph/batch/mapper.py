@@ -1,6 +1,6 @@
 """The offline batch: every pose, every detection and both curves of a log in one least-squares problem."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, MutableSequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,36 +11,184 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SettingsError, solving
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
-from pathspace_graph.graph.variables import Layout, are_poses, pose_key
+from pathspace_graph.graph.rows import odometry_factor
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    POINT,
+    POSE,
+    Layout,
+    are_poses,
+    pose_key,
+    pose_keys,
+)
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
-from pathspace_graph.lengths import POSE
+from pathspace_graph.lengths import POSE as POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import doubted, known_noise
-from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.scale import log_at_scale
 from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import Boundary
 
 from .lap import evidence, is_true_closure
-from .nonlinear_graph import nonlinear_graph
 from .optimizer import LOOSE_GATE, Convergence, Optimizer
-from .simplification import Scatter, map_block, scatter_of_cones, simplify
+from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplify
 from .start import CurveMapper, find_recurrence, start_odometry, start_online
-from .system import BatchSystem, Biweight, Evaluation, own_settings
+from .system import BatchSystem, Biweight, CurveGauge, Evaluation
+
+ROOM: Final = 4.0
+"""Distance from its foot points in which a factor searches them (m along the curve)."""
+HALVINGS: Final = 6
+"""Most halvings of the room while another foot point in it is nearer, as in a bend about a detection."""
+SAME: Final = 1e-3
+"""Distance below which two foot points are the same (m along the curve)."""
+
+
+def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
+    """Return every factor of the problem, on the keys of `graph.variables`.
+
+    A graph of plain least squares, with the associations of `at` and the sigmas across the curve over the
+    roots of their robust weights. Each control point is anchored where it is. At an optimum its linearization
+    is that of the optimization; its error isn't the robust cost.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in drive_factors(system, at):
+        graph.add(factor)
+    for label, gauge in system.gauges.items():
+        for factor in (*_gauge(gauge, at.state.control_points(label)), *_projections(system, at, label)):
+            graph.add(factor)
+    return graph
+
+
+def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield all factors that hold no control point: odometry, first pose and the priors of calibrations."""
+    for k, interval in enumerate(system.chain.odometry.intervals):
+        yield odometry_factor(k, interval)
+    for one in system.revisits:
+        root = one.root.copy()  # GTSAM's tangents are in the frame of the later pose
+        root[:, :2] = root[:, :2] @ rotation(one.local[2])
+        noise = gtsam.noiseModel.Gaussian.Information(root.T @ root)
+        between = gtsam.Pose2(*one.local)
+        yield gtsam.BetweenFactorPose2(pose_key(one.earlier), pose_key(one.later), between, noise)
+    yield from _priors(system.chain, at.state.poses[0, 2])
+    sensor_key = at.state.variables.sensor_key
+    if sensor_key is not None:
+        sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array(system.settings.calibration.sigmas))
+        yield gtsam.PriorFactorVector(sensor_key, np.array(system.settings.calibration.means), sigmas)
+
+
+def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFactor]:
+    map_from_pose = np.eye(POSE)  # GTSAM's tangents of a pose are in its own frame
+    map_from_pose[:2, :2] = rotation(heading)
+    information = map_from_pose.T @ chain.first_information @ map_from_pose
+    noise = gtsam.noiseModel.Gaussian.Information(information)
+    yield gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*chain.first), noise)
+    sigmas = gtsam.noiseModel.Diagonal.Sigmas(chain.calibration_sigma)
+    yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, chain.calibration_mean, sigmas)
+    if chain.bias is not None:
+        noise = gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, chain.bias.sigma**-2]))
+        yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.array([0.0, chain.bias.value]), noise)
+
+
+def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.NonlinearFactor]:
+    anchor = gtsam.noiseModel.Isotropic.Sigma(2, gauge.sigma_anchor)
+    for j, (key, point) in enumerate(zip(gauge.keys.tolist(), control_points, strict=True)):
+        yield factor_beside(gauge.keys[j : j + 1], int(gauge.cycle[j]), 1, beside_of(gauge, j))
+        yield gtsam.PriorFactorPoint2(key, point, anchor)
+    for row in range(len(gauge.smoothness)):
+        keys, cycle = gauge.keys[gauge.neighbours[row]], int(gauge.middle_cycle[row])
+        yield factor_beside(keys, cycle, POINT, bending_of(gauge, row))
+
+
+Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
+"""Whitened residuals of control points as a pose (1, 3) sees them, with derivatives by both."""
+
+
+def beside_of(gauge: CurveGauge, j: int) -> Terms:
+    """Return the terms that hold control point j of a curve beside its pose."""
+    only = slice(j, j + 1)
+    return replace(gauge, keys=gauge.keys[only], cycle=gauge.cycle[only], ahead=gauge.ahead[only]).terms
+
+
+def bending_of(gauge: CurveGauge, row: int) -> Terms:
+    """Return the terms of a second difference of a curve, as the pose beside it sees it."""
+    chosen = gauge.neighbours[row]
+    smoothness = gauge.smoothness[row, chosen][None]
+    return replace(gauge, keys=gauge.keys[chosen], cycle=np.zeros(3, np.intp), smoothness=smoothness).bending
+
+
+def factor_beside(
+    points: IntArray, cycle: int, size: int, terms: Terms, dimension: int = POINT
+) -> gtsam.CustomFactor:
+    """Return the factor of `size` whitened residuals of control points (k,) as the pose of a cycle sees them.
+
+    GTSAM's tangents of a pose are in its own frame.
+    """
+    keys = [*points.tolist(), pose_key(cycle)]
+    read = gtsam.Values.atPoint2 if dimension == POINT else gtsam.Values.atPoint3
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
+        pose = values.atPose2(keys[-1])
+        at = np.array([read(values, key) for key in keys[:-1]])
+        residual, by_points, by_pose = terms(at, pose_array(pose)[None])
+        if H is not None:
+            by_pose[..., :2] = by_pose[..., :2] @ rotation(pose.theta())
+            for k, block in enumerate(np.split(by_points.reshape(size, -1), len(points), axis=1)):
+                H[k] = block
+            H[len(points)] = by_pose.reshape(size, POSE)
+        return residual.ravel()
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error)
+
+
+def _projections(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
+    """Return a factor for each cycle, of its used detections on a boundary that have any weight."""
+    projected, boundary = at.projected[label], at.state.boundaries[label]
+    scale, detections = system.scale(projected), system.detections
+    weighted = scale > 0.0
+    scale, u, rows = scale[weighted], projected.foot.u[weighted], projected.rows[weighted]
+    cycles, variables = detections.cycle[rows], at.state.variables
+    points = to_map(detections.corrected(rows, variables.sensor), variables.poses_at(cycles))
+    room = _room(boundary, at.state.control_points(label), points, u)
+    return spline_projection_factors(
+        pose_keys(cycles),
+        at.state.keys(label).tolist(),
+        boundary.tables,
+        points_vehicle=detections.measured[rows],
+        covariances=scale[:, None, None] ** -2.0 * np.eye(2),
+        low=u - room,
+        high=u + room,
+        sigma_model=0.0,
+        huber=np.inf,
+        sensor_key=variables.sensor_key,
+        twists=detections.twist[rows],
+    )
+
+
+def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) -> Array:
+    """Return the room (m,) about u in which the nearest foot point of each point (m, 2) is that at u."""
+    room = np.full(len(u), ROOM)
+    for _ in range(HALVINGS):
+        nearest = boundary.find(control_points, points, u - room, u + room).u
+        room[np.abs(nearest - u) > SAME] *= 0.5
+    return room
+
 
 NAME: Final = "spline"
 """Name of the estimator on the command line."""
@@ -72,7 +220,7 @@ class BatchResult(BatchRun):
     def pose_covariances(self) -> Array:
         """Return the marginal covariance (n, 3, 3) of each pose (x, y, theta), map frame, computed once."""
         with threadpool_limits(limits=1):
-            weights = self.scale ** np.array(POSE, float)
+            weights = self.scale ** np.array(POSE_LENGTHS, float)
             return np.outer(weights, weights) * self.system.eliminated(self.optimum).pose_marginals
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -126,7 +274,11 @@ class BatchMapper:
             online = None
             at, convergence = find_optimum_from_odometry(optimizer)
         else:
-            state, online, system.revisits = self._start_online(log)
+            if self.online is None:
+                raise SettingsError("start online: expected an online mapper to begin with, found none")
+            mapper = self.online(replace(self.settings, scale=1.0), self.noise)
+            state, online = start_online(log, mapper)
+            system.revisits = mapper.revisits
             watch.lap("start")
             at, convergence = optimizer.find(state)
         at, convergence = _with_doubt(optimizer, at, convergence)
@@ -160,12 +312,6 @@ class BatchMapper:
             optimum=at,
         )
 
-    def _start_online(self, log: Log) -> tuple[State, RunResult, tuple[Revisit, ...]]:
-        if self.online is None:
-            raise SettingsError("start online: expected an online mapper to begin with, found none")
-        mapper = self.online(replace(self.settings, scale=1.0), self.noise)
-        return *start_online(log, mapper), mapper.revisits
-
 
 def _vehicle(system: BatchSystem, at: Evaluation) -> VehicleState:
     """Return the last pose and the calibration, with their joint covariance."""
@@ -180,10 +326,7 @@ def _vehicle(system: BatchSystem, at: Evaluation) -> VehicleState:
 
 
 def find_optimum_from_odometry(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:
-    """Return the optimum whose search begins at odometry alone.
-
-    Where the path recurs, the loop is closed, and it stays closed if the detections are for it.
-    """
+    """Return the optimum whose search begins at odometry alone."""
     system = optimizer.system
     chain, detections, settings = system.chain, system.detections, system.settings
     recurrence = find_recurrence(chain.dead_reckoned(np.zeros(CALIBRATION_SIZE)), settings)

@@ -37,16 +37,11 @@ TOLERANCE_COST: Final = 1e-5
 TOLERANCE_CURVE: Final = 2e-3
 """Largest move of a point of a curve across it in a round then, as seen from its poses (m)."""
 TOLERANCE_DECREASE: Final = 5e-3
-"""Largest decrease of the cost by an undamped step then. A step of one sigma in any direction makes it
-smaller by 1/2, also where it swings a whole map by metres."""
+"""Largest decrease of the cost by an undamped step then; a step of one sigma decreases it by 1/2."""
 CURVE_SAMPLES: Final = 2
 """Points in each knot interval at which the movement of a curve is measured."""
 SHARES: Final = (0.3, 0.97)
 """Shares of the step before between which a step is extended to the sum of those that would follow it."""
-
-
-REASONS: Final = {True: "nothing changes any more", False: "no round left"}
-"""Why an optimization ended, by whether it has converged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,16 +61,6 @@ class Convergence:
     """Norm `sqrt(g' H^-1 g)` of the gradient g at the end, with H the information of all variables: the
     distance of the linear problem's optimum in joint sigmas. A slow common motion of the whole map counts as
     much in it as that of a control point."""
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """Gate, rounds and tolerances of an optimization."""
-
-    gate: float
-    """Gate of the first round (sigmas)."""
-    rounds: int
-    tolerance: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -112,20 +97,16 @@ class Optimizer:
         self._last_step: Array | None = None  # of the map and the calibration
 
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
-        """Return the optimum on curves with about one knot for each cone, which meet the cones.
-
-        The poses are first aligned beside the map of the start. The search is repeated if the number of cones
-        has changed: then one was missing or was a duplicate.
-        """
+        """Return the optimum on curves with about one knot for each cone, which meet the cones."""
         system, effort = self.system, self.effort
         detections, settings = system.detections, system.settings
-        rough = Schedule(LOOSE_GATE, effort.rough_rounds, ROUGH_TOLERANCE)
-        fine = Schedule(self.settings.gate, effort.rounds)
         state = self.align_poses(state, POSE_STEPS, LOOSE_GATE)
-        at, _ = self.run(reknot(state, detections, settings, dense=True), rough)
+        state = reknot(state, detections, settings, dense=True)
+        at, _ = self.run(state, LOOSE_GATE, effort.rough_rounds, ROUGH_TOLERANCE)
         for _ in range(effort.knot_passes):
             cones = cone_counts(at.state, detections, settings)
-            at, convergence = self.run(reknot(at.state, detections, settings, dense=True), fine)
+            state = reknot(at.state, detections, settings, dense=True)
+            at, convergence = self.run(state, self.settings.gate, effort.rounds)
             if cone_counts(at.state, detections, settings) == cones:
                 break
         return at, convergence
@@ -137,21 +118,23 @@ class Optimizer:
             state = moved(state, self.system.poses_alone(self._refreshed(state, gate, False)))
         return state
 
-    def run(self, state: State, schedule: Schedule) -> tuple[Evaluation, Convergence]:
+    def run(
+        self, state: State, gate: float, rounds: int, tolerance: float = 1.0
+    ) -> tuple[Evaluation, Convergence]:
         """Optimize in rounds until nothing changes, and return the problem there.
 
-        Each round takes one step. The gate shrinks to that of the settings (graduated robust weights), and
-        only then may it end. After `SEARCH` rounds, or half of them, associations and sigmas stay as they
-        are: where two rows are near, some would change for ever.
+        Each round takes one step. The gate (sigmas) shrinks to that of the settings (graduated robust
+        weights), and only then may it end. After `SEARCH` rounds, or half of them, associations and sigmas
+        stay: where two rows are near, some would change for ever.
         """
-        system, gate = self.system, schedule.gate
+        system = self.system
         locate_poses(state, self.settings.association)
         system.begin(state)
         self._last_step = None
         at: Evaluation | None = None
         cost, searched = np.inf, 0
-        search = max(min(SEARCH, schedule.rounds // 2), 1)
-        for number in range(1, schedule.rounds + 1):
+        search = max(min(SEARCH, rounds // 2), 1)
+        for number in range(1, rounds + 1):
             gate = max(gate, self.settings.gate)
             strict = gate <= self.settings.gate
             system.kernel = Biweight(gate)
@@ -161,14 +144,14 @@ class Optimizer:
             state, gain, cost = at.state, abs(cost - at.cost), at.cost
             if self._on_round is not None:
                 self._on_round()
-            if strict and self._is_still(before, at, gain, schedule.tolerance):
+            if strict and self._is_still(before, at, gain, tolerance):
                 at = self._refreshed(state, gate, strict, held)
                 decrease = self.predicted_decrease(at)
-                if decrease <= schedule.tolerance * (self.effort.tolerance * TOLERANCE_DECREASE):
+                if decrease <= tolerance * (self.effort.tolerance * TOLERANCE_DECREASE):
                     return at, self._report(at, number, decrease, True)
             gate *= GATE_FACTOR
         assert at is not None
-        return at, self._report(at, schedule.rounds, self.predicted_decrease(at), False)
+        return at, self._report(at, rounds, self.predicted_decrease(at), False)
 
     def _refreshed(self, state: State, gate: float, strict: bool, held: bool = False) -> Evaluation:
         """Return the problem of a new round, with the associations and sigmas of the last one if `held`."""
@@ -202,11 +185,7 @@ class Optimizer:
         return still and gain <= tolerance * cost * after.cost
 
     def _movement(self, before: State, after: State) -> float:
-        """Return how far a curve has moved across itself (m), seen from the poses beside its control points.
-
-        A motion of the curve with its poses doesn't count: `predicted_decrease` judges it in sigmas, since
-        the end of a long open road swings by metres within its own.
-        """
+        """Return how far a curve has moved across itself (m), as the poses beside it see it."""
         farthest = 0.0
         for label, gauge in self.system.gauges.items():
             boundary, points = before.boundaries[label], before.control_points(label)
@@ -220,8 +199,7 @@ class Optimizer:
         return farthest
 
     def predicted_decrease(self, at: Evaluation) -> float:
-        """Return `1/2 g' H^-1 g` with gradient g and information H: the gain of an undamped step if it were
-        linear.
+        """Return `1/2 g' H^-1 g`, with gradient g and information H: the linear gain of an undamped step.
 
         A step of one sigma in any direction has 1/2, however far it leads in metres.
         """
@@ -230,7 +208,8 @@ class Optimizer:
         return -0.5 * float(gradient(self.system.rows(at), layout) @ step)
 
     def _report(self, at: Evaluation, rounds: int, decrease: float, converged: bool) -> Convergence:
-        norm, reason = float(np.sqrt(2.0 * max(decrease, 0.0))), REASONS[converged]
+        norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
+        reason = "nothing changes any more" if converged else "no round left"
         return Convergence(converged, reason, rounds, self.steps, at.cost, norm)
 
     def _step(self, at: Evaluation) -> Evaluation:
@@ -272,9 +251,8 @@ class Optimizer:
 def extrapolation_factor(step: Array, before: Array) -> float:
     """Return `1 / (1 - r)`: how much longer a step (n,) is made, r being its share of the step before.
 
-    This is Aitken's process for vectors, with r by least squares. The result is 1 where r isn't between
-    `SHARES`. Robust weights, held sigmas and foot points on a curve that bends let Gauss-Newton converge only
-    linearly, slowest where few detections hold the curve.
+    Aitken's process for vectors, with r by least squares, and 1 where r isn't between `SHARES`. Robust
+    weights, held sigmas and foot points on a bend let Gauss-Newton converge only linearly.
     """
     square = float(before @ before)
     share = float(step @ before) / square if square > 0.0 else 0.0

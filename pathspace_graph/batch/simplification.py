@@ -20,15 +20,14 @@ from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 
-from .association import MIN_CONES, associate, cones_of_curve, find_anywhere, first_parameter, locate_poses
+from .association import MIN_CONES, associate, cones_of_curve, first_parameter, locate_poses
 
 MIN_SIZE_SHARE: Final = 0.6
 """Least share of the largest number of control points that the map's curves are tried with."""
 ALIKE: Final = (3.0, 0.01)
 """Parameters of two curves through the same cones differ by less than `a + b L` (m), with L their length."""
 FOLDS: Final = 4
-"""Groups of the cross-validation, which the cones are dealt to in turn. So the neighbours of a cone that is
-left out are always there."""
+"""Groups of the cross-validation, dealt in turn: the neighbours of a cone left out are always there."""
 FOOT_ROOM: Final = 1.5
 """Distance from its own place in which the foot point of a cone is searched (m along the curve)."""
 
@@ -50,9 +49,10 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
             continue
         if dense:
             beyond = 0.0 if boundary.periodic else settings.growth.merge_radius
-            spline = dense_fit_through(extended(points, beyond), boundary.periodic, settings)
+            points, share_of = extended(points, beyond), (settings.batch.dense_share, 1.0)
         else:
-            spline = fit_through(points, boundary.periodic, settings, share)
+            share_of = share, MIN_SIZE_SHARE
+        spline = fit_through(points, boundary.periodic, settings, *share_of)
         state.replace_boundary(label, *boundary_of(spline, settings))
     return state
 
@@ -63,36 +63,28 @@ def size_share(cones: Mapping[int, int], batch: BatchSettings) -> float:
     return batch.size_share if batch.size is None or total == 0 else batch.size / total
 
 
-def fit_through(points: Array, periodic: bool, settings: MapperSettings, share: float) -> BSpline:
-    """Return a curve through ordered cones (k, 2), which has at most `share` control points for each."""
-    least_size = settings.spline.min_size
-    most = max(least_size, int(share * len(points)))
-    return _fit(points, periodic, settings, max(least_size, int(MIN_SIZE_SHARE * most)), most)
+def fit_through(
+    points: Array, periodic: bool, settings: MapperSettings, share: float, least_share: float = MIN_SIZE_SHARE
+) -> BSpline:
+    """Return the best curve through ordered cones (k, 2), with at most `share` control points for each.
 
-
-def dense_fit_through(points: Array, periodic: bool, settings: MapperSettings) -> BSpline:
-    """Return a curve through cones (k, 2) on nearly a knot for each."""
-    size = max(settings.spline.min_size, int(settings.batch.dense_share * len(points)))
-    return _fit(points, periodic, settings, size, size)
-
-
-def _fit(points: Array, periodic: bool, settings: MapperSettings, least: int, most: int) -> BSpline:
-    """Return the curve of `least` to `most` control points that fits best.
-
-    A closed one begins at the cone nearest to the start, so that similar cones give similar knots.
+    It has at least `least_share` of these. A closed one begins at the cone nearest to the start, so that
+    similar cones give similar knots.
     """
+    smallest = settings.spline.min_size
+    most = max(smallest, int(share * len(points)))
     if periodic:
         points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
     fit = FitSettings(degree=settings.spline.degree)
-    chosen = chosen_breaks(points, periodic, fit, least, most)
+    chosen = chosen_breaks(points, periodic, fit, max(smallest, int(least_share * most)), most)
     return fit_spline(points, chosen.size, periodic, fit, chosen.breaks)
 
 
 def extended(points: Array, beyond: float) -> Array:
-    """Return cones (k, 2) with a point before the first and one after the last, `beyond` metres straight on.
+    """Return cones (k, 2) with a point before the first and one after the last, `beyond` (m) straight on.
 
-    There are at least two cones. Half of the detections of the last one lie beyond it, and any motion of an
-    end there would put some of them into use and others out of it. Nothing is added where `beyond` is zero.
+    Half of the detections of the last one lie beyond it, and any motion of an end there would put some of
+    them into use and others out of it.
     """
     if beyond == 0.0:
         return points
@@ -115,19 +107,27 @@ def exact_settings(spline: SplineSettings) -> SplineSettings:
     return replace(spline, refine_iterations=2, refine_room=8.0, search_iterations=4)
 
 
+def own_settings(settings: MapperSettings) -> MapperSettings:
+    """Return the settings with the batch's own values in the groups that it shares with online mapping."""
+    batch = settings.batch
+    return replace(
+        settings,
+        spline=replace(settings.spline, sigma_model=batch.sigma_model),
+        gauge=replace(settings.gauge, sigma_smoothness=batch.sigma_smoothness),
+    )
+
+
 # --- simplification --------------------------------------------------------------------------------------
 
 
 def simplify(
     state: State, covariance: Array, detections: DetectionTable, settings: MapperSettings
 ) -> tuple[State, Array]:
-    """Return the same poses beside curves on few knots, and the joint covariance (n, n) of their control
-    points (paper: Simplification).
+    """Return the same poses beside curves on few knots, and the covariance (n, n) of their control points.
 
-    `C_new = F C_old`, so the covariance is `F Sigma F'`, with Sigma that of the state's control points. The
-    optimum isn't solved for on few knots: such a curve passes its cones by a decimetre, on the same side in
-    every lap. In the first seconds that turns vehicle and map by up to a degree, several times the claimed
-    sigma.
+    The paper's Simplification: `C_new = F C_old`, so the covariance is `F Sigma F'`. The optimum isn't solved
+    for on few knots: such a curve passes its cones by a decimetre, on the same side in every lap, which turns
+    vehicle and map by up to a degree in the first seconds.
     """
     few, change = simplified(state, detections, settings)
     associate_again(few, detections, settings)
@@ -152,16 +152,12 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
 
 
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
-    """Return F (m_new, m_old): least squares over points of the old curve and their foot points on the new.
-
-    old_points (m_old, 2) and new_points (m_new, 2) are the curves' control points. An open dense curve goes
-    on beyond the ends of the new one, which doesn't count.
-    """
+    """Return F (m_new, m_old): least squares over points of the old curve and their feet on the new."""
     splines = old.spline(old_points), new.spline(new_points)
     if new.periodic:
 
         def nearest_on_new(u: Array) -> Array:
-            return find_anywhere(new, new_points, old.evaluate(old_points, u)).u
+            return new.find_anywhere(new_points, old.evaluate(old_points, u)).u
 
         return refit(*splines, nearest_on_new).new_from_old
     # an open curve that passes the same cones again lies on itself, so it is searched near the same place
@@ -191,10 +187,8 @@ class Scatter:
     """Distance of cones from the simplified curves: a variance to be added to that of the curves.
 
     `sigma^2(u) = seen^2 + (d / s)^2 (unseen^2 - seen^2)`, where d is the distance along the curve from u to
-    the nearest detected cone, and s is the usual distance of two such cones. A cone that was never detected
-    (d = s) is missed by as much as a detected one that is left out of knots and fit (cross-validation).
-    Without the scatter, the claimed covariance is right at detected cones, and several times too small at the
-    others.
+    the nearest detected cone, and s the usual distance of two such cones. A cone that was never detected (d =
+    s) is missed by as much as a detected one that is left out of knots and fit.
     """
 
     LENGTHS: ClassVar = {"seen": 1, "unseen": 1, "places": 1, "lengths": 1}
@@ -238,11 +232,7 @@ def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperS
 
 
 def cross_validated(points: Array, periodic: bool, settings: MapperSettings, share: float) -> Array:
-    """Return the distance of each cone (k, 2) from a curve that is fitted without it, in m, in any order.
-
-    `share` is the number of control points per cone. The first and the last cone of an open curve are never
-    left out, since nothing is known beyond them.
-    """
+    """Return the distance of each cone (k, 2) from a curve that is fitted without it, in m, in any order."""
     number = np.arange(len(points))
     ends = np.zeros(len(points), bool) if periodic else (number == 0) | (number == len(points) - 1)
     distances = [np.zeros(0)]

@@ -144,7 +144,7 @@ def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
     """Return the shortest path length after which the curvature of dead-reckoned poses (P, 3) recurs.
 
     From the first lag whose correlation is a large share of the best one's, the search climbs to a lag that
-    is the best within `closing.radius` after it. That is the lap.
+    is the best within `closing.radius` after it.
     """
     closing, driven = settings.closing, path_lengths(poses)
     profile = profile_of(poses, driven)
@@ -176,9 +176,8 @@ class Profile:
     def correlations(self, lags: IntArray, settings: ClosingSettings) -> Array:
         """Return how well the curvature agrees with itself each of the lags (l,) later, in samples.
 
-        The result (l,) is `1 - mean((a - b)^2) / (mean(a^2) + mean(b^2))`, 1 where both are the same. It is
-        -inf where the path isn't back at about the same place and heading after that lag, by the limits of a
-        loop closure. All sums over the overlap come from a Fourier transform.
+        `1 - mean((a - b)^2) / (mean(a^2) + mean(b^2))`, and -inf where the path isn't back at about the same
+        place and heading, by the limits of a loop closure. The sums come from a Fourier transform.
         """
         off = self.position - self.position.mean(axis=0)
         place, curvature = off[:, 0] + 1j * off[:, 1], self.curvature.astype(complex)
@@ -227,11 +226,7 @@ def start_odometry(
     settings: MapperSettings,
     recurrence: Recurrence | None = None,
 ) -> State:
-    """Return poses by dead reckoning, and curves through the cones that were seen in the first lap.
-
-    Where the path recurs, every lap is made to pass the same places first, and the curves are closed;
-    otherwise they are open. By default the path driven says whether it recurs.
-    """
+    """Return poses by dead reckoning, and curves through the cones that were seen in the first lap."""
     calibration = np.array(settings.calibrations)
     poses = chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
     recurrence = recurrence or find_recurrence(poses, settings)
@@ -247,9 +242,8 @@ def start_odometry(
 def align_laps(chain: LogOdometry, recurrence: Recurrence) -> tuple[Array, Array]:
     """Return the poses (P, 3) and the calibration (2,) at which every lap passes the same reference poses.
 
-    Gauss-Newton minimizes the odometry's cost and that of the lap correspondences. The reference poses are
-    unknown, too: their keys are those of cycles after the last one. The search begins at the yaw-rate bias by
-    which the heading changes by whole turns in a lap.
+    Gauss-Newton on the odometry and the lap correspondences, from the yaw-rate bias by which the heading
+    changes by whole turns in a lap. The keys of the reference poses, also unknown, follow the last cycle's.
     """
     seconds = (chain.stamps[-1] - chain.stamps[0]) / (recurrence.driven[-1] / recurrence.lap)
     calibration = np.array([0.0, (recurrence.turn - recurrence.whole_turn) / seconds])
@@ -260,7 +254,7 @@ def align_laps(chain: LogOdometry, recurrence: Recurrence) -> tuple[Array, Array
     count = len(chain)
     for _ in range(ALIGN_STEPS):
         poses, calibration = variables.poses[:count], variables.calibration
-        rows = chain.rows(chain.terms(poses, calibration), poses[0], calibration)
+        rows = chain.rows(poses, calibration)
         rows.append(correspondences.rows(poses, variables.poses[count:]))
         step = Elimination(linear_graph(rows, variables), variables.layout).step(np.zeros(CALIBRATION_SIZE))
         variables.values = variables.values + step
@@ -300,24 +294,16 @@ class LapCorrespondences:
 
 
 def lap_correspondences(recurrence: Recurrence) -> LapCorrespondences:
-    """Return the correspondences of the poses nearest to where each lap passes each reference pose.
-
-    A lap has a whole number of reference poses, equally spaced by REFERENCE_STEP at most.
-    """
+    """Return the correspondences of the poses nearest to where each lap passes each reference pose."""
     count = max(int(np.ceil(recurrence.lap / REFERENCE_STEP)), 1)
     places = recurrence.driven / recurrence.lap * count
-    cycles = _nearest_cycles(places)
-    reference = np.mod(np.round(places[cycles]).astype(np.intp), count)
-    turns = recurrence.whole_turn * np.round((places[cycles] - reference) / count)
-    return LapCorrespondences(cycles, reference, turns)
-
-
-def _nearest_cycles(places: Array) -> IntArray:
-    """Return the cycle nearest to each whole number that the increasing places (P,) pass."""
     whole = np.arange(np.ceil(places[0]), np.floor(places[-1]) + 1.0)
     after = np.clip(np.searchsorted(places, whole), 1, len(places) - 1)
     nearer = np.abs(places[after - 1] - whole) < np.abs(places[after] - whole)
-    return np.unique(np.where(nearer, after - 1, after))
+    cycles = np.unique(np.where(nearer, after - 1, after))
+    reference = np.mod(np.round(places[cycles]).astype(np.intp), count)
+    turns = recurrence.whole_turn * np.round((places[cycles] - reference) / count)
+    return LapCorrespondences(cycles, reference, turns)
 
 
 def _begin_boundary(

@@ -1,36 +1,183 @@
 """The least-squares problem of a whole log: its cost at a state, and its linear factors there."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Final
 
 import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.residuals import ProjectionRows, project
+from pathspace_graph.factors.residuals import ProjectionRows, project, smoothness_matrix
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
-from pathspace_graph.front_end.log_odometry import LogOdometry, sensor_prior, sensor_prior_cost
+from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import SENSOR_KEY, Layout, are_poses, pose_keys
+from pathspace_graph.graph.variables import POINT, POSE, SENSOR_KEY, Layout, are_poses, indices, pose_keys
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .gauge import CurveGauge, curve_gauge
+from .association import headings
+
+POINTS_A_FACTOR: Final = 8
+"""Neighbouring control points in one factor of their anchors; it changes the speed, not the result."""
 
 
-def own_settings(settings: MapperSettings) -> MapperSettings:
-    """Return the settings with the batch's own values in the groups that it shares with online mapping."""
-    batch = settings.batch
-    return replace(
-        settings,
-        spline=replace(settings.spline, sigma_model=batch.sigma_model),
-        gauge=replace(settings.gauge, sigma_smoothness=batch.sigma_smoothness),
+@dataclass(frozen=True, eq=False)
+class CurveGauge:
+    """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness` of a curve.
+
+    p_k is the position of the pose that control point c_j began beside, h_k its heading, R_k its rotation,
+    and D is `smoothness_matrix`. Detections constrain nothing along a curve, so control points would slide
+    along it; held beside a pose they don't, and the map is as free as before.
+    """
+
+    label: int
+    keys: IntArray
+    """Keys (m,) of the control points."""
+    cycle: IntArray
+    """Perception cycles (m,) of the poses beside them."""
+    ahead: Array
+    """Distances (m,) of the control points ahead of their poses (m)."""
+    sigma: float
+    """Standard deviation of that distance (m)."""
+    smoothness: Array
+    """D (r, m)."""
+    sigma_smoothness: float
+    """Standard deviation of a second difference (m)."""
+    sigma_anchor: float
+    """Standard deviation (m) that holds each control point where it is linearized. The anchor has no
+    gradient, so it isn't part of the cost."""
+
+    def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
+        """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives."""
+        heading = headings(beside) / self.sigma
+        arm = control_points - beside[:, :2]
+        by_theta = heading[:, 0] * arm[:, 1] - heading[:, 1] * arm[:, 0]
+        residual = (heading * arm).sum(axis=1) - self.ahead / self.sigma
+        return residual, heading, np.column_stack([-heading, by_theta])
+
+    def beside(self, control_points: Array, poses: Array) -> Rows:
+        """Return `terms` as rows on [control point | pose], from all poses (P, 3)."""
+        residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
+        jacobian = np.column_stack([by_point, by_pose])
+        return Rows(self._keys_beside, jacobian, residual, owners(self.cycle, self.label))
+
+    def bending(self, control_points: Array, poses: Array) -> tuple[Array, Array, Array]:
+        """Return the second differences as the poses beside their middles see them, whitened (r, 2).
+
+        Also return their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
+        map frame they would turn with the map, and Gauss-Newton would take that turn for a change of shape.
+        """
+        neighbours, theta = self.neighbours, poses[self.middle_cycle, 2]
+        c, s = np.cos(theta), np.sin(theta)
+        turned = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
+        weights = np.take_along_axis(self.smoothness, neighbours, axis=1) / self.sigma_smoothness
+        in_map = (weights[:, :, None] * control_points[neighbours]).sum(axis=1)
+        residual = (turned @ in_map[:, :, None])[:, :, 0]
+        by_control = weights[:, None, :, None] * turned[:, :, None, :]
+        by_pose = np.zeros((len(residual), POINT, POSE))
+        by_pose[:, 0, 2], by_pose[:, 1, 2] = residual[:, 1], -residual[:, 0]
+        return residual, by_control.reshape(len(residual), POINT, -1), by_pose
+
+    def smooth(self, control_points: Array, poses: Array) -> Rows:
+        """Return `bending` as rows on [three control points | pose], two rows for each second difference."""
+        residual, by_control, by_pose = self.bending(control_points, poses)
+        keys = np.column_stack([self.keys[self.neighbours], pose_keys(self.middle_cycle)])
+        return Rows(
+            keys=np.repeat(keys, POINT, axis=0),
+            jacobian=np.concatenate([by_control, by_pose], axis=2).reshape(residual.size, -1),
+            residual=residual.ravel(),
+            owner=np.repeat(owners(self.middle_cycle, self.label), POINT),
+        )
+
+    @property
+    def neighbours(self) -> IntArray:
+        """Return the three control points (r, 3) of each second difference, by index."""
+        return np.asarray((np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys))
+
+    @property
+    def middle_cycle(self) -> IntArray:
+        """Return the cycle (r,) of the pose beside the middle of each second difference."""
+        return np.asarray(self.cycle[self.neighbours[:, 1]])
+
+    @property
+    def _keys_beside(self) -> IntArray:
+        return np.column_stack([self.keys, pose_keys(self.cycle)])
+
+    def anchor(self) -> Rows:
+        """Return rows that hold each control point where it is."""
+        keys = np.repeat(self.keys, POINT)
+        jacobian = np.tile(np.eye(POINT), (len(self.keys), 1)) / self.sigma_anchor
+        owner = np.asarray(-1 - self.label - 2 * (indices(keys) // POINTS_A_FACTOR))
+        return Rows(keys[:, None], jacobian, np.zeros(len(keys)), owner)
+
+    def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
+        """Return rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
+
+        They damp how it moves as seen from the pose beside it, in 1/m^2, and not a map that swings with its
+        poses.
+        """
+        arm = control_points - poses[self.cycle, :2]
+        by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
+        return Rows(
+            keys=np.repeat(self._keys_beside, POINT, axis=0),
+            jacobian=np.sqrt(weight) * np.column_stack([by_point, -by_point, by_theta.ravel()]),
+            residual=np.zeros(POINT * len(arm)),
+            owner=np.repeat(owners(self.cycle, self.label), POINT),
+        )
+
+    def carried(self, control_points: Array, poses: Array, poses_after: Array) -> Array:
+        """Return control points (m, 2) moved rigidly with the poses beside them, from and to (P, 3)."""
+        before, after = poses[self.cycle], poses_after[self.cycle]
+        turned = np.column_stack([np.zeros((len(before), 2)), after[:, 2] - before[:, 2]])
+        return after[:, :2] + to_map(control_points - before[:, :2], turned)
+
+    def cost(self, control_points: Array, poses: Array) -> float:
+        """Return half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""
+        beside, _, _ = self.terms(control_points, poses[self.cycle])
+        smooth = self.smoothness @ control_points / self.sigma_smoothness
+        return 0.5 * float(beside @ beside + (smooth**2).sum())
+
+
+def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
+    """Return the gauge that holds each control point where it is, beside a pose of a cycle before `until`."""
+    boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
+    mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
+    cycle = _nearest_poses(state, label, until, mean_spacing)
+    return CurveGauge(
+        label=label,
+        keys=state.keys(label),
+        cycle=cycle,
+        ahead=(headings(poses[cycle]) * (control_points - poses[cycle, :2])).sum(axis=1),
+        sigma=sigma,
+        smoothness=smoothness_matrix(boundary.abscissae, boundary.length if boundary.periodic else None),
+        sigma_smoothness=boundary.gauge.sigma_smoothness * mean_spacing,
+        sigma_anchor=boundary.gauge.sigma_anchor,
     )
+
+
+def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
+    """Return (m,) the pose nearest to where each control point acts, of those with the curve's direction.
+
+    On an open curve, which may have drifted over itself, it is within `room` (m) of the nearest along the
+    curve.
+    """
+    boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
+    u = boundary.abscissae
+    position, tangent = (boundary.evaluate(points, u, order) for order in (0, 1))
+    dx, dy = position[:, :1] - poses[:, 0], position[:, 1:] - poses[:, 1]
+    along = tangent[:, :1] * np.cos(poses[:, 2]) + tangent[:, 1:] * np.sin(poses[:, 2])
+    square = dx**2 + dy**2
+    square[along <= 0.0] += square.max(initial=0.0)
+    if not boundary.periodic:
+        away = np.abs(u[:, None] - state.pose_u[label][:until])
+        square[away > away.min(axis=1, keepdims=True) + room] = np.inf
+    return np.asarray(square.argmin(axis=1))
 
 
 @dataclass(frozen=True)
@@ -54,7 +201,7 @@ class Biweight:
     @property
     def ceiling(self) -> float:
         """Return the loss of a detection that isn't used, which is that at the gate."""
-        return float(self.loss(np.array([self.gate]))[0])
+        return self.gate**2 / 6.0
 
     def _inner(self, whitened: Array) -> Array:
         return np.maximum(1.0 - (whitened / self.gate) ** 2, 0.0)
@@ -92,8 +239,8 @@ class Evaluation:
     state: State
     projected: dict[int, Projected]
     """Used detections of each boundary."""
-    odometry: tuple[Array, Array]
-    """Residuals and derivatives of `LogOdometry.terms`."""
+    drive: list[Rows]
+    """Rows of odometry, priors and revisits."""
     cost: float
     """Half the sum of squares, with the robust losses of the detections."""
 
@@ -123,19 +270,19 @@ class BatchSystem:
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
         """Return the problem at a state; foot points are refined from those that the detections have.
 
-        `hold` sets what later evaluations keep. The derivatives leave out that the sigma depends on the
-        direction of the curve.
+        `hold` sets what later evaluations keep. That the sigma depends on the curve's direction has no
+        derivative.
         """
         projected = {label: self._project(state, label, hold) for label in state.boundaries}
-        odometry = self.chain.terms(state.poses, state.calibration)
-        cost = self._detections_cost(projected) + 0.5 * float((odometry[0] ** 2).sum())
+        drive = self.chain.rows_at(state.variables, self.settings.calibration)
+        drive += [one.rows(state.poses) for one in self.revisits]
+        used = sum(int(p.inside.sum()) for p in projected.values())
+        losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
+        cost = losses + self.kernel.ceiling * (len(self.detections) - used) + half_square(drive)
         cost += sum(
             self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
         )
-        cost += self.chain.prior_cost(state.poses[0], state.calibration)
-        cost += sensor_prior_cost(state.variables, self.settings.calibration)
-        cost += sum(0.5 * float((one.residual(state.poses) ** 2).sum()) for one in self.revisits)
-        return Evaluation(state, projected, odometry, cost)
+        return Evaluation(state, projected, drive, cost)
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
         detections, sensor = self.detections, state.variables.sensor
@@ -153,20 +300,10 @@ class BatchSystem:
         by = sensor_rows(foot.normal_unit, foot.distance, poses, measured, twists, sensor, rates)
         return Projected(rows, foot, projection, self._sigma[rows], self._inside[rows], by)
 
-    def _detections_cost(self, projected: dict[int, Projected]) -> float:
-        used = sum(int(p.inside.sum()) for p in projected.values())
-        losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
-        return losses + self.kernel.ceiling * (len(self.detections) - used)
-
     def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
-        """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights.
-
-        Other gauges than the problem's own may take their place.
-        """
+        """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights."""
         state = at.state
-        groups = self.chain.rows(at.odometry, state.poses[0], state.calibration)
-        groups += sensor_prior(state.variables, self.settings.calibration)
-        groups += [one.rows(state.poses) for one in self.revisits]
+        groups = [*at.drive]
         for label, gauge in (gauges or self.gauges).items():
             points = state.control_points(label)
             groups += [

@@ -26,11 +26,11 @@ from pathspace_graph.settings.online import LimitSettings
 UNITS: Final = "stamps are in seconds"
 """Hint where a stamp looks like one in milliseconds or nanoseconds."""
 TWIST: Final = ("vx", "vy", "wz")
+UNIT: Final = ("m/s", "m/s", "rad/s")
 MAX_STAMP: Final = 1e11
 """Largest stamp, s: some three thousand years. Stamps in nanoseconds are larger."""
 MIN_INTERVAL: Final = 1e-3
-"""Least time from a cycle to the next, s. Between nearer ones the odometry is so certain that the system
-loses its digits."""
+"""Least time from a cycle to the next, s: between nearer ones the odometry is too certain for doubles."""
 MAX_TWISTS: Final = 100_000
 MAX_DETECTIONS: Final = 500
 """Largest numbers of twists and detections in a cycle, which bound its time."""
@@ -88,10 +88,9 @@ def admit(
 ) -> Admitted:
     """Return a cycle as an estimator may use it, or raise a ReadingError.
 
-    A cycle that is older than the newest one is late. It is admitted where it lies between the stamps (s) of
-    the `window`, whose poses can still take detections, unless its stamp is among those `used`. The twists
-    are a stream, and need not begin at the newest cycle: each is held until the next one, and what was in
-    force before the newest cycle is left out.
+    A late cycle, older than the newest one, is admitted between the stamps (s) of the `window`, whose poses
+    can still take detections, unless its stamp is among those `used`. Each twist is held until the next one,
+    and what was in force before the newest cycle is left out.
     """
     t = _stamp(_of_type(Detections, detections, "detections").t)
     try:
@@ -229,23 +228,23 @@ def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, A
     twists = _numbers(odometry.twist, "odometry.twist", (len(stamps), len(TWIST)))
     if len(stamps) > MAX_TWISTS:
         raise ReadingError("odometry.t", f"at most {MAX_TWISTS} twists", len(stamps))
-    good = np.abs(stamps) <= MAX_STAMP
-    if not good.all():
-        row = int(good.argmin())
-        expected = f"at most {MAX_STAMP:g} s ({UNITS})"
-        raise ReadingError("odometry.t", expected, float(stamps[row]), row)
-    good = stamps[1:] > stamps[:-1]
-    if not good.all():
-        row = int(good.argmin()) + 1
-        raise ReadingError("odometry.t", "a stamp later than the one before", float(stamps[row]), row)
+    _require(np.abs(stamps) <= MAX_STAMP, "odometry.t", f"at most {MAX_STAMP:g} s ({UNITS})", stamps)
+    later = np.append(True, stamps[1:] > stamps[:-1])[: len(stamps)]
+    _require(later, "odometry.t", "a stamp later than the one before", stamps)
     most = limits.speed, limits.speed, limits.yaw_rate
     good = np.abs(twists) <= most
     if not good.all():
         row, column = divmod(int(good.argmin()), len(TWIST))
-        unit = "rad/s" if column == len(TWIST) - 1 else "m/s"
-        expected = f"{TWIST[column]} from -{most[column]:g} to {most[column]:g} {unit}"
+        expected = "{0} from -{1:g} to {1:g} {2}".format(TWIST[column], most[column], UNIT[column])
         raise ReadingError("odometry.twist", expected, float(twists[row, column]), row)
     return stamps, twists
+
+
+def _require(good: BoolArray, field: str, expected: str, values: NDArray[Any]) -> None:
+    """Raise a ReadingError about the first of the values (n,) that is not good (n,)."""
+    if not good.all():
+        row = int(good.argmin())
+        raise ReadingError(field, expected, values[row].item(), row)
 
 
 def _since(stamps: Array, twists: Array, newest: Newest) -> tuple[Array, Array]:
@@ -262,19 +261,16 @@ def _since(stamps: Array, twists: Array, newest: Newest) -> tuple[Array, Array]:
 
 
 def possible_detections(detections: Detections, t: float, limits: LimitSettings) -> tuple[Detections, str]:
-    """Return the possible detections of a cycle at t (s), and a notice about the others.
-
-    A detection is possible if it is finite, within the ranges and the uncertainties of any sensor, and if its
-    covariance is symmetric and positive definite. Wrong shapes, types or labels are a ReadingError.
-    """
+    """Return the possible detections of a cycle at t (s), and a notice about the others."""
     points = _numbers(detections.points_vehicle, "detections.points_vehicle", (-1, 2))
     count = len(points)
     covariances = _numbers(detections.covariances, "detections.covariances", (count, 2, 2))
     labels = _labels(detections.labels, count)
     if count > MAX_DETECTIONS:
         raise ReadingError("detections.points_vehicle", f"at most {MAX_DETECTIONS} rows", count)
-    near, definite = _has_range(points, limits.range_max), _has_covariance(covariances)
-    good = near & definite
+    distance = np.hypot(points[:, 0], points[:, 1])  # not that of a point that is not finite
+    near = (distance >= MIN_RANGE) & (distance <= limits.range_max)
+    good = near & _has_covariance(covariances)
     if good.all():
         return Detections(t, points, covariances, labels), ""
     row = int(good.argmin())
@@ -288,17 +284,8 @@ def possible_detections(detections: Detections, t: float, limits: LimitSettings)
     return Detections(t, points[good], covariances[good], labels[good]), notice
 
 
-def _has_range(points: Array, most: float) -> BoolArray:
-    """Return whether points (m, 2), vehicle frame, are where a sensor can see; those not finite are not."""
-    distance = np.hypot(points[:, 0], points[:, 1])
-    return np.asarray((distance >= MIN_RANGE) & (distance <= most))
-
-
 def _has_covariance(covariances: Array) -> BoolArray:
-    """Return whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible size.
-
-    The smaller eigenvalue is the determinant by the larger one.
-    """
+    """Return whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible size."""
     xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
         det = xx * yy - xy * yx
@@ -314,11 +301,8 @@ def _labels(values: Any, count: int) -> IntArray:
     labels = _array(values, field, (count,))
     if count and labels.dtype.kind not in "iu":
         raise ReadingError(field, "integers", labels.dtype)
-    good = (labels >= LEFT) & (labels < len(NAMES))
-    if not good.all():
-        row = int(good.argmin())
-        known = ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
-        raise ReadingError(field, f"one of {known}", labels[row], row)
+    known = ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
+    _require((labels >= LEFT) & (labels < len(NAMES)), field, f"one of {known}", labels)
     return labels.astype(np.int_)
 
 

@@ -48,38 +48,31 @@ class LogOdometry:
         return np.array(poses)
 
     def terms(self, poses: Array, calibration: Array) -> tuple[Array, Array]:
-        """Return whitened residuals (P - 1, 3) and their derivatives (P - 1, 3, 8).
-
-        The columns of the derivatives are [calibration | pose | next pose].
-        """
+        """Return whitened residuals (P - 1, 3), derivatives (P - 1, 3, 8) by [calibration | pose | next]."""
         return self.odometry.terms(slice(None), poses, calibration)
 
-    def prior_cost(self, first: Array, calibration: Array) -> float:
-        """Return the cost of the priors on the first pose (3,) and on the calibration (2,)."""
-        off = first - self.first
-        whitened = (calibration - self.calibration_mean) / self.calibration_sigma
-        cost = 0.5 * float(off @ self.first_information @ off + whitened @ whitened)
-        return cost + sum(0.5 * float((rows.residual**2).sum()) for rows in self._measured_bias(calibration))
-
-    def rows(self, terms: tuple[Array, Array], first: Array, calibration: Array) -> list[Rows]:
-        """Return the rows of `terms`, and of both priors at a first pose (3,) and a calibration (2,)."""
+    def rows(self, poses: Array, calibration: Array) -> list[Rows]:
+        """Return the rows of `terms` and `priors` at poses (P, 3) and a calibration (2,)."""
         start = np.arange(len(self.odometry))
-        root = np.asarray(np.linalg.cholesky(self.first_information).T, np.float64)
-        return [
-            odometry_rows(start, terms, owners(start)),
-            _prior(pose_key(0), root, first - self.first),
-            _prior(
-                CALIBRATION_KEY, np.diag(1.0 / self.calibration_sigma), calibration - self.calibration_mean
-            ),
-            *self._measured_bias(calibration),
-        ]
+        odometry = odometry_rows(start, self.terms(poses, calibration), owners(start))
+        return [odometry, *self.priors(poses[0], calibration)]
 
-    def _measured_bias(self, calibration: Array) -> list[Rows]:
-        """Return the row `(b - value) / sigma` of a bias that was measured at rest, or none."""
-        if self.bias is None:
-            return []
-        root = np.array([[0.0, 1.0 / self.bias.sigma]])
-        return [_prior(CALIBRATION_KEY, root, calibration - [0.0, self.bias.value])]
+    def rows_at(self, variables: Variables, settings: CalibrationSettings) -> list[Rows]:
+        """Return all rows at the values of variables, with the prior of the sensor's calibration."""
+        return self.rows(variables.poses, variables.calibration) + sensor_prior(variables, settings)
+
+    def priors(self, first: Array, calibration: Array) -> list[Rows]:
+        """Return the rows of the priors at a first pose (3,) and a calibration (2,)."""
+        root = np.asarray(np.linalg.cholesky(self.first_information).T, np.float64)
+        weights = np.diag(1.0 / self.calibration_sigma)
+        priors = [
+            _prior(pose_key(0), root, first - self.first),
+            _prior(CALIBRATION_KEY, weights, calibration - self.calibration_mean),
+        ]
+        if self.bias is not None:
+            root = np.array([[0.0, 1.0 / self.bias.sigma]])
+            priors.append(_prior(CALIBRATION_KEY, root, calibration - [0.0, self.bias.value]))
+        return priors
 
 
 def _prior(key: int, root: Array, off: Array) -> Rows:
@@ -104,9 +97,6 @@ def chained(
     )
 
 
-# --- calibrations ----------------------------------------------------------------------------------------
-
-
 def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Rows]:
     """Return the rows `(b - mean) / sigma` of the sensor's calibration b; none where it is not estimated."""
     if len(variables.sensor) == 0:
@@ -115,6 +105,6 @@ def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Ro
     return [_prior(SENSOR_KEY, root, variables.sensor - settings.means)]
 
 
-def sensor_prior_cost(variables: Variables, settings: CalibrationSettings) -> float:
-    """Return half the sum of squares of `sensor_prior`."""
-    return sum(0.5 * float((rows.residual**2).sum()) for rows in sensor_prior(variables, settings))
+def half_square(groups: Sequence[Rows]) -> float:
+    """Return half the sum of the squared residuals."""
+    return sum(0.5 * float((rows.residual**2).sum()) for rows in groups)

@@ -42,8 +42,7 @@ MISFIT: Final = 1.5
 MISFIT_GAIN: Final = 0.02
 """Smoothing gain of the mean-square misfit."""
 MAX_MISFIT: Final = 3.0
-"""Largest misfit that tells a motion. It is about 1 where the vehicle has moved, and 4 and more where it was
-put down elsewhere."""
+"""Largest misfit that tells a motion: about 1 where the vehicle moved, 4 where it was put down elsewhere."""
 MISFIT_ODOMETRY: Final = 2.0
 """Least misfit at the odometry's own pose in a contradiction."""
 MISFIT_RATIO: Final = 1.3
@@ -53,8 +52,7 @@ MAX_CHANGE: Final = 3.5
 SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)
 """Standard deviations (m/s, m/s, rad/s) of a velocity's change in a cycle whose odometry is not believed."""
 BEFORE: Final = 0.5
-"""Share of a contradiction's size that is added to the standard deviation of its motion, since it may have
-begun a few cycles before it was noticed."""
+"""Share of a contradiction's size added to its motion's sigma: it may have begun a few cycles before."""
 WIDENING: Final = 1.5
 """Factor of the standard deviations of a motion told from detections, since the estimator uses them again."""
 HOLD: Final = 0.15
@@ -62,8 +60,7 @@ HOLD: Final = 0.15
 HOLD_INTERVALS: Final = 3.0
 """Shortest intervals between two twists for which it is held so; the longer time counts."""
 STUCK: Final = 3
-"""Twists in a cycle that are equal to the one before, to the last digit, from which readings have stuck where
-the vehicle could not change its velocity so."""
+"""Twists in a cycle equal to the one before from which readings are stuck, if no vehicle moves so."""
 REST: Final = 1.0
 """Time of standing from which the vehicle is at rest, s: its mean yaw rate measures the bias then."""
 REST_TWIST: Final = (0.1, 0.1, 0.05)
@@ -102,10 +99,9 @@ class MotionCheck:
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
     def believe(self, sigma: Array) -> None:
-        """Take other standard deviations (3,) of a twist (m/s, m/s, rad/s) from now on.
+        """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten.
 
-        The errors of the sensor are taken out of the detections from now on, so what was learned of them is
-        forgotten.
+        Its errors are taken out of the detections from now on.
         """
         self.sigma = self._rest.sigma = sigma
         self._recent, self.errors = RecentDetections(), SensorErrors(self.settings)
@@ -198,7 +194,8 @@ class MotionCheck:
         if near is not None and near.misfit > MAX_MISFIT * self._excess:
             near = None
         told = near is not None and near.matched >= MIN_DOUBTING
-        stuck = motion.stuck and not told and self._has_jumped(odometry, going_on, dt)
+        jumped = (np.abs(odometry.delta - going_on) > np.array(SIGMAS_CHANGE) * dt).any()
+        stuck = motion.stuck and not told and bool(jumped)  # no vehicle changes its velocity so
         failed = motion.missing or (stuck and self.settings.doubt < np.inf)
         if near is not None and not failed:
             difference = self._difference(odometry, predicted, near)
@@ -211,11 +208,9 @@ class MotionCheck:
             return motion
         best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
         denied = best is not None and self._denies(best, self._difference(odometry, predicted, best))
-        if failed or (
-            best is not None and denied and self._fits_better(best, predicted, detections, variances)
-        ):
-            return self._replaced(motion, best, going_on, dt)
-        return motion
+        if denied and not failed:
+            failed = best is not None and self._fits_better(best, predicted, detections, variances)
+        return self._replaced(motion, best, going_on, dt) if failed else motion
 
     def _fits_better(self, best: Match, predicted: Array, detections: Detections, variances: Array) -> bool:
         """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match.
@@ -231,11 +226,7 @@ class MotionCheck:
     def _best(
         self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float
     ) -> Match | None:
-        """Return the better match of those that begin at two poses (3,), the first going on as before.
-
-        A vehicle that was put down elsewhere sees other cones, which agree with no motion, or with one that
-        no vehicle can make. Nothing is told from them.
-        """
+        """Return the better match of those that begin at two poses (3,), the first going on as before."""
         matches = [self._match(detections, variances, start, reaches()) for start in starts]
         possible = [one for one in matches if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)
@@ -252,10 +243,6 @@ class MotionCheck:
         off, covariance = difference.off, self.errors.covariance_of(difference)
         enough = matched.matched >= MIN_DOUBTING
         return enough and bool(off @ np.linalg.solve(covariance, off) > self._limit**2)
-
-    def _has_jumped(self, odometry: IntegratedOdometry, going_on: Array, dt: float) -> bool:
-        """Return whether a motion differs from going on (3,) as before by more than a vehicle can do."""
-        return bool((np.abs(odometry.delta - going_on) > np.array(SIGMAS_CHANGE) * dt).any())
 
     def _match(
         self, detections: Detections, variances: Array, start: Array, reaches: Sequence[float]
@@ -290,7 +277,7 @@ class MotionCheck:
             difference = self._difference(odometry, compose(self.pose, odometry.delta), best)
             near = DOUBT_RATE * np.sqrt(self.errors.covariance_of(difference)[2, 2])
             gyro_is_right = abs(difference.off[2]) <= near
-            if gyro_is_right and not motion.missing and not motion.stuck:
+            if gyro_is_right and not (motion.missing or motion.stuck):
                 mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
             turn = _to_vehicle(best.pose[2])
             information = turn @ best.information @ turn.T / (WIDENING**2 * self._excess)
@@ -322,7 +309,7 @@ class Rest:
     def update(self, odometry: Odometry, t: float) -> bool:
         """Return whether the vehicle has stood for long enough at t (s), by the twists since the last cycle.
 
-        Its mean twist must be zero within its own noise, and within the limits of a vehicle that stands.
+        Its mean twist is zero within its own noise, and within the limits of a vehicle that stands.
         """
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
         if (

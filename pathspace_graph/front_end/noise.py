@@ -129,9 +129,8 @@ class NoiseLearner:
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
         """Return settings with measured priors of the calibrations where one of the old ones is contradicted.
 
-        An error b is contradicted where `|b - m| > doubt hypot(sigma, sigma_prior)`. Then the sensor is not
-        what it was said to be, and all of its errors are what was measured. Of ranges and speeds only the
-        ratio can be seen: the scale of one is held, that of the other is what was measured.
+        `|b - m| > doubt hypot(sigma, sigma_prior)` contradicts the prior of an error b, and then all errors
+        are what was measured. Of ranges and speeds only the ratio can be seen: the scale of one is held.
         """
         measured, sensor = self.measured, settings.calibration
         contradicted = self._contradicted(settings)
@@ -153,10 +152,7 @@ class NoiseLearner:
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
     def _contradicted(self, settings: MapperSettings) -> BoolArray:
-        """Return which errors (5,) of the sensor are measured, and contradict their priors.
-
-        What is measured of the scale of the ranges is its ratio to that of the speeds.
-        """
+        """Return which errors (5,) of the sensor are measured, and contradict their priors."""
         measured, sensor = self.measured, settings.calibration
         if not self.of_sensor or measured is None or measured.along is None or not sensor.sensor:
             return np.zeros(SENSOR_SIZE, bool)
@@ -166,10 +162,7 @@ class NoiseLearner:
         return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, prior))
 
     def used(self, settings: MapperSettings) -> RunNoise:
-        """Return the noise that is used, and what sets the size of the map where ranges and speeds disagree.
-
-        They do where `calibrated` finds that the scale of the ranges contradicts its prior.
-        """
+        """Return the noise used, and what sets the size of the map where ranges and speeds disagree."""
         measured = self.measured
         size: Literal["odometry", "ranges"] | None = None
         if self._contradicted(settings)[SCALE]:

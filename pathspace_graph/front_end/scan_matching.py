@@ -37,8 +37,7 @@ MOST_REMEMBERED: Final = 2000
 """Largest number of remembered detections, which bounds the time of a match."""
 REACH: Final = 1.0
 REACH_LAST: Final = 0.4
-"""Reach in the first and in the last iteration, m: a remembered detection at distance d has the weight
-`exp(-d^2 / 2 reach^2)`. Cones of a row are some 3 m apart."""
+"""Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
 ITERATIONS: Final = 6
 REACHES_CHECK: Final = (REACH, REACH_LAST)
 """Reaches in the check of the odometry, which begins near the solution."""
@@ -66,11 +65,7 @@ def reaches(iterations: int = ITERATIONS) -> list[float]:
 
 
 class RecentDetections:
-    """Detections of the newest cycles in one frame.
-
-    They are corrected by the newest errors of the sensor, so that a cone stays where it is when more is
-    learned.
-    """
+    """Detections of the newest cycles in one frame."""
 
     def __init__(self) -> None:
         self.points: Array = np.zeros((0, 2))
@@ -107,7 +102,7 @@ class RecentDetections:
 
     def has(self, points: Array) -> BoolArray:
         """Return whether each point (m, 2) lies where an earlier detection does."""
-        return np.asarray(_means(points, self.points, REACH_LAST)[1] > MIN_WEIGHT)
+        return np.asarray(_weighted_means(points, self.points, REACH_LAST, FARTHEST)[1] > MIN_WEIGHT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,10 +135,9 @@ def match(
 ) -> Match:
     """Lay detections (m, 2), vehicle frame, on the recent ones by Gauss-Newton steps from a pose (3,).
 
-    Each step minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2` with m_i the weighted mean of the recent
-    detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) + SIGMA_CONE^2` with n_i the sum of
-    the weights. There is a step for each of the reaches (m). The variances (m,) are those of one coordinate
-    (m^2).
+    Each step, one for each of the reaches (m), minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2`, m_i being
+    the weighted mean of the recent detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) +
+    SIGMA_CONE^2` with n_i the sum of the weights. The variances (m,) are those of one coordinate (m^2).
     """
     pose = start.copy()
     for reach in reaches:
@@ -168,10 +162,7 @@ def _matched(
     reach: float,
     limits: tuple[float, float, float, float],
 ) -> tuple[Array, Array, BoolArray, float]:
-    """Return information (3, 3), gradient (3,), which detections (m,) are matched, and their weighted cost.
-
-    These are of a step of `match`, whose limits are FARTHEST, MIN_WEIGHT, HUBER and SIGMA_CONE.
-    """
+    """Return information (3, 3), gradient (3,), which detections (m,) match, and their weighted cost."""
     farthest, min_weight, huber, sigma_cone = limits
     points = to_map(points_vehicle, pose[None])
     means, weights = _weighted_means(points, recent, reach, farthest)
@@ -180,31 +171,31 @@ def _matched(
     precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + sigma_cone**2)
     square = (off * off).sum(axis=1)
     precision *= huber_weights(np.sqrt(square * precision), huber)
-    information, gradient = _normal_equations(off, arm, precision)
+    ax, ay = arm.T
+    ex, ey = off.T
+    w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
+    turning = precision @ (ax * ax + ay * ay)
+    information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
+    gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
     return information, gradient, matched, float(square @ precision)
 
 
 def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:
-    """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given.
-
-    Each counts at most `MOST_MISFIT`, and as much where nothing was detected before.
-    """
+    """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given."""
     points = to_map(points_vehicle, pose[None])
-    means, weights = _means(points, recent.points, REACH_LAST)
+    means, weights = _weighted_means(points, recent.points, REACH_LAST, FARTHEST)
     matched = weights > MIN_WEIGHT
     variance = variances * (1.0 + 1.0 / np.where(matched, weights, 1.0)) + SIGMA_CONE**2
     square = np.where(matched, ((points - means) ** 2).sum(axis=1) / variance, MOST_MISFIT)
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
 
-def _means(points: Array, recent: Array, reach: float) -> tuple[Array, Array]:
-    """Return the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights."""
-    return _weighted_means(points, recent, reach, FARTHEST)
-
-
 @compiled
 def _weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
-    """Return `_means`, with weights `exp(-d^2 / 2 reach^2)` below a distance of `farthest` reaches."""
+    """Return the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights.
+
+    The weights are `exp(-d^2 / 2 reach^2)` below a distance of `farthest` reaches.
+    """
     dx = points[:, 0, None] - recent[:, 0]
     dy = points[:, 1, None] - recent[:, 1]
     square = (dx * dx + dy * dy) / reach**2
@@ -213,26 +204,11 @@ def _weighted_means(points: Array, recent: Array, reach: float, farthest: float)
     return (weights @ recent) / np.maximum(total, _TINY)[:, None], total
 
 
-def _normal_equations(off: Array, arm: Array, precision: Array) -> tuple[Array, Array]:
-    """Return the information (3, 3) and the gradient (3,) of offsets (m, 2) by (x, y, theta)."""
-    ax, ay = arm.T
-    ex, ey = off.T
-    w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
-    turning = precision @ (ax * ax + ay * ay)
-    information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
-    gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
-    return information, gradient
-
-
 # --- errors of the sensor --------------------------------------------------------------------------------
 
 
 def by_errors(points_vehicle: Array, twist: Array) -> Array:
-    """Return the derivatives (m, 2, 2) of detections (m, 2), vehicle frame, by the yaw and by the latency.
-
-    The vehicle moved with the twist (3,), in m/s, m/s and rad/s. They are two columns of
-    `factors.sensor:by_sensor`.
-    """
+    """Return the derivatives (m, 2, 2) of detections (m, 2), vehicle frame, by the yaw and by the latency."""
     columns = np.empty((len(points_vehicle), 2, len(ERRORS)))
     columns[:, :, 0] = left_of(points_vehicle)
     columns[:, :, 1] = -twist[:2] - twist[2] * columns[:, :, 0]
@@ -254,12 +230,9 @@ class Difference:
 class SensorErrors:
     """Kalman filter of the errors e = (yaw, latency) of the sensor, in rad and s.
 
-    Detections are corrected by the mean. What is left of the errors shifts a match by
-
-        (d_y, -d_x, 0) (yaw),   mean v - v (latency)
-
-    in the vehicle frame, where d is the way from the place from which the remembered detections were seen in
-    the mean, v the velocity, and mean v that while they were seen.
+    Detections are corrected by the mean. What is left shifts a match, in the vehicle frame, by `(d_y, -d_x,
+    0)` (yaw) and `mean v - v` (latency). d is the way from the mean place from which the remembered
+    detections were seen, v the velocity, and mean v that while they were seen.
     """
 
     def __init__(self, settings: MotionSettings) -> None:
@@ -292,8 +265,8 @@ class SensorErrors:
     def shifts(self, way: Array, velocity: Array) -> Array:
         """Return the derivatives (3, 2) of how far a match is off the odometry, by the errors.
 
-        The way (2,) and the velocity (3,) are in the vehicle frame, in m, m/s, m/s and rad/s. No vehicle
-        changes its velocity by more than its accelerations: that is slip, and not to be taken for latency.
+        Way (2,) and velocity (3,) are in the vehicle frame (m, m/s, m/s, rad/s). Changes of the velocity
+        beyond the accelerations of a vehicle are slip, and not latency.
         """
         shifts = np.empty((3, len(ERRORS)))
         shifts[:, 0] = way[1], -way[0], 0.0

@@ -6,8 +6,6 @@ no colour, two rows of cones are followed from beside the vehicle ahead, each co
 better. What is in neither of them stays unknown.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
@@ -50,7 +48,7 @@ SURE: Final = 3.0
 BESIDE: Final = 2.0
 """Distance along the path within which cones stand beside each other, m."""
 LATERAL_GAP: Final = 0.8
-"""Distance from a cone beside it that is nearer to the path, beyond which a cone is of another stretch, m."""
+"""Distance from a nearer cone beside it beyond which a cone is of another stretch, m."""
 HALF_WIDTH: Final = 1.5
 """Distance beside the vehicle at which a row without any cone begins, m."""
 GAP: Final = 8.0
@@ -84,8 +82,8 @@ class SideJudge:
     ) -> Detections:
         """Return the detections of a cycle with the labels of their sides.
 
-        The pose (3,) is in the frame of the front end, and the vehicle came there with twists (k, 3). In a
-        lane between orange cones it isn't on the road yet, and the colours of others prove nothing.
+        The vehicle came to the pose (3,), in the frame of the front end, with twists (k, 3). In a lane of
+        orange cones it isn't on the road yet, and the colours of others prove nothing.
         """
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
         if not self.colourless and self._agreeing + self._opposing >= ENOUGH_VOTES:
@@ -159,12 +157,8 @@ class SideJudge:
 
     def _beginning(
         self, label: int, pose: Array, path: PathAhead, seen: IntArray, stations: Array, lateral: Array
-    ) -> Row:
-        """Return the row of a boundary beside the vehicle, where the path tells the side of each cone.
-
-        Of cones beside one another, only the nearest to the path is in the row. The cones `seen` (k,) are at
-        these stations and lateral distances (k,). A row without any cone begins beside the vehicle.
-        """
+    ) -> "Row":
+        """Return the row of a boundary beside the vehicle, where the path tells the side of each cone."""
         side = SIDES[label] * lateral
         beside = (side > MIN_LATERAL) & (side < MAX_LATERAL)
         beside &= (stations > path.driven - BEHIND) & (stations < path.driven + SURE)
@@ -200,10 +194,9 @@ class Row:
 def follow_rows(rows: Mapping[int, Row], points: Array, votes: IntArray, free: IntArray) -> None:
     """Lead both rows on through free cones (k,), as long as it is clear which cone comes next.
 
-    All cones (n,) have points (n, 2) in m, and votes (n, 2) for the left and the right boundary. The next
-    cone is the one with the least `distance (1 + TURN_COST turn^2)` from the end of its row. It must be far
-    cheaper for that row than for the other one. Where it is not, both rows end: two rows could be confused
-    there.
+    All cones (n,) have points (n, 2) in m, and votes (n, 2) for left and right. The next cone has the least
+    `distance (1 + TURN_COST turn^2)` from the end of its row, and is far dearer for the other row. Else both
+    rows end: they could be confused there.
     """
     left = free.tolist()
     while left:
@@ -221,10 +214,7 @@ def follow_rows(rows: Mapping[int, Row], points: Array, votes: IntArray, free: I
 def _costs(
     rows: Mapping[int, Row], label: int, points: Array, votes: IntArray, cones: IntArray
 ) -> tuple[Array, Array]:
-    """Return what it costs a row to lead on to cones (k,), and how far they are from its end (m).
-
-    The cost is infinite where the row may not lead on there.
-    """
+    """Return what it costs a row to lead on to cones (k,), and how far they are from its end (m)."""
     row, other = rows[label], rows[LEFT + RIGHT - label]
     dx, dy = (points[cones] - row.end).T
     distance, turn = np.hypot(dx, dy), wrap_angle(np.arctan2(dy, dx) - row.heading)
@@ -252,24 +242,17 @@ class NearCones:
 
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:
         """Add detections at points (m, 2) with labels (m,), seen at t (s); return the cone (m,) of each."""
-        self._forget(t)
+        kept = newest_of(self._last, MAX_CONES) & (self._last > t - FORGET_AFTER)
+        for name, column in vars(self).items():
+            setattr(self, name, column[kept])
         cones, known = nearest_within(points, self.points, MERGE_RADIUS)
         new = int((~known).sum())
         cones[~known] = len(self.points) + np.arange(new)
-        if new > 0:
-            self.points = np.concatenate([self.points, np.zeros((new, 2))])
-            self.counts = np.concatenate([self.counts, np.zeros(new, np.intp)])
-            self.votes = np.concatenate([self.votes, np.zeros((new, len(BOUNDARIES)), np.intp)])
-            self.judged = np.concatenate([self.judged, np.zeros(new, bool)])
-            self._last = np.concatenate([self._last, np.full(new, t)])
+        for name, column in vars(self).items() if new else ():
+            setattr(self, name, np.concatenate([column, np.zeros((new, *column.shape[1:]), column.dtype)]))
         coloured = labels != UNKNOWN
         np.add.at(self.votes, (cones[coloured], labels[coloured]), 1)
         np.add.at(self.counts, cones, 1)
         np.add.at(self.points, cones, (points - self.points[cones]) / self.counts[cones, None])
         self._last[cones] = t
         return cones
-
-    def _forget(self, t: float) -> None:
-        kept = newest_of(self._last, MAX_CONES) & (self._last > t - FORGET_AFTER)
-        self.points, self.counts, self.votes = self.points[kept], self.counts[kept], self.votes[kept]
-        self.judged, self._last = self.judged[kept], self._last[kept]

@@ -1,7 +1,5 @@
 """Sightings of cones, followed by dead reckoning, and the twists of a drive: what noise is measured from."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
@@ -53,18 +51,18 @@ class Sightings:
     """(n, 3) Derivative of that pose by the bias of the yaw rate."""
 
     @classmethod
-    def none(cls) -> Sightings:
+    def none(cls) -> "Sightings":
         empty = np.zeros(0)
         return cls(
             empty.astype(np.intp), empty, empty.reshape(0, 2), *(empty.reshape(0, 3) for _ in range(3))
         )
 
-    def where(self, rows: IntArray | BoolArray | slice) -> Sightings:
+    def where(self, rows: IntArray | BoolArray | slice) -> "Sightings":
         """Return some of the rows."""
         return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     @classmethod
-    def stacked(cls, tables: list[Sightings]) -> Sightings:
+    def stacked(cls, tables: "list[Sightings]") -> "Sightings":
         """Return the rows of several tables, one after the other."""
         return cls(*(np.concatenate([getattr(one, column.name) for one in tables]) for column in fields(cls)))
 
@@ -141,15 +139,6 @@ class Follower:
             self._by_bias = self._by_bias + np.array([-moved[1] * middle, moved[0] * middle, -(t - self._t)])
         self._pose, self._t = pose.copy(), t
 
-    def _gates(self, ranges: Array) -> tuple[Array, Array]:
-        """Return how far along and across its ray a detection (m,) may be from its cone (m)."""
-        known = self._known
-        if known.along is None or known.across is None:
-            round_gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
-            return round_gate, round_gate
-        along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
-        return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
-
     def _nearest_cone(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array
     ) -> tuple[IntArray, Array]:
@@ -163,15 +152,20 @@ class Follower:
 
     def _square(self, points: Array, others: Array, ranges: Array, pose: Array) -> Array:
         """Return the square (m, n) of the distances of points (m, 2) from others (n, 2) in their gates."""
-        return _gated_squares(points, others, pose[:2], *self._gates(ranges))
+        known = self._known
+        if known.along is None or known.across is None:
+            along = across = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
+        else:
+            rays = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
+            along, across = (np.clip(gate, GATE_LEAST, GATE_MOST) for gate in rays)
+        return _gated_squares(points, others, pose[:2], along, across)
 
     def _assign(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float
     ) -> tuple[IntArray, IntArray]:
         """Return which detections (m,), nearest first, are sightings, and of which cones.
 
-        Several cameras may see a cone at once, and each sighting counts: the one that fits best would pull
-        the errors of the sensor towards what is known of them already.
+        Several cameras may see a cone at once, and each counts: the best one alone would favour known errors.
         """
         place, square = self._nearest_cone(points, labels, ranges, pose)
         near = square < 1.0
@@ -256,7 +250,7 @@ class TwistRecord:
     def orders(self) -> Array | None:
         """Return the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
 
-        The median absolute difference over that of white noise, `sqrt(binomial(2 k, k))`. Where the orders
+        The median absolute difference over `sqrt(binomial(2 k, k))`, that of white noise. Where the orders
         differ, the noise is not white, or the motion itself is in it.
         """
         _, twists = self._newest

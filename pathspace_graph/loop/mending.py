@@ -25,7 +25,8 @@ from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import GrowthSettings
-from pathspace_graph.spline.bspline import BSpline, sampled
+from pathspace_graph.spline.boundary import sampled
+from pathspace_graph.spline.bspline import BSpline
 
 from .finding import KnownLoop, Loop
 

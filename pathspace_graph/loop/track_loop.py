@@ -19,7 +19,8 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE
-from pathspace_graph.spline.bspline import BSpline, boundaries_cross
+from pathspace_graph.spline.boundary import boundaries_cross
+from pathspace_graph.spline.bspline import BSpline
 
 from .closing import go_on_from, hold_gauge
 from .drive_record import LATE, DriveRecord, LapBatch

@@ -1,7 +1,7 @@
-"""What lies ahead of a vehicle: the next metres of the track in its own frame, for a controller.
+"""The next metres of the track in the vehicle's own frame, for a controller.
 
-It is the line of `centre_line`, but only its next stretch, and a hundred times faster: each boundary is
-sampled once, and near a sample it is taken as the circle that osculates it there.
+It is the line of `centre_line`, but a hundred times faster: each boundary is sampled once, and near a sample
+it is taken as the circle that osculates it there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,22 +19,15 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from .centre_line import points_across
 from .planning import MOST_POINTS, check_length
 
-Bools = BoolArray
-
 _SAMPLE_STEP: Final = 0.5
 """Approximate distance of boundary samples (m). The circle at a sample is right to a millimetre."""
-_ACROSS: Final = 2
-"""Stride of the samples among which the points across are searched."""
-_BEHIND: Final = 3.0
-"""Distance behind the vehicle at which the samples begin (m), since it may stand askew."""
-_OUTER: Final = 1.8
-"""Largest ratio of the length of a turn's outer boundary to that of the centre line."""
-_SETTLING_STEPS: Final = 8
-"""Largest number of Newton steps that settle the stations; mostly two are enough."""
+_ACROSS: Final = 2  # stride of the samples among which the points across are searched
+_BEHIND: Final = 3.0  # distance behind the vehicle at which the samples begin (m), since it may stand askew
+_OUTER: Final = 1.8  # largest ratio of the length of a turn's outer boundary to that of the centre line
+_SETTLING_STEPS: Final = 8  # largest number of Newton steps that settle the stations; mostly two are enough
 _SETTLED: Final = 1e-3
 """Largest difference of a point's distances from both boundaries where it is on the line (m)."""
-_LARGEST_GAP: Final = 2.0
-"""Largest number of steps between neighbours."""
+_LARGEST_GAP: Final = 2.0  # largest number of steps between neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,15 +56,9 @@ class TrackAhead:
     known, and fewer than were asked for where the map ends.
     """
 
-    LENGTHS: ClassVar = {
-        "points": 1,
-        "curvature": -1,
-        "arc_length": 1,
-        "width_left": 1,
-        "width_right": 1,
-        "left": 1,
-        "right": 1,
-    }
+    LENGTHS: ClassVar = {"curvature": -1} | dict.fromkeys(
+        ("points", "arc_length", "width_left", "width_right", "left", "right"), 1
+    )
 
     points: Array
     """Points (n, 2) in m; the first one is beside the vehicle."""
@@ -85,7 +72,7 @@ class TrackAhead:
     """Distance (n,) along the normal to the left boundary, in m."""
     width_right: Array
     """Distance (n,) along the normal to the right boundary, in m."""
-    confirmed: Bools
+    confirmed: BoolArray
     """Whether both boundaries are confirmed at each point (n,); another one may be taken back."""
     left: Array
     """Points (k, 2) of the left boundary from beside the vehicle on, in m."""
@@ -123,14 +110,10 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
         to_vehicle(samples[label].beside(distance), pose[None]) if label in samples else np.zeros((0, 2))
         for label in BOUNDARIES
     ]
-    line = None
-    if len(samples) == len(BOUNDARIES):
-        line = _first_line(samples[LEFT], samples[RIGHT])
+    line = _first_line(samples[LEFT], samples[RIGHT]) if len(samples) == len(BOUNDARIES) else None
     if line is None or len(line.points) < 2:
-        none = np.zeros(0)
-        return TrackAhead(
-            np.zeros((0, 2)), none, none, none, none, none, none > 0.0, sides[LEFT], sides[RIGHT]
-        )
+        no, none = np.zeros(0), np.zeros((0, 2))
+        return TrackAhead(none, no, no, no, no, no, no > 0.0, sides[LEFT], sides[RIGHT])
     line = _from_beside(line, pose[:2], distance, step)
     return _settled(samples[LEFT], samples[RIGHT], line, pose, step, sides)
 
@@ -140,18 +123,13 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """A boundary at n places."""
+    """A boundary at n places, map frame; stations count from beside the vehicle."""
 
     points: Array
-    """Points (n, 2) in m, map frame."""
     tangents: Array
-    """Unit tangents (n, 2)."""
     curvature: Array
-    """Curvature (n,) in 1/m."""
     station: Array
-    """Length (n,) along the boundary, from beside the vehicle, in m."""
-    confirmed: Bools
-    """Whether each sample (n,) is confirmed, or may be taken back."""
+    confirmed: BoolArray
 
     def beside(self, distance: float) -> Array:
         """Return the points (k, 2) from beside the vehicle on, along a distance (m)."""
@@ -183,14 +161,9 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
     points, first_order, second = parts
     square = _dot(first_order, first_order)
     speed = np.sqrt(square)
-    ahead = float(u[0] - curve.beside)
-    return _Samples(
-        points=points,
-        tangents=first_order / speed[:, None],
-        curvature=_dot(left_of(first_order), second) / (square * speed),
-        station=ahead + np.cumsum(_distances(points)),
-        confirmed=confirmed,
-    )
+    station = float(u[0] - curve.beside) + np.cumsum(_distances(points))
+    curvature = _dot(left_of(first_order), second) / (square * speed)
+    return _Samples(points, first_order / speed[:, None], curvature, station, confirmed)
 
 
 def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Array]:
@@ -282,12 +255,13 @@ def _settled(
     n = len(good) if good.all() else int(good.argmin())
     normal = both / np.sqrt(square)
     heading = np.arctan2(-normal[:, 0], normal[:, 1]) - pose[2]
+    half_turn = 0.5 * wrap_angle(np.diff(heading[:n], prepend=heading[:n][:1]))
     bend = 0.5 * _dot(normal, feet[0].normal) * (feet[0].offset_curvature + feet[1].offset_curvature)
     return TrackAhead(
         points=to_vehicle(points[:n], pose[None]),
         heading=wrap_angle(heading[:n]),
         curvature=bend[:n],
-        arc_length=_lengths(points[:n], heading[:n]),
+        arc_length=np.cumsum(_distances(points[:n]) / np.sinc(half_turn / np.pi)),  # along circular arcs
         width_left=feet[0].width(points, normal)[:n],
         width_right=feet[1].width(points, -normal)[:n],
         confirmed=(feet[0].confirmed & feet[1].confirmed)[:n],
@@ -365,9 +339,3 @@ def _distances(points: Array) -> Array:
     """Return the distance (n,) of each point from the one before, and 0 for the first."""
     edges = np.diff(points, axis=0, prepend=points[:1])
     return np.asarray(np.hypot(edges[:, 0], edges[:, 1]))
-
-
-def _lengths(points: Array, heading: Array) -> Array:
-    """Return the arc length (n,) at points (n, 2), which are joined by circular arcs."""
-    half = 0.5 * wrap_angle(np.diff(heading, prepend=heading[:1]))
-    return np.asarray(np.cumsum(_distances(points) / np.sinc(half / np.pi)))

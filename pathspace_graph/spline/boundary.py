@@ -1,19 +1,21 @@
-"""A track boundary as the mappers hold it: an open spline that grows, and is periodic after loop closure."""
+"""A boundary as the mappers hold it: an open spline that grows, periodic after closing; and crossings."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.bspline import SpanPolynomials, Spans, lay_out
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_foot_points
 from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.factors.se2 import move_points
+from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
-from .bspline import BSpline
+from .bspline import BSpline, side_of
 
 ROUND_OFF = 1e-9
 """Largest difference from a knot of parameters that lie on it (m)."""
@@ -41,8 +43,8 @@ class Gauge:
 class Placement:
     """How an extension places control points: a linear map of what they are fitted to.
 
-    The control points from index `kept` on are `by_known @ known[first:] + by_target @ targets`, and the
-    second differences that the fit assumes to be zero would move them by `by_bend`.
+    Those from index `kept` on are `by_known @ known[first:] + by_target @ targets`, and the second
+    differences that the fit assumes to be zero would move them by `by_bend`.
     """
 
     first: int
@@ -140,11 +142,9 @@ class Boundary:
 
     def extended(self, control_points: Array) -> Array:
         """Return control points as the kernels take them: those of a periodic curve repeat at the end."""
-        return (
-            np.concatenate([control_points, control_points[: self.degree]])
-            if self.periodic
-            else control_points
-        )
+        if not self.periodic:
+            return control_points
+        return np.concatenate([control_points, control_points[: self.degree]])
 
     def columns(self, span: IntArray) -> IntArray:
         """Return (m, degree + 1) the control points that shape the curve on each span (m,)."""
@@ -158,13 +158,17 @@ class Boundary:
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
         """Search the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
-        s, spans = self.settings, self._spans_from(float(np.min(low, initial=np.inf)))
+        s, first = self.settings, 0
+        if not self.periodic:
+            first = int(self.tables.locate(np.min(low, initial=np.inf, keepdims=True))[0][0])
+        spans = lay_out([self.tables.tail(first) if first else self.tables], [first], [self.size])
         alone, search = np.zeros(len(points), np.intp), (s.search_step, s.search_iterations)
         return joint_foot_points(spans, control_points, points, alone, low, high, *search)
 
-    def _spans_from(self, u: float) -> Spans:
-        first = 0 if self.periodic else int(self.tables.locate(np.array([u]))[0][0])
-        return lay_out([self.tables.tail(first) if first else self.tables], [first], [self.size])
+    def find_anywhere(self, control_points: Array, points: Array) -> FootPoints:
+        """Search the foot points of points (m, 2) on the whole curve."""
+        low, high = (np.full(len(points), end) for end in (self.tables.low, self.tables.high))
+        return self.find(control_points, points, low, high)
 
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
         """Refine the foot points of points (m, 2), starting at the parameters u (m,)."""
@@ -192,7 +196,7 @@ class Boundary:
         values, span = self.tables.evaluate(np.asarray(u, float), derivative)
         return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
-    def closed(self, knots: Array) -> Boundary:
+    def closed(self, knots: Array) -> "Boundary":
         """Return the boundary on periodic knots: all of it is confirmed, and its keys are new."""
         boundary = Boundary(knots, True, self.settings, self.gauge, self.first + self.size)
         boundary.confirmed_end = boundary.tables.high
@@ -201,17 +205,13 @@ class Boundary:
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
         """Extend the curve through targets (k, 2) at parameters (k,); return its control points (n', 2).
 
-        Knots are appended until the domain holds the last parameter, which becomes `confirmed_end`. Old basis
-        functions stay. The old control points that act only beyond the last cone before `confirmed_end` are
-        placed again with the new ones: the direction at the end was a guess, which over a long gap would lead
-        the curve astray.
+        Knots are appended until the domain holds the last parameter, the new `confirmed_end`; old basis
+        functions stay. The control points that act only beyond the last cone before are placed again: the
+        direction at the end was a guess.
         """
-        placement = self.extend(len(control_points), targets_u, self._last_cone_before_end())
-        return placement.place(control_points, targets)
-
-    def _last_cone_before_end(self) -> float:
         before = int(np.searchsorted(self.cone_parameters, self.confirmed_end - ROUND_OFF))
-        return self.cone_parameters[before - 1] if before else self.confirmed_end
+        from_u = self.cone_parameters[before - 1] if before else self.confirmed_end
+        return self.extend(len(control_points), targets_u, from_u).place(control_points, targets)
 
     def extend(self, old: int, targets_u: Array, from_u: float | None = None) -> Placement:
         """Extend a curve of `old` control points to targets at parameters (k,), as `grow` does.
@@ -264,16 +264,12 @@ class Boundary:
         np.put_along_axis(matrix, columns - first, values[0], axis=1)
         matrix = np.concatenate([matrix, weight * smoothness_matrix(self.abscissae[first:], None)])
         fit = np.asarray(np.linalg.pinv(matrix[:, kept - first :]), float)
-        by_known = fit[:, :held] @ self._held_design(columns[:held], values[0][:held], first, old)
+        design = np.zeros((held, old - first))  # basis of the old curve, whose control points end at `old`
+        known = np.minimum(columns[:held], old - 1) - first
+        np.add.at(design, (np.arange(held)[:, None], known), values[0][:held])
+        by_known = fit[:, :held] @ design
         by_known[:, : kept - first] -= fit @ matrix[:, : kept - first]
         return Placement(first, kept, by_known, fit[:, held:bent], weight * fit[:, bent:])
-
-    def _held_design(self, columns: IntArray, values: Array, first: int, old: int) -> Array:
-        """Return (k, old - first) the basis of the old curve, whose control points end at index `old`."""
-        design = np.zeros((len(columns), old - first))
-        rows = np.broadcast_to(np.arange(len(columns))[:, None], columns.shape)
-        np.add.at(design, (rows, np.minimum(columns, old - 1) - first), values)
-        return design
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
@@ -286,8 +282,7 @@ def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
     """Return the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
 
-    A closed curve is searched everywhere. An open one, which grows with the vehicle, is searched on its last
-    `room` metres; its end is returned if no tangent there agrees with the heading.
+    A closed curve is searched everywhere, an open one on its last `room` metres, whose end is the default.
     """
     low, high = boundary.tables.low, boundary.tables.high
     if not boundary.periodic:
@@ -302,3 +297,57 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
     distance = np.where(same_direction, np.hypot(offset[:, 0], offset[:, 1]), np.inf)
     start = u[np.argmin(distance)]
     return float(boundary.refine(control_points, pose[None, :2], np.array([start])).u[0])
+
+
+# --- whether boundaries cross ----------------------------------------------------------------------------
+
+
+NO_PATH: Final = np.zeros((0, 2))
+PATH_STEP: Final = 1.0
+"""Step at which a driven path is looked at for crossings with itself (m)."""
+LEVEL_SINE: Final = 0.7
+"""Least sine of the angle of a level crossing: laps over the same road meet at smaller ones."""
+LEVEL_CROSSING: Final = 8.0
+"""Largest distance of the crossing boundaries from where the driven path crosses itself there (m)."""
+
+
+def sampled(spline: BSpline, step: float) -> Array:
+    """Return points (n, 2) of a spline, from its beginning to its end, about this step (m) apart."""
+    low, high = spline.domain
+    return spline.evaluate(np.linspace(low, high, max(int((high - low) / step), 1) + 1))
+
+
+def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array = NO_PATH) -> bool:
+    """Return whether the left and the right boundary cross, sampled at this step (m)."""
+    found = crossings(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
+    return not at_level_crossing(found, path).all()
+
+
+def at_level_crossing(points: Array, path: Array) -> BoolArray:
+    """Return whether each point (m, 2) is at a place where a driven path (n, 2) crosses itself."""
+    if len(points) == 0 or len(path) < 2:
+        return np.zeros(len(points), bool)
+    station = np.append(0.0, np.hypot(*np.diff(path, axis=0).T).cumsum())
+    _, kept = np.unique(station // PATH_STEP, return_index=True)
+    own = crossings(path[kept], path[kept], LEVEL_SINE)
+    if len(own) == 0:
+        return np.zeros(len(points), bool)
+    return np.asarray(KDTree(own).query(points)[0] < LEVEL_CROSSING)
+
+
+def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
+    """Return the points (k, 2) where segments of the polyline a (n, 2) cross those of the polyline b (m, 2).
+
+    Only those count whose angle has at least this sine.
+    """
+    middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
+    reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
+    near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)
+    i = np.repeat(np.arange(len(near)), [len(own) for own in near])
+    j = np.array([k for own in near for k in own], np.intp)
+    (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
+    crossed = (side_of(p, q, r) * side_of(p, q, s) < 0.0) & (side_of(r, s, p) * side_of(r, s, q) < 0.0)
+    p, q, r, s = (points[crossed] for points in (p, q, r, s))
+    turned = np.abs(side_of(p, q, p + s - r)) > sine * np.hypot(*(q - p).T) * np.hypot(*(s - r).T)
+    share = side_of(r, s, p) / (side_of(r, s, p) - side_of(r, s, q))
+    return np.asarray((p + share[:, None] * (q - p))[turned])

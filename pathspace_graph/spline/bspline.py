@@ -1,18 +1,14 @@
-"""Plane B-spline curves: evaluation, arc length, exact changes of the ends, covariance, and crossings."""
+"""Plane B-spline curves: evaluation, arc length, exact changes of the ends, and covariance."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 from scipy.interpolate import BSpline as ScipyBSpline
-from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import (
     SpanPolynomials,
     clamped_knots,
@@ -22,24 +18,14 @@ from pathspace_graph.factors.bspline import (
 )
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
-from pathspace_graph.labels import LEFT, RIGHT
 
 _PERIODIC_TOLERANCE: Final = 1e-9
 """Largest difference of repeated values of a periodic spline, over (1 + largest value)."""
-_GRID_PER_SPAN: Final = 8
-"""Grid points on each span of a foot-point search over the whole curve."""
+_GRID_PER_SPAN: Final = 8  # grid points on each span of a foot-point search over the whole curve
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
-_ARC_NEWTON_STEPS: Final = 4
-"""Newton steps that invert the arc length, from a table with the same grid."""
+_ARC_NEWTON_STEPS: Final = 4  # Newton steps that invert the arc length, from a table with the same grid
 _SHORTEST_EXTENSION: Final = 1e-3
 """Least knot interval of an extension over the mean one, even if the point is the old end."""
-NO_PATH: Final = np.zeros((0, 2))
-PATH_STEP: Final = 1.0
-"""Step at which a driven path is looked at for crossings with itself (m)."""
-LEVEL_SINE: Final = 0.7
-"""Least sine of the angle of a level crossing: laps over the same road meet at smaller ones."""
-LEVEL_CROSSING: Final = 8.0
-"""Largest distance of the crossing boundaries from where the driven path crosses itself there (m)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -120,7 +106,7 @@ class BSpline:
         return cls(uniform_knots(len(control_points), degree, interval, start), control_points, degree)
 
     @classmethod
-    def clamped_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> BSpline:
+    def clamped_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> "BSpline":
         """Return a clamped curve on breaks (k + 1,) with k + p control points."""
         return cls(clamped_knots(breaks, degree), control_points, degree)
 
@@ -134,6 +120,15 @@ class BSpline:
             )
         unwrapped = np.concatenate([control_points, control_points[:degree]])
         return cls(periodic_knots(breaks, degree), unwrapped, degree, periodic=True)
+
+    @classmethod
+    def even(cls, low: float, high: float, intervals: int, periodic: bool, degree: int = 3) -> Self:
+        """Return a curve of zeros on equally spaced knots; the ends of an open one float."""
+        if periodic:
+            breaks = np.linspace(low, high, intervals + 1)
+            return cls.periodic_from(breaks, np.zeros((intervals, cls.DIMENSION)), degree)
+        zeros = np.zeros((intervals + degree, cls.DIMENSION))
+        return cls.open_uniform(zeros, degree, (high - low) / intervals, low)
 
     @property
     def domain(self) -> tuple[float, float]:
@@ -197,9 +192,9 @@ class BSpline:
     def curvature(self, u: Array) -> Array:
         """Return (x' y'' - y' x'') / |S'|^3 (k,) in 1/m: positive in a left turn, zero where S' vanishes."""
         first, second = self.evaluate(u, 1), self.evaluate(u, 2)
-        cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+        bent = cross(first, second)
         cube = np.linalg.norm(first, axis=1) ** 3
-        return np.asarray(np.divide(cross, cube, out=np.zeros_like(cross), where=cube > 0.0))
+        return np.asarray(np.divide(bent, cube, out=np.zeros_like(bent), where=cube > 0.0))
 
     def foot_points(self, points: Array) -> FootPoints:
         """Search the whole curve for the foot points of points (k, 2), map frame."""
@@ -243,13 +238,13 @@ class BSpline:
         speed = np.linalg.norm(self.evaluate(nodes.ravel(), 1), axis=1).reshape(nodes.shape)
         return np.asarray(half * (speed @ _GAUSS_WEIGHTS))
 
-    def with_end_knots(self, knots: Array) -> BSpline:
+    def with_end_knots(self, knots: Array) -> "BSpline":
         """Return the same curve on knots that differ only outside the domain; the change is exact."""
         self._refuse_periodic("change the ends of")
         matrix = end_change_matrix(self.knots, self.degree, knots)
         return BSpline(knots, matrix @ self.control_points, self.degree)
 
-    def clamp(self, start: bool = True, end: bool = True) -> BSpline:
+    def clamp(self, start: bool = True, end: bool = True) -> "BSpline":
         """Return the same curve with (p + 1)-fold knots at the chosen ends, which become control points."""
         knots, p = self.knots.copy(), self.degree
         if start:
@@ -258,7 +253,7 @@ class BSpline:
             knots[-p:] = knots[-p - 1]
         return self.with_end_knots(knots)
 
-    def unclamp(self, start: bool = True, end: bool = True) -> BSpline:
+    def unclamp(self, start: bool = True, end: bool = True) -> "BSpline":
         """Return the same curve with floating ends: p knots repeat the chosen end's interval outward."""
         knots, p = self.knots.copy(), self.degree
         outward = np.arange(1, p + 1)
@@ -279,7 +274,7 @@ class BSpline:
         kept = self.knots[: len(self.control_points) + 1]
         return np.concatenate([kept, np.full(self.degree + 1, new_end)])
 
-    def extend_to(self, point: Array) -> BSpline:
+    def extend_to(self, point: Array) -> "BSpline":
         """Return the curve extended to a point (2,), unchanged on its old domain and clamped at the point.
 
         The old end is unclamped, and the point becomes the last control point (Hu et al. 2002).
@@ -289,7 +284,7 @@ class BSpline:
         kept = end_change_matrix(self.knots, self.degree, knots) @ self.control_points
         return BSpline(knots, np.concatenate([kept, np.reshape(point, (1, 2))]), self.degree)
 
-    def grow(self, control_points: Array, interval: float | None = None) -> BSpline:
+    def grow(self, control_points: Array, interval: float | None = None) -> "BSpline":
         """Return the curve with control points (k, 2) appended at its floating end.
 
         No basis function and no other control point changes. Each new point appends a knot, `interval` after
@@ -304,7 +299,7 @@ class BSpline:
         knots = np.concatenate([self.knots, added])
         return BSpline(knots, np.concatenate([self.control_points, control_points]), self.degree)
 
-    def reversed(self) -> BSpline:
+    def reversed(self) -> "BSpline":
         """Return the same curve in the opposite direction: S(-u) on [-high, -low]."""
         return BSpline(-self.knots[::-1], self.control_points[::-1], self.degree, self.periodic)
 
@@ -367,55 +362,11 @@ def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
     return np.asarray(weights[0])
 
 
-# --- whether boundaries cross ----------------------------------------------------------------------------
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross products (...) of plane vectors (..., 2)."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-def sampled(spline: BSpline, step: float) -> Array:
-    """Return points (n, 2) of a spline, from its beginning to its end, about this step (m) apart."""
-    low, high = spline.domain
-    return spline.evaluate(np.linspace(low, high, max(int((high - low) / step), 1) + 1))
-
-
-def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array = NO_PATH) -> bool:
-    """Return whether the left and the right boundary cross, sampled at this step (m).
-
-    At a level crossing of the road with itself, where the driven path (n, 2) crosses itself, they do.
-    """
-    found = crossings(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
-    return not at_level_crossing(found, path).all()
-
-
-def at_level_crossing(points: Array, path: Array) -> BoolArray:
-    """Return whether each point (m, 2) is at a place where a driven path (n, 2) crosses itself."""
-    if len(points) == 0 or len(path) < 2:
-        return np.zeros(len(points), bool)
-    station = np.append(0.0, np.hypot(*np.diff(path, axis=0).T).cumsum())
-    _, kept = np.unique(station // PATH_STEP, return_index=True)
-    own = crossings(path[kept], path[kept], LEVEL_SINE)
-    if len(own) == 0:
-        return np.zeros(len(points), bool)
-    return np.asarray(KDTree(own).query(points)[0] < LEVEL_CROSSING)
-
-
-def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
-    """Return the points (k, 2) where segments of the polyline a (n, 2) cross those of the polyline b (m, 2).
-
-    Only those count whose angle has at least this sine.
-    """
-    middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
-    reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
-    near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)
-    i = np.repeat(np.arange(len(near)), [len(own) for own in near])
-    j = np.array([k for own in near for k in own], np.intp)
-    (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
-    crossed = (_side(p, q, r) * _side(p, q, s) < 0.0) & (_side(r, s, p) * _side(r, s, q) < 0.0)
-    p, q, r, s = (points[crossed] for points in (p, q, r, s))
-    turned = np.abs(_side(p, q, p + s - r)) > sine * np.hypot(*(q - p).T) * np.hypot(*(s - r).T)
-    share = _side(r, s, p) / (_side(r, s, p) - _side(r, s, q))
-    return np.asarray((p + share[:, None] * (q - p))[turned])
-
-
-def _side(p: Array, q: Array, point: Array) -> Array:
-    """Return on which side of the lines from p to q (k, 2) the points (k, 2) lie: positive on the left."""
-    along, to = q - p, point - p
-    return np.asarray(along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0])
+def side_of(p: Array, q: Array, point: Array) -> Array:
+    """Return on which side of the lines from p to q (..., 2) the points lie: positive on the left."""
+    return cross(q - p, point - p)

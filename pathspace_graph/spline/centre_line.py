@@ -3,8 +3,6 @@
 It is kept as a ribbon, one B-spline of the centre line and half the width.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -18,12 +16,12 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.bspline import BSpline, side_of
 
 SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}
 """Side of the centre line on which the edge of each label is."""
-_SAMPLE_STEP: Final = 0.5
-"""Distance of the points of a ribbon to which an edge is fitted (m)."""
+SAMPLE_STEP: Final = 0.5
+"""Distance of the samples of boundaries, of lines, and of edges that are fitted (m)."""
 _EDGE_BREAKS: Final = 2
 """Knot intervals of an edge for each one of the ribbon, since it is no B-spline itself."""
 
@@ -79,20 +77,10 @@ class Ribbon(BSpline):
         return at[:, :2] + half[:, None] * n, by_control.reshape(len(u), 2, -1)
 
     def edge_spline(self, label: int) -> tuple[BSpline, Array]:
-        """Return an edge as a B-spline of m' control points, and their derivatives (2m', 3m).
-
-        The least-squares fit to the edge, on twice the knots, at the same parameters. The derivatives are by
-        the ribbon's control points.
-        """
+        """Return an edge as a B-spline of m' control points, and their derivatives (2m', 3m)."""
         low, high = self.domain
-        count = _EDGE_BREAKS * len(self.tables.starts)
-        if self.periodic:
-            blank = BSpline.periodic_from(np.linspace(low, high, count + 1), np.zeros((count, 2)))
-        else:
-            blank = BSpline.open_uniform(
-                np.zeros((count + self.degree, 2)), self.degree, (high - low) / count, low
-            )
-        steps = int(np.ceil((high - low) / _SAMPLE_STEP))
+        blank = BSpline.even(low, high, _EDGE_BREAKS * len(self.tables.starts), self.periodic, self.degree)
+        steps = int(np.ceil((high - low) / SAMPLE_STEP))
         u = np.linspace(low, high, steps + 1)[: steps if self.periodic else None]
         points, jacobian = self.edge(u, SIDE[label])
         fit = np.linalg.pinv(blank.basis_matrix(u))
@@ -102,32 +90,20 @@ class Ribbon(BSpline):
 
 # --- the line between two boundaries ---------------------------------------------------------------------
 
-
-Ints = IntArray
-Bools = BoolArray
-
 SPACING: Final = 3.0
 """Distance of the knots of a planner's line (m); shorter kinks of the boundaries are smoothed."""
 MOST_SAMPLES: Final = 200_000
 """Largest number of samples of a boundary, which bounds the memory."""
-SAMPLE_STEP: Final = 0.5
-"""Distance of the samples of boundaries and line (m)."""
-_FEWEST: Final = 4
-"""Smallest number of samples of a boundary and of knot intervals of a line."""
-_STARTS: Final = 200
-"""Number of samples of the left boundary among which the march begins."""
-_NEAR: Final = 12
-"""Distance in samples from a pair within which segments are tested for a crossing."""
+_FEWEST: Final = 4  # smallest number of samples of a boundary and of knot intervals of a line
+_STARTS: Final = 200  # number of samples of the left boundary among which the march begins
+_NEAR: Final = 12  # distance in samples from a pair within which segments are tested for a crossing
 _ROUNDS: Final = 3
 """Number of times that the line is moved to the middle between the crossings of its normals."""
 _SMOOTHNESS: Final = 1e-3
 """Weight of second differences in the fit, which decides only what the samples leave open."""
-_CROSSING_STEPS: Final = 8
-"""Number of Newton steps to the crossing of a normal and a boundary."""
-_CROSSED: Final = 1e-6
-"""Distance of the point found from a boundary below which a normal crosses it (m)."""
-_LEAST_COSINE: Final = 0.1
-"""Least cosine of the angle between boundary and line at a crossing."""
+_CROSSING_STEPS: Final = 8  # number of Newton steps to the crossing of a normal and a boundary
+_CROSSED: Final = 1e-6  # distance of the point found from a boundary below which a normal crosses it (m)
+_LEAST_COSINE: Final = 0.1  # least cosine of the angle between boundary and line at a crossing
 _FARTHEST: Final = 1.5
 """Distance of a crossing, over that of the paired sample, beyond which it belongs to another stretch."""
 
@@ -165,7 +141,7 @@ class CentreCurve:
             u = table[0, 0] + np.mod(u - table[0, 0], high - low)
         return np.interp(u, table[:, 0], table[:, 1])
 
-    def crossings(self, u: Array) -> list[Crossing]:
+    def crossings(self, u: Array) -> "list[Crossing]":
         """Return where the normals at parameters u (k,) of the line cross the left and the right boundary."""
         found = []
         for side, spline in enumerate(self.sides):
@@ -201,7 +177,7 @@ class Crossing:
     """(k, 2) Unit normals of the line, to the left."""
     offset: Array
     """(k,) Signed distance along the normal, positive to the left (m)."""
-    good: Bools
+    good: BoolArray
     """(k,) Whether the normal crosses the boundary there."""
 
     @cached_property
@@ -240,32 +216,27 @@ def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPAC
     i, j = _paired(sides, samples, points, closed)
     _check_apart(points[0], points[1], i, j, closed)
     a, b = points[0][i % len(points[0])], points[1][j % len(points[1])]
-    paired = tuple(
-        _unwrapped(u, k, spline, closed) for u, k, spline in zip(samples, (i, j), sides, strict=True)
-    )
+    paired = []
+    for u, k, (low, high) in zip(samples, (i, j), (left.domain, right.domain), strict=True):
+        paired.append(u[k % len(u)] + (high - low) * (k // len(u)))  # indices go on past the end of a loop
     values = np.column_stack([0.5 * (a + b), 0.5 * np.hypot(*(a - b).T)])
     lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(values[:, :2], axis=0).T)))
-    blank = _blank(lengths[-1], closed, spacing)
+    blank = Ribbon.even(0.0, lengths[-1], max(round(lengths[-1] / spacing), _FEWEST), closed)
     count = max(int(np.ceil(lengths[-1] / SAMPLE_STEP)), RIBBON * (len(blank.breaks) - 1))
     u = np.linspace(0.0, lengths[-1], count + 1)[: count if closed else None]
     middles = np.column_stack([np.interp(u, lengths, column) for column in values.T])
     beside = np.interp(u, lengths, paired[0]), np.interp(u, lengths, paired[1])
     fit = _Fit(blank, u)
     line = CentreCurve(blank.with_points(fit.solve(middles)), u, sides, beside)
-    for _ in range(_ROUNDS):
-        line = _centred(line, fit, middles)
+    for _ in range(_ROUNDS):  # to the middle between the crossings of its normals, where these cross both
+        one, other = line.crossings(u)
+        good = one.good & other.good
+        middle = 0.5 * (one.offset + other.offset)[:, None] * one.normal + line.ribbon.centre.evaluate(u)
+        half = 0.5 * (one.offset - other.offset)
+        values = np.where(good[:, None], np.column_stack([middle, half]), middles)
+        beside = np.where(good, one.u, line.beside[0]), np.where(good, other.u, line.beside[1])
+        line = CentreCurve(blank.with_points(fit.solve(values)), u, sides, beside)
     return line
-
-
-def _centred(line: CentreCurve, fit: _Fit, middles: Array) -> CentreCurve:
-    """Return the line moved to the middle between the crossings of its normals, where these cross both."""
-    left, right = line.crossings(line.u)
-    good = left.good & right.good
-    middle = 0.5 * (left.offset + right.offset)[:, None] * left.normal + line.ribbon.centre.evaluate(line.u)
-    half = 0.5 * (left.offset - right.offset)
-    values = np.where(good[:, None], np.column_stack([middle, half]), middles)
-    beside = tuple(np.where(good, one.u, old) for one, old in zip((left, right), line.beside, strict=True))
-    return CentreCurve(line.ribbon.with_points(fit.solve(values)), line.u, line.sides, (beside[0], beside[1]))
 
 
 def _crossing(ribbon: Ribbon, at: Array, spline: BSpline, u: Array, side: float) -> Crossing:
@@ -286,17 +257,6 @@ def _crossing(ribbon: Ribbon, at: Array, spline: BSpline, u: Array, side: float)
     return Crossing(
         spline, np.where(good, u, begin), normal, np.where(good, across, side * ribbon.half_width(at)), good
     )
-
-
-# --- the fit ---------------------------------------------------------------------------------------------
-
-
-def _blank(length: float, closed: bool, spacing: float) -> Ribbon:
-    """Return a ribbon from 0 to a length (m), with evenly spaced knots and all control points at zero."""
-    count = max(round(length / spacing), _FEWEST)
-    if closed:
-        return Ribbon.periodic_from(np.linspace(0.0, length, count + 1), np.zeros((count, RIBBON)))
-    return Ribbon.open_uniform(np.zeros((count + 3, RIBBON)), interval=length / count)
 
 
 class _Fit:
@@ -327,15 +287,9 @@ def _samples(spline: BSpline, closed: bool) -> Array:
     return spline.parameters_at(np.linspace(0.0, length, count + 1)[: count if closed else None])
 
 
-def _unwrapped(u: Array, index: Ints, spline: BSpline, closed: bool) -> Array:
-    """Return the parameters of samples whose indices go on past the end of a loop."""
-    low, high = spline.domain
-    return np.asarray(u[index % len(u)] + (high - low) * (index // len(u)) if closed else u[index])
-
-
 def _paired(
     sides: tuple[BSpline, BSpline], samples: list[Array], points: list[Array], closed: bool
-) -> tuple[Ints, Ints]:
+) -> tuple[IntArray, IntArray]:
     """Return the samples of both boundaries that face each other, in the direction of travel."""
     i, j = _first_pair(sides, samples, points, closed)
     lefts, rights = ([tuple(point) for point in side.tolist()] for side in points)
@@ -377,7 +331,7 @@ def _first_pair(
 
 def points_across(
     points: tuple[Array, Array], tangents: tuple[Array, Array], lengths: tuple[Array, Array], apart: float
-) -> tuple[Ints, Ints]:
+) -> tuple[IntArray, IntArray]:
     """Return the samples of the first curve that have a point across, and that sample of the second curve.
 
     The point across is the nearest one to the right of the first curve, which is to the left of the second
@@ -396,10 +350,7 @@ def points_across(
 def _march(
     lefts: list[tuple[float, ...]], rights: list[tuple[float, ...]], to_the_end: bool
 ) -> list[tuple[int, int]]:
-    """Return the pairs of a march along two rows, which always goes on over the shorter diagonal.
-
-    It ends at the end of both rows or, by default, of the one where the other row comes no nearer.
-    """
+    """Return the pairs of a march along two rows, which always goes on over the shorter diagonal."""
     i = j = 0
     pairs = [(0, 0)]
     last = len(lefts) - 1, len(rights) - 1
@@ -421,12 +372,12 @@ def _square(a: tuple[float, ...], b: tuple[float, ...]) -> float:
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2
 
 
-def _check_apart(lefts: Array, rights: Array, i: Ints, j: Ints, closed: bool) -> None:
+def _check_apart(lefts: Array, rights: Array, i: IntArray, j: IntArray, closed: bool) -> None:
     """Raise a SettingsError where the boundaries cross near a pair of samples that face each other."""
     near = j[:, None] + np.arange(-_NEAR, _NEAR + 1)
     p, q = _segments(lefts, i[:, None], closed)
     r, s = _segments(rights, near, closed)
-    cross = (_turn(p, q, r) * _turn(p, q, s) < 0.0) & (_turn(r, s, p) * _turn(r, s, q) < 0.0)
+    cross = (side_of(p, q, r) * side_of(p, q, s) < 0.0) & (side_of(r, s, p) * side_of(r, s, q) < 0.0)
     if cross.any():
         x, y = p[np.flatnonzero(cross.any(axis=1))[0], 0]
         raise SettingsError(
@@ -434,15 +385,9 @@ def _check_apart(lefts: Array, rights: Array, i: Ints, j: Ints, closed: bool) ->
         )
 
 
-def _segments(points: Array, index: Ints, closed: bool) -> tuple[Array, Array]:
+def _segments(points: Array, index: IntArray, closed: bool) -> tuple[Array, Array]:
     """Return both ends of the segments that begin at some indices; beyond an open end they are points."""
     if closed:
         return points[index % len(points)], points[(index + 1) % len(points)]
     last = len(points) - 1
     return points[np.clip(index, 0, last)], points[np.clip(index + 1, 0, last)]
-
-
-def _turn(p: Array, q: Array, point: Array) -> Array:
-    """Return on which side of the lines from p to q the points lie: positive on the left."""
-    along, to = q - p, point - p
-    return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])

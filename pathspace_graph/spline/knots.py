@@ -9,19 +9,16 @@ import scipy.linalg
 from scipy.linalg import cho_factor, cho_solve
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.settings.batch import BreakSettings, FitSettings
 from pathspace_graph.spline.bspline import BSpline
 
-_SAMPLES_PER_BREAK: Final = 40
-"""Equally spaced samples of the curvature for each requested break."""
-_SAMPLES_PER_SPAN: Final = 8
-"""Least-squares samples of a refit on each span: enough for any degree up to 7."""
+_SAMPLES_PER_BREAK: Final = 40  # equally spaced samples of the curvature for each requested break
+_SAMPLES_PER_SPAN: Final = 8  # least-squares samples of a refit on each span: enough for any degree up to 7
 _BRIDGE: Final = 1e-3
 """Weight of second derivatives beside the samples of a refit, on spans that have too few samples."""
-_BENDING_PER_SPAN: Final = 3
-"""Places on each such span at which the second derivative is taken."""
+_BENDING_PER_SPAN: Final = 3  # places on each such span at which the second derivative is taken
 
 
 def quantile_breaks(u: Array, curvature: Array, count: int, settings: BreakSettings) -> Array:
@@ -47,9 +44,9 @@ def curvature_weighted_breaks(
 ) -> Array:
     """Return breaks (count + 1,) in the spline's own parameter between low and high (default: its domain).
 
-    As in the paper's Simplification, the curvature at equal distances along the curve is a probability
-    density, to which the linear baseline is added; the knots are its equal quantiles. An open curve counts
-    as straight beyond its ends. SettingsError is raised if the stretch is empty.
+    The paper's Simplification: the curvature at equal distances along the curve, plus the linear baseline, is
+    a density, and the knots are its quantiles. An open curve counts as straight beyond its ends.
+    SettingsError is raised if the stretch is empty.
     """
     first, last = spline.domain
     low, high = first if low is None else low, last if high is None else high
@@ -94,26 +91,27 @@ def refit(
 ) -> Refit:
     """Fit the bases of two splines to each other; only the knots of `new` are used, not its control points.
 
-    `u_map` maps increasing parameters of the old spline to those of the new one (default: the same ones). A
-    periodic new spline wraps them, so the beginning of an open curve and an end that overlaps it lie on the
-    same stretch. Where the new domain has no sample of the old one, F fills the gap smoothly. What lies
-    outside the parameters `within` of the old spline doesn't count for F, as a shorter new one ends there.
+    `u_map` maps increasing parameters of the old spline to those of the new one (default: the same), wrapped
+    if that is periodic. Where the new domain has no sample, F fills the gap smoothly. What lies outside the
+    parameters `within` of the old spline doesn't count for F.
     """
     u = _refit_samples(old, new)
     inside = (u >= within[0]) & (u <= within[1])
     w = u if u_map is None else u_map(u)
     B_old, B_new = old.basis_matrix(u), new.basis_matrix(w)
-    bridge = _BRIDGE * _bending_rows(new)[np.repeat(_sparse_spans(new, w[inside]), _BENDING_PER_SPAN)]
+    within_new = w[inside]
+    if new.periodic:
+        begin, end = new.domain
+        within_new = begin + np.mod(within_new - begin, end - begin)
+    sparse = np.histogram(within_new, new.breaks)[0] <= new.degree  # fewer samples than control points
+    bridge = _BRIDGE * _bending_rows(new)[np.repeat(sparse, _BENDING_PER_SPAN)]
     stacked = np.concatenate([B_new[inside], bridge])
     target = np.concatenate([B_old[inside], np.zeros((len(bridge), old.size))])
     return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
 
 
 def _least_squares(matrix: Array, right: Array) -> Array:
-    """Return argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned.
-
-    Where a stretch has no sample, X is the least of all that are as good.
-    """
+    """Return argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned."""
     try:
         factor = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
     except np.linalg.LinAlgError:
@@ -127,13 +125,6 @@ def _refit_samples(old: BSpline, new: BSpline) -> Array:
     parts = _SAMPLES_PER_SPAN * min(max(1, finer), _SAMPLES_PER_SPAN)
     offsets = (np.arange(parts) + 0.5) / parts
     return (old.breaks[:-1, None] + widths[:, None] * offsets).ravel()
-
-
-def _sparse_spans(spline: BSpline, u: Array) -> BoolArray:
-    """Return (spans,) whether a span has fewer samples than control points."""
-    low, high = spline.domain
-    inside = low + np.mod(u - low, high - low) if spline.periodic else u
-    return np.histogram(inside, spline.breaks)[0] <= spline.degree
 
 
 def _bending_rows(spline: BSpline) -> Array:
@@ -152,10 +143,10 @@ def fit_spline(
 ) -> BSpline:
     """Fit a spline of `size` distinct control points to ordered points (k, 2) in m, by least squares.
 
-    The points' parameters begin as chord lengths and are moved to the foot points. Knots follow the
-    curvature, unless `breaks` are given (in chord lengths from the first point). The fit with the smallest
-    rmse is returned. A weak bending energy makes two points enough (three for a periodic curve).
-    SettingsError is raised if there are fewer distinct points, or too few control points for the degree.
+    Parameters begin as chord lengths and move to the foot points. Knots follow the curvature, unless `breaks`
+    are given (in chord lengths). The fit with the smallest rmse is returned; a weak bending energy makes two
+    points enough (three for a periodic curve). SettingsError is raised if there are fewer distinct points, or
+    too few control points for the degree.
     """
     settings = FitSettings() if settings is None else settings
     u, high = _chord_lengths(points, periodic)
@@ -187,13 +178,10 @@ def _fit_on(
     points: Array, u: Array, breaks: Array, periodic: bool, settings: FitSettings
 ) -> tuple[BSpline, Array, float]:
     """Fit on given breaks and refresh foot points; return spline, parameters (k,) and rmse (m)."""
-    p = settings.degree
-    count = len(breaks) - 1
-    build = BSpline.periodic_from if periodic else BSpline.clamped_from
-    frame = build(breaks, np.zeros((count if periodic else count + p, 2)), p)
+    frame = _frame(breaks, periodic, settings.degree)
     bending = np.sqrt(settings.smoothness) * energy_rows(frame)
     zeros = np.zeros((len(bending), 2))
-    reach = (breaks[-1] - breaks[0]) / max(count, len(points))
+    reach = (breaks[-1] - breaks[0]) / max(len(breaks) - 1, len(points))
     rmse = np.inf
     for _ in range(settings.refits):
         stacked = np.concatenate([frame.basis_matrix(u), bending])
@@ -219,13 +207,11 @@ def energy_rows(spline: BSpline) -> Array:
 
 
 EVEN: Final = 1e-9
-"""Weight of the square of the interval (m^2) that a removal leaves against the cost of the removal (m^2):
-among knots that cost nothing, the one that leaves the shortest interval is removed."""
+"""Weight of the square of the interval (m^2) that a removal leaves against its cost (m^2), for ties."""
 MARGIN: Final = 0.1
 """Least share by which the sum of squares of a smaller curve must be smaller for it to be chosen."""
 COINCIDENT: Final = 1e-9
-"""Largest difference of parameters of cones that share one knot (m). Two knots so close to each other impose
-the same constraint up to rounding, and the cost of the second one would be 0 / 0."""
+"""Largest difference of parameters of cones that share one knot (m); the cost of a second would be 0 / 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,11 +227,6 @@ class Thinned:
     """(k,) Share of each point in the curve there: the diagonal of the hat matrix."""
 
     @property
-    def rss(self) -> float:
-        """Return the residual sum of squares (m^2)."""
-        return float((self.residual**2).sum())
-
-    @property
     def crossed(self) -> float:
         """Return the sum of squares (m^2) where each point in turn is left out of the fit."""
         return float(((self.residual / (1.0 - self.leverage)[:, None]) ** 2).sum())
@@ -254,11 +235,9 @@ class Thinned:
 def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, most: int) -> Thinned:
     """Choose, among the curves of `thin` with `least` to `most` control points, by cross-validation.
 
-    The largest curve is chosen, unless a smaller one predicts a point left out better by `MARGIN`: which of
-    nearly equal curves is best is chance. The other criterion, `n log(rss / n) + p log(n)` (BIC), took a knot
-    for every cone on all 22 boundaries of eleven tracks: with so many knots rss vanishes, and with it BIC's
-    estimate of the noise. At a given size the curve is nearer to the cones than one whose knots follow the
-    curvature: 0.066 m in place of 0.107 m on cones with 3 cm of noise.
+    The largest curve is chosen, unless a smaller one predicts a point left out better by `MARGIN`. BIC, `n
+    log(rss / n) + p log(n)`, took a knot for every cone on all 22 boundaries of eleven tracks: rss vanishes.
+    Knots by curvature leave 0.107 m to cones with 3 cm of noise, these 0.066 m at the same size.
     """
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
@@ -285,7 +264,9 @@ def thin(
     while periodic and len(breaks) <= fit.degree + 1:
         breaks = np.sort(np.append(breaks, 0.5 * (breaks[1:] + breaks[:-1])))
     frame = _frame(breaks, periodic, fit.degree)
-    B, bending, jumps = frame.basis_matrix(u), energy_rows(frame), _jumps(frame)
+    B, bending = frame.basis_matrix(u), energy_rows(frame)
+    highest = frame.basis_matrix(0.5 * (frame.breaks[1:] + frame.breaks[:-1]), frame.degree)
+    jumps = np.diff(highest, axis=0)  # of the highest derivative at each inner break, by control point
     factor = cho_factor(B.T @ B + fit.smoothness * bending.T @ bending)
     watched, n, remaining = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
     spread, values = watched @ cho_solve(factor, jumps.T), watched @ cho_solve(factor, B.T @ points)
@@ -314,10 +295,3 @@ def _frame(breaks: Array, periodic: bool, degree: int) -> BSpline:
     count = len(breaks) - 1
     build = BSpline.periodic_from if periodic else BSpline.clamped_from
     return build(breaks, np.zeros((count if periodic else count + degree, 2)), degree)
-
-
-def _jumps(frame: BSpline) -> Array:
-    """Return (b - 1, m) the jump of the highest derivative at each inner break, by control point."""
-    breaks = frame.breaks
-    highest = frame.basis_matrix(0.5 * (breaks[1:] + breaks[:-1]), frame.degree)
-    return np.asarray(np.diff(highest, axis=0))

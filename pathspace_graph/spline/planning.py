@@ -14,7 +14,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.settings.output import SpeedSettings
-from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.bspline import BSpline, cross
 from pathspace_graph.spline.centre_line import CentreCurve, Crossing, find_line
 
 if TYPE_CHECKING:
@@ -22,23 +22,20 @@ if TYPE_CHECKING:
 
 
 class SampledLine(Protocol):
-    """A line that is sampled at n points, such as `CentreLine` and `TrackAhead`."""
+    """A line that is sampled at n points, such as `CentreLine` and `TrackAhead`.
+
+    It has the curvature (n,) in 1/m, the length (n,) from its first point, and the whole length (m), with the
+    way back to the first point where the line is closed, a loop.
+    """
 
     @property
-    def curvature(self) -> Array:
-        """Return the curvature (n,) in 1/m."""
-
+    def curvature(self) -> Array: ...
     @property
-    def arc_length(self) -> Array:
-        """Return the length (n,) of the line from its first point, in m."""
-
+    def arc_length(self) -> Array: ...
     @property
-    def length(self) -> float:
-        """Return the whole length in m, with the way back to the first point where the line is closed."""
-
+    def length(self) -> float: ...
     @property
-    def closed(self) -> bool:
-        """Return whether the line is a loop."""
+    def closed(self) -> bool: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,20 +127,16 @@ LEAST_STEP: Final = 0.01
 """Least distance of the points of a line (m)."""
 MOST_POINTS: Final = 200_000
 """Largest number of points of a line, which bounds the memory."""
-_FEWEST: Final = 4
-"""Smallest number of points of a line."""
-_NEIGHBOURS: Final = 10
-"""Number of points apart up to which normals must not cross."""
-_SHORT: Final = 0.95
-"""Share of the way to where two normals would cross that is left to both widths."""
+_FEWEST: Final = 4  # smallest number of points of a line
+_NEIGHBOURS: Final = 10  # number of points apart up to which normals must not cross
+_SHORT: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CentreLine:
-    """Centre line of a track at n points, evenly spaced, in the map frame.
+    """Centre line of a track at n points, evenly spaced, in the map frame; smooth, by `find_line`.
 
-    The line is in the middle between the boundaries, and smooth (`find_line`). A standard deviation is that
-    of the quantity where the line crosses its normal at the point; it is NaN where the map has no covariance.
+    A standard deviation is that where the line crosses its normal at the point; NaN without covariance.
     """
 
     points: Array
@@ -251,10 +244,10 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
     for apart in range(1, min(_NEIGHBOURS, count - 1) + 1):
         i = np.arange(count if closed else count - apart)
         j = (i + apart) % count
-        turn, way = _cross(normal[i], normal[j]), points[j] - points[i]
+        turn, way = cross(normal[i], normal[j]), points[j] - points[i]
         known = np.abs(turn) > np.finfo(float).eps
-        a = np.divide(_cross(way, normal[j]), turn, out=np.full(len(i), np.inf), where=known)
-        b = np.divide(_cross(way, normal[i]), turn, out=np.full(len(i), np.inf), where=known)
+        a = np.divide(cross(way, normal[j]), turn, out=np.full(len(i), np.inf), where=known)
+        b = np.divide(cross(way, normal[i]), turn, out=np.full(len(i), np.inf), where=known)
         for width, side in ((left, 1.0), (right, -1.0)):
             meet = (side * a > 0.0) & (side * b > 0.0) & (side * a <= width[i]) & (side * b <= width[j])
             np.minimum.at(width, i[meet], _SHORT * np.abs(a[meet]))
@@ -288,7 +281,7 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
     cube = (speed**3)[:, None]
     bent = _dot(-left_of(second) / cube - 3.0 * curvature / speed[:, None] * tangent, moved[1])
     bent = bent + _dot(left_of(first) / cube, moved[2])
-    by_parameter = _cross(first, third) / cube[:, 0]
+    by_parameter = cross(first, third) / cube[:, 0]
     by_parameter -= 3.0 * curvature[:, 0] * np.einsum("kd,kd->k", first, second) / speed**2
     bent = bent - (by_parameter / speed)[:, None] * along
     intervals = centre.arc_length(u)
@@ -306,7 +299,3 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
 def _dot(a: Array, moved: Array) -> Array:
     """Return a . dC (n, M) of vectors a (n, 2) and derivatives (n, 2, M)."""
     return np.asarray(np.einsum("kd,kdm->km", a, moved))
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.association import associate, find_anywhere
+from pathspace_graph.batch.association import associate
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
@@ -87,7 +87,7 @@ def test_an_open_curve_that_lies_over_itself_is_followed_in_the_order_of_the_dri
 def test_a_foot_point_is_found_anywhere_on_a_curve() -> None:
     state = corridor_state()
     points = np.array([[3.0, 5.0], [57.0, -1.0]])
-    foot = find_anywhere(state.boundaries[LEFT], state.control_points(LEFT), points)
+    foot = state.boundaries[LEFT].find_anywhere(state.control_points(LEFT), points)
     np.testing.assert_allclose(foot.position, [[3.0, 2.0], [57.0, 2.0]], atol=1e-6)
     np.testing.assert_allclose(foot.distance, [3.0, -3.0], atol=1e-6)
 

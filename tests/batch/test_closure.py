@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.lap import Evidence, evidence, is_true_closure, is_worth_trying, objection
 from pathspace_graph.batch.mapper import BatchMapper, find_optimum_from_odometry
 from pathspace_graph.batch.optimizer import LOOSE_GATE, Optimizer
+from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import Recurrence, find_recurrence, start_odometry
-from pathspace_graph.batch.system import BatchSystem, Biweight, own_settings
+from pathspace_graph.batch.system import BatchSystem, Biweight
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT

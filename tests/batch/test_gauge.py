@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.gauge import CurveGauge, curve_gauge
+from pathspace_graph.batch.system import CurveGauge, curve_gauge
 from pathspace_graph.mapping.state import State
 
 from ..scenes.batch import state_of, straight

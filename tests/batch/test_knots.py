@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.simplification import (
     MIN_SIZE_SHARE,
     boundary_of,
-    dense_fit_through,
     fit_through,
     reknot,
     size_share,
@@ -45,7 +44,7 @@ def test_a_fit_has_the_least_size_where_there_are_few_cones() -> None:
 
 def test_a_dense_fit_meets_its_cones() -> None:
     cones = zigzag_ring(40)
-    spline = dense_fit_through(cones, True, SETTINGS)
+    spline = fit_through(cones, True, SETTINGS, SETTINGS.batch.dense_share, 1.0)
     assert spline.size == 40
     assert np.abs(spline.foot_points(cones).distance).max() < 0.02
 
@@ -53,7 +52,10 @@ def test_a_dense_fit_meets_its_cones() -> None:
 def test_a_closed_curve_begins_at_the_cone_nearest_to_the_start() -> None:
     """So it doesn't matter with which cone the row begins."""
     cones = zigzag_ring(40) + np.array([20.0, 0.0])
-    one, other = (dense_fit_through(np.roll(cones, k, axis=0), True, SETTINGS) for k in (0, 7))
+    one, other = (
+        fit_through(np.roll(cones, k, axis=0), True, SETTINGS, SETTINGS.batch.dense_share, 1.0)
+        for k in (0, 7)
+    )
     np.testing.assert_allclose(one.knots, other.knots)
     np.testing.assert_allclose(one.control_points, other.control_points)
 

@@ -11,7 +11,6 @@ from pathspace_graph.batch.optimizer import (
     LOOSE_GATE,
     TOLERANCE_DECREASE,
     Optimizer,
-    Schedule,
     extrapolation_factor,
 )
 from pathspace_graph.batch.system import BatchSystem
@@ -42,9 +41,8 @@ def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
     """Only with the last gate may the optimization end, however little has changed before."""
     system, state = noisy()
     gates: list[float] = []
-    schedule = Schedule(gate=8.0, rounds=12, tolerance=1e9)
     optimizer = Optimizer(system, on_round=lambda: gates.append(system.kernel.gate))
-    _, convergence = optimizer.run(state, schedule)
+    _, convergence = optimizer.run(state, gate=8.0, rounds=12, tolerance=1e9)
     expected = [8.0 * GATE_FACTOR**k for k in range(2)] + [BATCH.gate]
     np.testing.assert_allclose(gates, expected)
     assert convergence.converged
@@ -54,11 +52,11 @@ def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
 def test_it_ends_where_nothing_changes_any_more() -> None:
     """The gradient is small there, and another run changes neither cost nor curves."""
     system, state = noisy()
-    at, convergence = Optimizer(system).run(state, Schedule(BATCH.gate, 40))
+    at, convergence = Optimizer(system).run(state, BATCH.gate, 40)
     assert convergence.converged
     assert convergence.cost == at.cost
     assert convergence.steps >= convergence.rounds
-    again, _ = Optimizer(system).run(at.state, Schedule(BATCH.gate, 40))
+    again, _ = Optimizer(system).run(at.state, BATCH.gate, 40)
     np.testing.assert_allclose(again.cost, at.cost, rtol=1e-4)
     np.testing.assert_allclose(again.state.poses, at.state.poses, atol=5e-3)
 
@@ -67,7 +65,7 @@ def test_the_predicted_decrease_is_that_of_a_linear_problem() -> None:
     """Near the optimum an undamped step makes the cost smaller by just that."""
     system, state = noisy()
     optimizer = Optimizer(system)
-    at, convergence = optimizer.run(state, Schedule(BATCH.gate, 40))
+    at, convergence = optimizer.run(state, BATCH.gate, 40)
     assert optimizer.predicted_decrease(at) <= TOLERANCE_DECREASE
     np.testing.assert_allclose(convergence.gradient, np.sqrt(2.0 * optimizer.predicted_decrease(at)))
     off = np.random.default_rng(4).normal(0.0, 1e-3, len(at.state.variables.values))
@@ -82,14 +80,14 @@ def test_a_tolerance_ends_it_sooner() -> None:
     rounds = []
     for tolerance in (1.0, 100.0):
         system, state = noisy()
-        _, convergence = Optimizer(system).run(state, Schedule(BATCH.gate, 40, tolerance))
+        _, convergence = Optimizer(system).run(state, BATCH.gate, 40, tolerance)
         rounds.append(convergence.rounds)
     assert rounds[1] < rounds[0]
 
 
 def test_without_rounds_left_it_has_not_converged() -> None:
     system, state = noisy()
-    _, convergence = Optimizer(system).run(state, Schedule(gate=8.0, rounds=2))
+    _, convergence = Optimizer(system).run(state, gate=8.0, rounds=2)
     assert not convergence.converged
     assert convergence.rounds == 2
     assert convergence.reason == "no round left"
@@ -101,7 +99,7 @@ def test_the_cost_never_grows_in_a_step() -> None:
     start = Optimizer(system).align_poses(state, 1, BATCH.gate)
     costs = []
     for rounds in (1, 2, 4, 8):
-        at, _ = Optimizer(system).run(start, Schedule(BATCH.gate, rounds))
+        at, _ = Optimizer(system).run(start, BATCH.gate, rounds)
         costs.append(at.cost)
     assert (np.diff(costs) < 1e-3).all()
 
@@ -110,7 +108,7 @@ def test_a_damping_that_is_too_large_leaves_the_map_beside_its_poses() -> None:
     """The poses are free, as they aren't damped, and the map goes with them."""
     system, state = noisy()
     optimizer = Optimizer(system, damping=Damping(first=1e12, least=1e12, most=1e13))
-    at, _ = optimizer.run(state, Schedule(BATCH.gate, 1))
+    at, _ = optimizer.run(state, BATCH.gate, 1)
     assert np.abs(at.state.poses - state.poses).max() > 1e-3
     for label, gauge in system.gauges.items():
         carried = gauge.carried(state.control_points(label), state.poses, at.state.poses)
@@ -120,7 +118,7 @@ def test_a_damping_that_is_too_large_leaves_the_map_beside_its_poses() -> None:
 def test_where_no_damping_is_allowed_nothing_moves() -> None:
     system, state = noisy()
     refused = Optimizer(system, damping=Damping(first=1.0, most=0.1))
-    at, _ = refused.run(state, Schedule(BATCH.gate, 1))
+    at, _ = refused.run(state, BATCH.gate, 1)
     np.testing.assert_array_equal(at.state.variables.values, state.variables.values)
 
 

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import associate, locate_poses
 from pathspace_graph.batch.optimizer import gradient
+from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import start_odometry
-from pathspace_graph.batch.system import BatchSystem, Biweight, moved, own_settings
+from pathspace_graph.batch.system import BatchSystem, Biweight, moved
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.variables import pose_key

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline as ScipyBSpline
 
+from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.batch.system import BatchSystem
 from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import online as commands_online
@@ -20,7 +21,7 @@ from pathspace_graph.io.log import Detections, Log, read_log, write_log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
-from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
+from pathspace_graph.options import one_line
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.paths import TRACKS

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph import FixedLagMapper, ReadingError
+from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.factors.se2 import compose, se2_exp, to_map, to_vehicle
 from pathspace_graph.front_end.front_end import LateDetections, at_nearest_pose
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.online import MotionSettings
 

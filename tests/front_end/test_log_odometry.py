@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.front_end.log_odometry import sensor_prior, sensor_prior_cost
+from pathspace_graph.front_end.log_odometry import half_square, sensor_prior
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, control_keys, pose_keys
 from pathspace_graph.settings.calibration import CalibrationSettings
 
@@ -30,7 +30,7 @@ def test_the_prior_counts_in_its_sigmas() -> None:
     (rows,) = sensor_prior(variables, ESTIMATED)
     np.testing.assert_allclose(rows.residual, 2.0)
     np.testing.assert_allclose(np.diag(rows.jacobian) * ESTIMATED.sigmas, 1.0)
-    assert sensor_prior_cost(variables, ESTIMATED) == 0.5 * 5 * 4.0
+    assert half_square(sensor_prior(variables, ESTIMATED)) == 0.5 * 5 * 4.0
 
 
 def test_the_prior_counts_from_its_mean() -> None:
@@ -42,12 +42,12 @@ def test_the_prior_counts_from_its_mean() -> None:
     )
     (rows,) = sensor_prior(variables, known)
     np.testing.assert_allclose(rows.residual, off, atol=1e-12)
-    assert sensor_prior_cost(variables, known) == pytest.approx(0.5 * 15.0)
+    assert half_square(sensor_prior(variables, known)) == pytest.approx(0.5 * 15.0)
 
 
 def test_a_sensor_that_is_known_has_no_prior() -> None:
     variables = Variables()
     variables.insert_calibrations(np.zeros(2))
     assert sensor_prior(variables, KNOWN) == []
-    assert sensor_prior_cost(variables, KNOWN) == 0.0
+    assert half_square(sensor_prior(variables, KNOWN)) == 0.0
     np.testing.assert_array_equal(variables.calibration_keys, [CALIBRATION_KEY])

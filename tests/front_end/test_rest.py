@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.ckf.mapper import CkfMapper
+from pathspace_graph.baselines.filters import CkfMapper
+from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.log_odometry import half_square
 from pathspace_graph.front_end.motion import MotionCheck, Rest, mean_bias
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, Odometry
-from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.mapping.motion import BiasMeasurement
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online, split_odometry
@@ -84,11 +85,12 @@ def test_a_log_has_the_mean_of_all_that_was_measured_at_rest(log: Log) -> None:
     chain = judge_log(log, log.noise, MapperSettings()).chain
     assert chain.bias is not None
     off = np.array([0.0, chain.bias.value + chain.bias.sigma])
-    at_mean = chain.prior_cost(chain.first, np.array([0.0, chain.bias.value]))
+    at_mean = half_square(chain.priors(chain.first, np.array([0.0, chain.bias.value])))
     prior = 0.5 * (off[1] ** 2 - chain.bias.value**2) / chain.calibration_sigma[1] ** 2
-    assert chain.prior_cost(chain.first, off) - at_mean == pytest.approx(0.5 + prior)
-    rows = [rows for rows in chain._measured_bias(off) if rows.keys[0, 0] == CALIBRATION_KEY]
-    np.testing.assert_allclose(rows[0].residual, [1.0])
+    assert half_square(chain.priors(chain.first, off)) - at_mean == pytest.approx(0.5 + prior)
+    *_, measured = chain.priors(chain.first, off)
+    assert measured.keys[0, 0] == CALIBRATION_KEY
+    np.testing.assert_allclose(measured.residual, [1.0])
 
 
 def test_means_are_weighted_by_information() -> None:

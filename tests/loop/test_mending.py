@@ -21,7 +21,7 @@ from pathspace_graph.run import CycleResult, run_online
 from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
-from pathspace_graph.spline.bspline import sampled
+from pathspace_graph.spline.boundary import sampled
 
 from ..scenes.drives import map_log, true_poses
 from ..scenes.holes import cluttered, unseen

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.log_odometry import half_square
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -84,11 +85,13 @@ def test_the_rows_of_the_priors_have_their_cost(log: Log, mean: tuple[float, flo
     first = odometry.first + np.array([1e-4, -2e-4, 1e-5])
     off = rng.normal(size=2)
     calibration = mean + odometry.calibration_sigma * off
-    _, *priors = odometry.rows(odometry.terms(true_poses(log), calibration), first, calibration)
-    cost = 0.5 * sum(float(rows.residual @ rows.residual) for rows in priors)
-    assert odometry.prior_cost(first, calibration) == pytest.approx(cost, rel=1e-9)
-    assert odometry.prior_cost(odometry.first, calibration) == pytest.approx(0.5 * off @ off, rel=1e-9)
-    assert odometry.prior_cost(odometry.first, np.array(mean)) == 0.0
+    moved = first - odometry.first
+    cost = 0.5 * (moved @ odometry.first_information @ moved + off @ off)
+    assert half_square(odometry.priors(first, calibration)) == pytest.approx(cost, rel=1e-9)
+    assert half_square(odometry.priors(odometry.first, calibration)) == pytest.approx(
+        0.5 * off @ off, rel=1e-9
+    )
+    assert half_square(odometry.priors(odometry.first, np.array(mean))) == 0.0
 
 
 # --- a prior that the drive contradicts ------------------------------------------------------------------

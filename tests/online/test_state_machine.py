@@ -20,14 +20,13 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_stat
 from numpy.typing import NDArray
 
 from pathspace_graph import FixedLagMapper, ReadingError, SettingsError
-from pathspace_graph.ckf.mapper import CkfMapper
+from pathspace_graph.baselines.filters import CkfMapper, LandmarkCkf
+from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.factors.se2 import compose, se2_exp
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import pose_key, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import NAMES
-from pathspace_graph.landmark.ckf import LandmarkCkf
-from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.run import CycleResult
 from pathspace_graph.settings.mapper import MapperSettings

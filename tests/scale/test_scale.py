@@ -16,8 +16,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pathspace_graph.baselines.filters import CkfMapper
+from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.ckf.mapper import CkfMapper
 from pathspace_graph.errors import ReadingError
 from pathspace_graph.estimators import ONLINE, make_batch, make_online
 from pathspace_graph.eval.metrics.measures import measure
@@ -28,7 +29,6 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.landmark.fixed_lag import LandmarkFixedLag
 from pathspace_graph.lengths import scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.judge import hints

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import add_drive, associate, locate_poses
-from pathspace_graph.batch.simplification import boundary_of
+from pathspace_graph.batch.simplification import boundary_of, own_settings
 from pathspace_graph.batch.start import start_odometry
-from pathspace_graph.batch.system import BatchSystem, Biweight, moved, own_settings
+from pathspace_graph.batch.system import BatchSystem, Biweight, moved
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.front_end import judge_log

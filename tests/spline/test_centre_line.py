@@ -10,7 +10,8 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.spline.bspline import BSpline, boundaries_cross
+from pathspace_graph.spline.boundary import boundaries_cross
+from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
 from ..scenes.maps import circle

@@ -37,7 +37,7 @@ def test_each_step_takes_out_one_knot_and_misses_more() -> None:
     path = list(thin(points, u, float(u[-1]), False, FIT, 8))
     assert [curve.size for curve in path] == list(range(path[0].size, 7, -1))
     assert path[0].size == len(points) + 2
-    assert (np.diff([curve.rss for curve in path]) > -1e-6).all()
+    assert (np.diff([(curve.residual**2).sum() for curve in path]) > -1e-6).all()
 
 
 def test_the_price_of_a_knot_is_what_the_fit_loses() -> None:

@@ -7,7 +7,8 @@ import pytest
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.spline.bspline import BSpline, at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.boundary import at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.bspline import BSpline
 
 STEP = 0.25
 """Curves are sampled at this step (m)."""

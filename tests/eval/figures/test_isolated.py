@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.ckf.expansion import beyond_end
+from pathspace_graph.baselines.ckf_curves import beyond_end
 from pathspace_graph.cli import main
 from pathspace_graph.eval.figures.curves import BLIND, simplification, uncertainty
 from pathspace_graph.eval.figures.isolated import (

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.baselines.landmark_batch import solve_landmarks
 from pathspace_graph.eval.metrics.accuracy import root_mean_square
 from pathspace_graph.eval.metrics.reference import (
     Limit,
@@ -23,7 +24,6 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.landmark.batch import solve_landmarks
 from pathspace_graph.settings import calibration
 from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 from pathspace_graph.settings.mapper import MapperSettings

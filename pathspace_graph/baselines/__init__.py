@@ -1,0 +1,1 @@
+"""What the boundary estimators are compared with: landmarks, the paper's filters, and one centre line."""

@@ -1,0 +1,338 @@
+"""One centre line with a width: as the batch of a log, and from the posterior of the online mapper."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import gtsam
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from pathspace_graph.batch.association import headings
+from pathspace_graph.batch.mapper import (
+    BatchMapper,
+    BatchResult,
+    bending_of,
+    beside_of,
+    drive_factors,
+    factor_beside,
+)
+from pathspace_graph.batch.start import CurveMapper
+from pathspace_graph.batch.system import CurveGauge
+from pathspace_graph.errors import SettingsError, solving
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.gtsam_factors import pose_array, ribbon_factor
+from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.factors.residuals import RIBBON
+from pathspace_graph.graph.gaussian import sparse_marginal
+from pathspace_graph.graph.variables import pose_key
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
+from pathspace_graph.io.results import BatchRun, LapBatches, RunNoise, VehicleState
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import CycleResult, settings_dict
+from pathspace_graph.scale import at_scale, log_at_scale
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.centre_line import SIDE, CentreCurve, Ribbon, find_line
+
+NAME: Final = "centerline"
+ONLINE_NAME: Final = "centerline-fixed-lag"
+"""Names of the estimators on the command line."""
+ROOM: Final = 4.0
+"""Distance along the line within which a foot point is searched for (m)."""
+RIBBON_LETTER: Final = "a"
+"""Letter of the keys of a ribbon's control points, which hold `Point3` (x, y, h)."""
+ROUNDS: Final = 2
+"""Optimizations; before each, the control points are held beside the poses anew."""
+MAX_ITERATIONS: Final = 15
+"""Most iterations of one of them."""
+TOLERANCE: Final = 1e-5
+"""Share by which an iteration lowers the error at least, or it is the last one."""
+
+
+# --- the map of a ribbon, and the ribbon of a map --------------------------------------------------------
+
+
+def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
+    """Return the edges of a ribbon as a map, with the covariance (3m, 3m) of its control points, if known.
+
+    `sigma_shape` (m) is added to each control point: what the edges cannot follow of the cones. `until` has
+    the parameter up to which an edge is confirmed, where it is open.
+    """
+    edges = {label: ribbon.edge_spline(label) for label in BOUNDARIES}
+    if covariance is None:
+        none = {b: _boundary(spline, NO_COVARIANCE, until.get(b)) for b, (spline, _) in edges.items()}
+        return Map(ribbon.periodic, none)
+    by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
+    joint = by_ribbon @ covariance @ by_ribbon.T
+    joint = 0.5 * (joint + joint.T)
+    boundaries, at = {}, 0
+    for label, (spline, jacobian) in edges.items():
+        block = slice(at, at := at + len(jacobian))
+        own = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
+        boundaries[label] = _boundary(spline, own, until.get(label))
+    return Map(ribbon.periodic, boundaries, joint_covariance(joint, boundaries))
+
+
+def _boundary(spline: BSpline, covariance: Array, until: float | None) -> SplineBoundary:
+    return SplineBoundary(spline, covariance, spline.domain[1] if until is None else until)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedRibbon:
+    """A ribbon that was fitted to the boundaries of a map."""
+
+    ribbon: Ribbon
+    covariance: Array | None
+    """Covariance (3m, 3m) of its control points; None where that of the map is not known."""
+    until: dict[int, float]
+    """Parameter up to which an open edge is confirmed, by label."""
+
+
+def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
+    """Return the ribbon between the boundaries of a map, with the covariance that follows from theirs.
+
+    SettingsError is raised where the map has no two boundaries side by side.
+    """
+    curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
+    P = track.covariance_of(*curves.values())
+    left, right = (curve.spline for curve in curves.values())
+    line, until = find_line(left, right, left.periodic, settings.centerline.spacing), {}
+    for side, (label, curve) in enumerate(curves.items()):
+        if not left.periodic:
+            end = np.array([min(curve.confirmed_until, curve.spline.domain[1])])
+            until[label] = float(line.ribbon_parameters(side, end)[0])
+    covariance = None if P is None else line.by_boundaries @ P @ line.by_boundaries.T
+    return FittedRibbon(line.ribbon, covariance, until)
+
+
+@at_scale
+class CenterlineMapper:
+    """Maps a track online as a ribbon.
+
+    The fixed-lag smoother holds what all detections so far say, as a joint Gaussian of both boundaries. The
+    ribbon is estimated from it whenever the map is asked for, so that every detection counts as much as it
+    does there, and a cycle takes the same time. Where there is no line between the boundaries, the map is
+    theirs. What isn't described is that of `FixedLagMapper`.
+    """
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        self.settings = settings or MapperSettings()
+        self.boundaries = FixedLagMapper(replace(self.settings, scale=1.0), odometry_sigma)
+        """Mapper of both boundaries and of the poses."""
+
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        return self.boundaries.update(odometry, detections)
+
+    def wait(self) -> None:
+        self.boundaries.wait()
+
+    def batches(self) -> LapBatches:
+        return self.boundaries.batches()
+
+    def noise_used(self) -> RunNoise:
+        return self.boundaries.noise_used()
+
+    def vehicle_state(self) -> VehicleState:
+        return self.boundaries.vehicle_state()
+
+    def map(self) -> Map:
+        """Return the edges of the ribbon, with their joint covariance."""
+        return self._edges(self.boundaries.map())
+
+    def outline(self) -> Map:
+        """Return the edges without covariances."""
+        return self._edges(self.boundaries.outline())
+
+    def _edges(self, track: Map) -> Map:
+        try:
+            fitted = ribbon_of(track, self.settings)
+        except SettingsError:
+            return track
+        edges = map_of(fitted.ribbon, fitted.covariance, self.settings.spline.sigma_shape, fitted.until)
+        return replace(edges, points=track.points)
+
+
+# --- the graph of a log ----------------------------------------------------------------------------------
+
+
+def ribbon_keys(ribbon: Ribbon) -> list[int]:
+    """Return the keys of the distinct control points of a ribbon."""
+    return [int(gtsam.symbol(RIBBON_LETTER, j)) for j in range(ribbon.size)]
+
+
+def edge_factors(
+    start: BatchResult, line: CentreCurve, settings: MapperSettings
+) -> Iterator[gtsam.CustomFactor]:
+    """Yield a factor for each cycle with detections that the batch of both boundaries uses."""
+    table, parts = start.system.detections, []
+    for side, (label, projected) in enumerate(start.optimum.projected.items()):
+        used = start.system.scale(projected) > 0.0
+        u = line.ribbon_parameters(side, projected.foot.u[used])
+        parts.append((projected.rows[used], np.full(len(u), SIDE[label]), u))
+    rows, sides, u = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.lexsort((rows, table.cycle[rows]))
+    cycles = table.cycle[rows[order]]
+    for own in np.split(order, np.flatnonzero(np.diff(cycles)) + 1):
+        if len(own):
+            row = rows[own]
+            yield ribbon_factor(
+                pose_key(table.cycle[row[0]]),
+                ribbon_keys(line.ribbon),
+                line.ribbon.tables,
+                points_vehicle=table.measured[row],
+                covariances=table.covariance[row],
+                sides=sides[own],
+                low=u[own] - ROOM,
+                high=u[own] + ROOM,
+                sigma_model=settings.batch.sigma_model,
+                huber=settings.gate.huber,
+                sensor_key=start.optimum.state.variables.sensor_key,
+                twists=table.twist[row],
+            )
+
+
+def shape_factors(ribbon: Ribbon, poses: Array, settings: MapperSettings) -> Iterator[gtsam.CustomFactor]:
+    """Yield the weak priors of the control points, each in the frame of the nearest pose of poses (n, 3).
+
+    Those of the line are the priors of a boundary (`CurveGauge`), and second differences of the width are
+    small as well.
+    """
+    points, keys = ribbon.distinct_control_points[:, :2], np.array(ribbon_keys(ribbon))
+    cycle = ((points[:, None] - poses[:, :2]) ** 2).sum(axis=2).argmin(axis=1)
+    beside = poses[cycle]
+    smoothness = np.zeros((len(ribbon.bending), ribbon.size))
+    columns = (np.arange(len(smoothness))[:, None] + np.arange(3)) % ribbon.size
+    np.put_along_axis(smoothness, columns, ribbon.bending, axis=1)
+    gauge = CurveGauge(
+        label=0,
+        keys=keys,
+        cycle=cycle,
+        ahead=(headings(beside) * (points - beside[:, :2])).sum(axis=1),
+        sigma=settings.batch.sigma_slide,
+        smoothness=smoothness,
+        sigma_smoothness=settings.batch.sigma_smoothness * ribbon.spacing,
+        sigma_anchor=np.inf,
+    )
+    for j in range(ribbon.size):
+        yield factor_beside(keys[j : j + 1], int(cycle[j]), 1, _of_line(beside_of(gauge, j)), RIBBON)
+    for row, weights in enumerate(ribbon.bending / settings.centerline.sigma_width):
+        terms = _with_width(bending_of(gauge, row), weights)
+        yield factor_beside(keys[columns[row]], int(gauge.middle_cycle[row]), RIBBON, terms, RIBBON)
+
+
+Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
+
+
+def _of_line(terms: Terms) -> Terms:
+    """Return terms of the control points (1, 3) of a ribbon, from those of points of a line."""
+
+    def of_line(points: Array, pose: Array) -> tuple[Array, Array, Array]:
+        residual, by_points, by_pose = terms(points[:, :2], pose)
+        return residual, np.column_stack([by_points, np.zeros(1)]), by_pose
+
+    return of_line
+
+
+def _with_width(terms: Terms, weights: Array) -> Terms:
+    """Return bending terms of three control points of a ribbon, with weights (3,) for that of the width."""
+
+    def with_width(points: Array, pose: Array) -> tuple[Array, Array, Array]:
+        residual, by_points, by_pose = terms(points[:, :2], pose)
+        by_all = np.zeros((RIBBON, 3, RIBBON))
+        by_all[:2, :, :2], by_all[2, :, 2] = by_points.reshape(2, 3, 2), weights
+        return np.append(residual, weights @ points[:, 2]), by_all, np.vstack([by_pose[0], np.zeros(3)])
+
+    return with_width
+
+
+def ribbon_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ribbon: Ribbon) -> Array:
+    """Return the joint covariance (3m, 3m) of the control points, all other variables marginalized out."""
+    keys = np.array(ribbon_keys(ribbon))
+    marginal = sparse_marginal(graph.linearize(values), keys)
+    information, _ = marginal.hessian(gtsam.Ordering(keys.tolist()))
+    return np.asarray(np.linalg.inv(information), np.float64)
+
+
+@log_at_scale
+class CenterlineBatch:
+    """Maps a whole log as a ribbon: all poses and one ribbon, by GTSAM's own optimizer.
+
+    The start, with the sides of the detections, is the batch of two boundaries. Where there is no line
+    between them, since one was never seen or they cross, their map is the result.
+    """
+
+    def __init__(
+        self,
+        settings: MapperSettings | None = None,
+        odometry_sigma: Array | KnownNoise | None = None,
+        online: Callable[[MapperSettings, KnownNoise], CurveMapper] | None = None,
+    ) -> None:
+        """Keep the settings and what `BatchMapper` takes."""
+        self.settings = settings or MapperSettings()
+        self._boundaries = BatchMapper(self.settings, odometry_sigma, online)
+
+    def solve(self, log: Log) -> BatchRun:
+        """Return the optimum over a whole log."""
+        start = self._boundaries.solve(log)
+        run = BatchRun(
+            estimator=NAME,
+            settings=settings_dict(self.settings),
+            map=start.map,
+            trajectory_t=start.trajectory_t,
+            trajectory=start.trajectory,
+            cycles=start.cycles,
+            laps=start.laps,
+            converged=start.converged,
+            cost=start.cost,
+            noise=start.noise,
+        )
+        with threadpool_limits(limits=1), solving("the batch"):
+            try:
+                return self._optimized(start, run)
+            except SettingsError:
+                return run
+
+    def _optimized(self, start: BatchResult, run: BatchRun) -> BatchRun:
+        settings, splines, count = self.settings, start.optimum.state.splines, len(start.trajectory)
+        if len(splines) < len(SIDE):
+            raise SettingsError(f"a centre line: expected both boundaries, found {len(splines)}")
+        left, right = splines.values()
+        line = find_line(left, right, start.optimum.state.closed, settings.centerline.spacing)
+        ribbon, variables, drive = line.ribbon, start.optimum.state.variables, gtsam.NonlinearFactorGraph()
+        for factor in (*drive_factors(start.system, start.optimum), *edge_factors(start, line, settings)):
+            drive.add(factor)
+        values = variables.gtsam_values(variables.calibration_keys)
+        for k, pose in enumerate(variables.poses):
+            values.insert(pose_key(k), gtsam.Pose2(*pose))
+        for key, point in zip(ribbon_keys(ribbon), ribbon.distinct_control_points, strict=True):
+            values.insert(key, point)
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setRelativeErrorTol(TOLERANCE)
+        parameters.setMaxIterations(MAX_ITERATIONS)
+        for _ in range(ROUNDS):
+            graph = gtsam.NonlinearFactorGraph(drive)
+            for factor in shape_factors(ribbon, _poses(values, count), settings):
+                graph.add(factor)
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+            values = optimizer.optimize()
+            ribbon = ribbon.with_points(np.array([values.atPoint3(key) for key in ribbon_keys(ribbon)]))
+        covariance = ribbon_covariance(graph, values, ribbon)
+        return replace(
+            run,
+            map=replace(map_of(ribbon, covariance, settings.spline.sigma_shape, {}), points=start.map.points),
+            trajectory=_poses(values, count),
+            converged=bool(optimizer.iterations() < MAX_ITERATIONS),
+            cost=float(optimizer.error()),
+        )
+
+
+def _poses(values: gtsam.Values, count: int) -> Array:
+    """Return the poses (n, 3), with headings that do not jump."""
+    poses = np.array([pose_array(values.atPose2(pose_key(k))) for k in range(count)])
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    return poses

@@ -1,0 +1,329 @@
+"""The paper's state, a pose and control points of clamped splines, and its growth (paper: Expansion)."""
+
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.bspline import clamped_knots
+from pathspace_graph.factors.footpoint import FootPoints, foot_points
+from pathspace_graph.factors.residuals import greville, smoothness_matrix
+from pathspace_graph.factors.se2 import rotated, rotation, to_map
+from pathspace_graph.graph.variables import POINT
+from pathspace_graph.io.log import Detections
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.belief import Belief, point_columns
+from pathspace_graph.mapping.path import (
+    CARRIED_TO,
+    END_BEHIND,
+    MIN_CARRY,
+    MIN_LATERAL,
+    SIDES,
+    STATION_MARGIN,
+    STRANDED,
+    Candidates,
+    End,
+    PathAhead,
+    chain,
+)
+from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
+from pathspace_graph.settings.batch import CkfSettings
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import Boundary, relocate
+from pathspace_graph.spline.bspline import BSpline, end_change_matrix
+
+SIGMA_START: Final = 0.3
+"""Standard deviation (m) of each control point of a new curve, beyond that of its first detections."""
+
+
+class CurveState:
+    """State `x = [pose | calibration | left control points | right control points]`, and the knots."""
+
+    def __init__(self, belief: Belief, settings: MapperSettings) -> None:
+        self.settings = settings
+        self.belief = belief
+        """Mean and covariance of x."""
+        self.curves: dict[int, BSpline] = {}
+        """Curves by label. Only the number of their control points is current; see `spline`."""
+        self.pose_u: dict[int, float] = {}
+        """Parameter of the vehicle's foot point on each curve, not wrapped."""
+
+    @property
+    def pose(self) -> Array:
+        """Return the pose (3,), x (m), y (m), theta (rad, not wrapped), in the map frame: a view."""
+        return self.belief.pose
+
+    def offset(self, label: int) -> int:
+        """Return the number of points in x before a curve's first control point."""
+        return sum(curve.size for other, curve in self.curves.items() if other < label)
+
+    def control_points(self, label: int) -> Array:
+        """Return the distinct control points (m, 2) of a curve in m, map frame: a view."""
+        start = self.offset(label)
+        return self.belief.points[start : start + self.curves[label].size]
+
+    def columns(self, label: int, control: IntArray) -> IntArray:
+        """Return the entries (2 k,) of x that are control points (k,) of a curve."""
+        return point_columns(self.offset(label) + control)
+
+    def covariance(self, label: int) -> Array:
+        """Return the joint covariance (2m, 2m) of a curve's control points in m^2: a copy."""
+        columns = self.columns(label, np.arange(self.curves[label].size))
+        return self.belief.covariance[np.ix_(columns, columns)]
+
+    def spline(self, label: int) -> BSpline:
+        """Return a curve with its current control points."""
+        return self.curves[label].with_points(self.control_points(label).copy())
+
+    def foot_points(self, label: int, points: Array, low: Array, high: Array) -> FootPoints:
+        """Return the foot points of points (m, 2) in the stretches [low, high] (m,) of a curve."""
+        curve, s = self.spline(label), self.settings.spline
+        return foot_points(
+            curve.tables, curve.control_points, points, low, high, s.search_step, s.search_iterations
+        )
+
+    def locate_vehicle(self) -> None:
+        """Update the vehicle's parameter on each curve: near the last one, or anywhere if it has left."""
+        gate = self.settings.gate
+        heading = np.array([np.cos(self.pose[2]), np.sin(self.pose[2])])
+        for label, last in self.pose_u.items():
+            low, high = np.array([last - gate.station_behind]), np.array([last + gate.station_ahead])
+            foot = self.foot_points(label, self.pose[None, :2], low, high)
+            u = float(foot.u[0])
+            if foot.tangent_unit[0] @ heading < 0.0 or abs(foot.distance[0]) > gate.station_lateral:
+                u = relocate(self.boundary(label), self.control_points(label), self.pose, gate.station_room)
+            if self.curves[label].periodic:
+                begin, end = self.curves[label].domain
+                u += (end - begin) * round((last - u) / (end - begin))
+            self.pose_u[label] = u
+
+    def visible_range(self, label: int, count: int) -> tuple[Array, Array]:
+        """Return the limits of the stretch of a curve that the vehicle sees, each `count` times."""
+        gate, u = self.settings.gate, self.pose_u[label]
+        return np.full(count, u - gate.view_behind), np.full(count, u + gate.view_ahead)
+
+    def begin(self, label: int, detections: Array, covariances: Array) -> None:
+        """Begin a clamped curve of one span along the polyline of detections (k >= 2, 2), vehicle frame."""
+        belief, p, k = self.belief, self.settings.spline.degree, len(detections)
+        count = len(belief.points)
+        belief.add_points(detections, covariances)
+        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(detections, axis=0).T)))
+        at = np.linspace(0.0, along[-1], p + 1)
+        matrix = np.column_stack([np.interp(at, along, row) for row in np.eye(k)])
+        belief.transform_points(count, count + k, matrix, np.full(p + 1, SIGMA_START))
+        knots = clamped_knots(np.array([0.0, along[-1]]), p)
+        self._append_points(label, BSpline(knots, belief.points[count:], p), p + 1)
+        self.pose_u[label] = 0.0
+
+    def extend(self, label: int, detection: Array, covariance: Array) -> None:
+        """Extend a curve to a detection (2,), vehicle frame: unclamp, insert, clamp (Hu et al. 2002).
+
+        The new control point has the uncertainty of the detection (2, 2) and of the pose.
+        """
+        belief, spline, p = self.belief, self.spline(label), self.curves[label].degree
+        belief.add_points(detection[None], covariance[None])
+        knots = spline.extension_knots(belief.points[-1])
+        matrix = end_change_matrix(spline.knots, p, knots)
+        n, end = spline.size, self.offset(label) + spline.size
+        last = slice(n - p - 1, n)
+        belief.transform_points(end - p - 1, end, matrix[last, last], np.zeros(p + 1))
+        self._append_points(label, BSpline(knots, np.zeros((n + 1, 2)), p), 1)
+        self._limit_bending(label, p + 1)
+
+    def _limit_bending(self, label: int, count: int) -> None:
+        """Apply a prior of little bending to a curve's last `count` control points."""
+        curve = self.curves[label]
+        last = np.arange(curve.size - count, curve.size)
+        abscissae = greville(curve.knots, curve.degree)[last]
+        matrix = np.kron(smoothness_matrix(abscissae, None), np.eye(POINT))
+        sigma = self.settings.ckf.sigma_bend * float(np.mean(np.diff(abscissae)))
+        noise = sigma**2 * np.eye(len(matrix))
+        self.belief.update(self.columns(label, last), lambda x: x @ matrix.T, np.zeros(len(matrix)), noise)
+
+    def _append_points(self, label: int, curve: BSpline, added: int) -> None:
+        """Move the last `added` points of x to the end of a curve, whose knots are now those of `curve`."""
+        self.curves = dict(sorted({**self.curves, label: curve}.items()))
+        end, count = self.offset(label) + curve.size, len(self.belief.points)
+        order = np.arange(count - added)
+        self.belief.reorder(np.insert(order, end - added, np.arange(count - added, count)))
+
+    def replace(self, label: int, curve: BSpline, matrix: Array, sigma: float) -> None:
+        """Replace a curve by one with `matrix` (k, n) times its control points, plus noise of sigma (m)."""
+        start = self.offset(label)
+        stop = start + self.curves[label].size
+        self.belief.transform_points(start, stop, matrix, np.full(len(matrix), sigma))
+        self.curves[label] = curve
+
+    def boundary(self, label: int) -> Boundary:
+        """Return a curve as the boundary that registration and simplification take; its end is confirmed."""
+        curve, settings = self.curves[label], self.settings
+        boundary = Boundary(curve.knots, curve.periodic, settings.spline, settings.gauge)
+        boundary.confirmed_end = boundary.tables.high
+        return boundary
+
+
+STRETCH: Final = 12.0
+"""An extension is at most this long (m), so a longer one takes several."""
+SIGMA_CARRY: Final = 1.0
+"""Standard deviation (m) of the control point that carries on a stranded end along the path."""
+RECENT: Final = 40
+"""A confirmed track is compared with this many of the last cones, not with those of the lap's beginning."""
+AT_END: Final = 1e-6
+"""A foot point within this distance (m) of the end's parameter is at the end."""
+
+
+class Expansion:
+    """What was detected beyond the curves, which expands them.
+
+    A detection expands a curve only if it belongs to a confirmed track that comes next along the path. An end
+    that the vehicle has passed is extended beside the path, as in the other estimators.
+    """
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self.settings = settings
+        self.tentative = {label: TentativeTracks(settings.growth) for label in BOUNDARIES}
+        """Tracks of all recent detections, by label."""
+        self.observed: dict[int, list[Array]] = {label: [] for label in BOUNDARIES}
+        """All distinct cones that were confirmed, as points (2,) in m, map frame, by label."""
+        self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # lengths (m) since the last cone
+
+    def observe(self, state: CurveState, detections: Detections) -> None:
+        """Add all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
+        points = to_map(detections.points_vehicle, state.pose[None])
+        covariances = rotated(detections.covariances, np.full(len(points), state.pose[2]))
+        for label, tentative in self.tentative.items():
+            same = detections.labels == label
+            tentative.add(points[same], covariances[same], detections.t)
+            known, radius = self.observed[label], self.settings.growth.merge_radius
+            for point in tentative.points[tentative.confirmed()]:
+                if not known or np.hypot(*(np.array(known[-RECENT:]) - point).T).min() > radius:
+                    known.append(point.copy())
+
+    def expand(
+        self, state: CurveState, detections: Detections, path_ahead: PathAhead, free: BoolArray
+    ) -> set[int]:
+        """Begin or extends each curve by detections that update none (`free` (m,))."""
+        extended: set[int] = set()
+        for label in BOUNDARIES:
+            rows = np.flatnonzero(free & (detections.labels == label))
+            found = self._candidates(state, label, detections, rows, path_ahead)
+            if label not in state.curves:
+                found = found.where(found.sides < self.settings.growth.max_lateral)
+                if len(found.points) > 1:
+                    begin, rows = detections.points_vehicle[found.indices], found.indices
+                    state.begin(label, begin, self._covariances(detections, rows))
+            elif self._extend(state, label, detections, found):
+                extended.add(label)
+                self._carried[label] = 0.0
+            elif self._carry_on(state, label, path_ahead):
+                extended.add(label)
+        return extended
+
+    def _candidates(
+        self, state: CurveState, label: int, detections: Detections, rows: IntArray, path_ahead: PathAhead
+    ) -> Candidates:
+        """Return the detections `rows` of confirmed tracks that come next along the path."""
+        settings, tentative = self.settings.growth, self.tentative[label]
+        points = to_map(detections.points_vehicle[rows], state.pose[None])
+        confirmed = tentative.points[self._undisputed(label, tentative.confirmed())]
+        near = nearest_within(points, confirmed, settings.merge_radius)[1]
+        stations, lateral = path_ahead.locate(points)
+        found = Candidates(points, rows, stations, SIDES[label] * lateral)
+        found = found.where(near & (stations <= path_ahead.stations[-1]) & (found.sides > 0.0))
+        found = found.where(np.argsort(found.stations))
+        end = None
+        if label in state.curves:
+            end = _end(state, label, path_ahead, END_BEHIND)
+            found = found.where(self._beyond(state, label, found, end)) if len(found.points) else found
+        return found.where(chain(found, end))
+
+    def _undisputed(self, label: int, indices: IntArray) -> IntArray:
+        """Return the tracks that do not have more detections with another label around them."""
+        tracks = self.tentative[label]
+        votes = tracks.counts[indices].astype(np.float64)
+        for other in (self.tentative[b] for b in BOUNDARIES if b != label):
+            offset = tracks.points[indices, None] - other.points
+            near = np.hypot(offset[..., 0], offset[..., 1]) < self.settings.growth.merge_radius
+            votes -= near @ other.counts
+        return indices[votes >= 0.0]
+
+    def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> BoolArray:
+        """Return which candidates (m,) meet the paper's three conditions, and lie ahead of the end."""
+        high, control_points = state.curves[label].domain[1], state.control_points(label)
+        low, _ = state.visible_range(label, len(found.points))
+        foot = state.foot_points(label, found.points, np.minimum(low, high), np.full(len(low), high))
+        ahead = found.stations > end.station + STATION_MARGIN
+        return ahead & beyond_end(found.points, foot.u, high, control_points, self.settings.ckf)
+
+    def _extend(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> bool:
+        """Extend a curve to the last candidate of the proximity chain; return whether there is any."""
+        if len(found.points) == 0:
+            return False
+        order = proximity_chain(found.points, _end_position(state, label))
+        points, rows = found.points[order], found.indices[order]
+        covariances = self._covariances(detections, rows)
+        last = _end_position(state, label)
+        for i in range(len(rows)):
+            final = i == len(rows) - 1
+            too_far = not final and np.hypot(*(points[i + 1] - last)) > STRETCH
+            if final or (too_far and np.hypot(*(points[i] - last)) > self.settings.ckf.threshold):
+                state.extend(label, detections.points_vehicle[rows[i]], covariances[i])
+                last = points[i]
+        return True
+
+    def _covariances(self, detections: Detections, rows: IntArray) -> Array:
+        """Return the covariances (k, 2, 2) of detections as points of the curve, vehicle frame."""
+        model = self.settings.ckf.sigma_model**2 * np.eye(2)
+        return np.asarray(detections.covariances[rows] + model)
+
+    def _carry_on(self, state: CurveState, label: int, path_ahead: PathAhead) -> bool:
+        """Extend a curve whose end the vehicle has passed beside the path, nearly as far as the vehicle."""
+        settings = self.settings.growth
+        end = _end(state, label, path_ahead, END_BEHIND)
+        if end.station >= path_ahead.driven - STRANDED:
+            return False
+        side = SIDES[label] * max(end.side, MIN_LATERAL)
+        point = path_ahead.beside(path_ahead.driven - CARRIED_TO, side)
+        distance = float(np.hypot(*(point - end.position)))
+        if not MIN_CARRY <= distance <= settings.max_unseen - self._carried[label]:
+            return False
+        self._carried[label] += distance
+        point_vehicle = (point - state.pose[:2]) @ rotation(state.pose[2])
+        state.extend(label, point_vehicle, SIGMA_CARRY**2 * np.eye(2))
+        return True
+
+
+def beyond_end(
+    points: Array, u: Array, high: float, control_points: Array, settings: CkfSettings
+) -> BoolArray:
+    """Return which points (m, 2) with foot points at u (m,) meet the paper's three conditions (m,).
+
+    The foot point is the end of the curve, at the parameter `high`; the point is farther from `C_n` than the
+    growth threshold, and farther from `C_{n-1}` than the separation.
+    """
+    at_end = u >= high - AT_END
+    far = np.hypot(*(points - control_points[-1]).T) > settings.threshold
+    apart = np.hypot(*(points - control_points[-2]).T) > settings.separation
+    return np.asarray(at_end & far & apart)
+
+
+def proximity_chain(points: Array, start: Array) -> IntArray:
+    """Return the order (k,) of points (k, 2), each the nearest to the last; it begins at `start` (2,)."""
+    remaining, order, last = list(range(len(points))), [], start
+    while remaining:
+        distances = np.hypot(*(points[remaining] - last).T)
+        order.append(remaining.pop(int(distances.argmin())))
+        last = points[order[-1]]
+    return np.array(order, np.intp)
+
+
+def _end_position(state: CurveState, label: int) -> Array:
+    """Return S(1) (2,), which is the last control point of a clamped curve."""
+    return np.array(state.control_points(label)[-1])
+
+
+def _end(state: CurveState, label: int, path_ahead: PathAhead, behind: float) -> End:
+    """Return the end of a curve relative to the path from `behind` (m) before the vehicle on."""
+    position = _end_position(state, label)
+    station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position[None])
+    return End(position, float(station[0]), SIDES[label] * float(lateral[0]))

@@ -1,0 +1,216 @@
+"""Classifies the detections of a cycle, and makes its one Kalman update (paper: Expansion, Update).
+
+What the paper leaves open, and what was chosen, is in `docs/paper.md`, "Decisions of the filter".
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.bspline import scatter
+from pathspace_graph.factors.residuals import project
+from pathspace_graph.factors.se2 import rotation, to_map, to_vehicle
+from pathspace_graph.factors.sensor import SENSOR_SIZE, in_vehicle
+from pathspace_graph.graph.variables import POINT, POSE
+from pathspace_graph.io.log import Detections
+from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.mapping.belief import SENSOR_COLUMNS, point_columns, to_vehicle_rows, transform
+from pathspace_graph.settings.batch import CkfSettings
+
+from .ckf_curves import CurveState
+
+RANK: Final = 1e-9
+"""Singular values of the gain below this share of the largest one count as zero."""
+LEAST_BASIS: Final = 1e-3
+"""A control point is updated where its basis values at the detections add up to at least this."""
+
+
+# --- classification --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class OnCurve:
+    """The detections of a cycle that update a curve."""
+
+    rows: IntArray
+    """(m,) Rows of the cycle's detections."""
+    basis: Array
+    """(m, n) The curve's n basis functions at the foot points: the paper's B."""
+    tangents: Array
+    """(m, 2) Unit tangents at the foot points, map frame."""
+    distances: Array
+    """(m,) Squared Mahalanobis distances across the curve."""
+
+    def where(self, chosen: BoolArray) -> "OnCurve":
+        """Return the detections whose entry in `chosen` (m,) is set."""
+        return OnCurve(self.rows[chosen], self.basis[chosen], self.tangents[chosen], self.distances[chosen])
+
+
+def classify(state: CurveState, detections: Detections) -> dict[int, OnCurve]:
+    """Return the detections that update each curve; one with an unknown label updates the nearer curve."""
+    found = {label: on_curve(state, label, detections) for label in state.curves}
+    nearest = np.full(len(detections.labels), np.inf)
+    for on in found.values():
+        nearest[on.rows] = np.minimum(nearest[on.rows], on.distances)
+    return {label: on.where(on.distances <= nearest[on.rows]) for label, on in found.items()}
+
+
+def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
+    """Return the detections within the gate of a curve: `d^2 < chi^2 (n' K n + sigma^2 + g' Sigma g)`.
+
+    d is the signed distance across the curve, n its normal, K the covariance of the detection, sigma^2 the
+    variances of the settings, and g the derivative of d by pose and control points. Sigma is their joint
+    covariance. The foot point is in the stretch that the vehicle sees, and is not at an end of it.
+    """
+    gate, curve = state.settings.gate, state.curves[label]
+    rows = np.flatnonzero((detections.labels == label) | (detections.labels == UNKNOWN))
+    poses = np.tile(state.pose, (len(rows), 1))
+    points = to_map(detections.points_vehicle[rows], poses)
+    foot = state.foot_points(label, points, *state.visible_range(label, len(rows)))
+    projected = project(points, detections.covariances[rows], poses, foot, state.settings.ckf.sigma_model)
+    control = foot.span[:, None] + np.arange(-curve.degree, 1)
+    control = control % curve.size if curve.periodic else control
+    by_control = projected.by_control.reshape(len(rows), control.shape[1] * POINT)
+    expected = to_vehicle(foot.position, poses)
+    normals = in_vehicle(foot.normal_unit, poses)
+    by_calibration = np.einsum("mi,mik->mk", normals, state.belief.by_sensor(expected))
+    gradient = np.concatenate([projected.by_pose, by_calibration, by_control], axis=1)
+    points_of = point_columns(state.offset(label) + control.ravel())
+    points_of = points_of.reshape(len(rows), POINT * control.shape[1])
+    head = np.tile(np.append(np.arange(POSE), SENSOR_COLUMNS), (len(rows), 1))
+    columns = np.concatenate([head, points_of], axis=1)
+    joint = state.belief.covariance[columns[:, :, None], columns[:, None, :]]
+    variance = projected.sigma**2 + gate.sigma_floor**2
+    variance = variance + np.einsum("mi,mij,mj->m", gradient, joint, gradient)
+    squared = foot.distance**2 / variance
+    passes = foot.interior & (np.abs(foot.distance) < gate.rough) & (squared < gate.chi**2)
+    basis = scatter(foot.basis, foot.span - curve.degree, curve.size, curve.periodic)
+    return OnCurve(rows, basis, foot.tangent_unit, squared).where(passes)
+
+
+# --- the fit of S_z --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class SplineMeasurement:
+    """S_z on r control points, in the frame of the detections."""
+
+    points: Array
+    """(r, 2) Control points of S_z, in m."""
+    covariance: Array
+    """(2 r, 2 r) Their covariance over x0, y0, x1, y1 and so on, in m^2."""
+    gain: Array
+    """(r, m) G, the derivative of S_z by the detections."""
+    taken: Array
+    """(r, r) G B, the derivative of S_z by control points whose curve the detections lie on."""
+    known: Array
+    """(r, 2) Control points C_mu before the fit."""
+
+    def refitted(self, points: Array) -> Array:
+        """Return `C_mu + G B (C - C_mu)`: the S_z of detections on curves with control points (k, r, 2)."""
+        return np.asarray(self.known + np.einsum("ij,kjd->kid", self.taken, points - self.known))
+
+    def range_basis(self) -> Array:
+        """Return an orthonormal basis (r, q) of the range of G: all that the detections can change."""
+        vectors, values, _ = np.linalg.svd(self.gain, full_matrices=False)
+        return np.asarray(vectors[:, values > RANK * values[0]])
+
+
+def regularization(basis: Array, settings: CkfSettings) -> Array:
+    """Return `L = lambda diag(1 - B' 1 / m)` (r, r) of the basis B (m, r)."""
+    return np.diag(settings.ridge * (1.0 - basis.mean(axis=0)))
+
+
+def ridge_gain(basis: Array, settings: CkfSettings) -> Array:
+    """Return `G = (B' B + L)^-1 B'` (r, m): the ridge regression is `C = C_mu + G (y - B C_mu)`."""
+    gram = basis.T @ basis + regularization(basis, settings)
+    return np.asarray(np.linalg.lstsq(gram, basis.T, rcond=None)[0])
+
+
+def fit_detections(
+    basis: Array, detections: Array, covariances: Array, known: Array, settings: CkfSettings
+) -> SplineMeasurement:
+    """Fit S_z to detections (m, 2) with covariances (m, 2, 2): a cubature transform of the ridge regression.
+
+    basis (m, r) is evaluated at their foot points. known (r, 2) holds the control points in the frame of the
+    detections.
+    """
+    m, r = basis.shape
+    gain = ridge_gain(basis, settings)
+    joint = np.zeros((m, 2, m, 2))
+    joint[np.arange(m), :, np.arange(m), :] = covariances
+    kept = known - gain @ (basis @ known)
+
+    def fit(samples: Array) -> Array:
+        fitted = kept + np.einsum("rm,kmd->krd", gain, samples.reshape(-1, m, 2))
+        return np.asarray(fitted.reshape(len(samples), -1))
+
+    fitted = transform(fit, detections.ravel(), joint.reshape(2 * m, 2 * m))
+    return SplineMeasurement(fitted.mean.reshape(r, 2), fitted.covariance, gain, gain @ basis, known)
+
+
+# --- the update ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class CurveBlock:
+    """The block of the measurement that is the S_z of one curve."""
+
+    columns: IntArray
+    """(2 r,) Entries of the state that are the measured control points."""
+    fitted: SplineMeasurement
+    """S_z in the vehicle frame."""
+    combinations: Array
+    """(2 r, q) Linear combinations of the coordinates of S_z that are measured."""
+    by_sensor: Array
+    """(2 r, 5) Derivative of S_z by the calibration of the sensor, as it corrects detections."""
+
+
+def update(state: CurveState, detections: Detections, found: dict[int, OnCurve]) -> None:
+    """Fit S_z of each curve, and makes one Kalman update of pose and map with all of them."""
+    blocks = [_fit(state, label, detections, on) for label, on in found.items() if len(on.rows)]
+    if not blocks:
+        return
+    bounds = np.cumsum([0] + [len(block.columns) for block in blocks])
+
+    head, now = POSE + SENSOR_SIZE, state.belief.sensor.copy()
+
+    def predict(x: Array) -> Array:
+        control_vehicle, predicted = to_vehicle_rows(x[:, :POSE], x[:, head:]), []
+        for block, start, stop in zip(blocks, bounds[:-1], bounds[1:], strict=True):
+            points = control_vehicle[:, start:stop].reshape(len(x), -1, POINT)
+            fitted = block.fitted.refitted(points).reshape(len(x), -1)
+            predicted.append((fitted - (x[:, POSE:head] - now) @ block.by_sensor.T) @ block.combinations)
+        return np.concatenate(predicted, axis=1)
+
+    columns = state.belief.measuring_columns(np.concatenate([block.columns for block in blocks]))
+    measured = np.concatenate([block.fitted.points.ravel() @ block.combinations for block in blocks])
+    noise = block_diag(*(b.combinations.T @ b.fitted.covariance @ b.combinations for b in blocks))
+    state.belief.update(columns, predict, measured, noise)
+
+
+def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> CurveBlock:
+    """Return S_z of one curve, on the control points that the detections reach."""
+    control = np.flatnonzero(on.basis.sum(axis=0) > LEAST_BASIS)
+    known = to_vehicle_rows(state.pose[None], state.control_points(label)[control].reshape(1, -1))
+    fitted = fit_detections(
+        on.basis[:, control],
+        detections.points_vehicle[on.rows],
+        _widened(state, detections.covariances[on.rows], on.tangents),
+        known.reshape(-1, POINT),
+        state.settings.ckf,
+    )
+    combinations: Array = np.asarray(np.kron(fitted.range_basis(), np.eye(POINT)), float)
+    expected = state.belief.by_sensor(on.basis[:, control] @ fitted.known)
+    by_calibration = np.einsum("rm,mik->rik", fitted.gain, expected).reshape(-1, SENSOR_SIZE)
+    return CurveBlock(state.columns(label, control), fitted, combinations, by_calibration)
+
+
+def _widened(state: CurveState, covariances: Array, tangents: Array) -> Array:
+    """Return `K + sigma_model^2 I + sigma_along^2 t t'` (m, 2, 2), vehicle frame, of map tangents (m, 2)."""
+    t = tangents @ rotation(state.pose[2])
+    along = state.settings.ckf.sigma_along**2 * t[:, :, None] * t[:, None, :]
+    return np.asarray(covariances + state.settings.ckf.sigma_model**2 * np.eye(POINT) + along)

@@ -1,0 +1,362 @@
+"""The paper's filters: that of splines, which closes its loop, and its landmark baseline (paper: Results)."""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.factors.se2 import left_of, rotated, to_map
+from pathspace_graph.front_end.front_end import FrontEnd
+from pathspace_graph.graph.variables import POINT, POSE, pose_keys
+from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
+from pathspace_graph.io.results import RunNoise, VehicleState
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.motion import MeasuredMotion, known_noise
+from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.registration import (
+    BEGINNING,
+    BEGINNING_SHARE,
+    WINDOW,
+    Motion,
+    near_start,
+    register,
+)
+from pathspace_graph.mapping.seam import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
+from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
+from pathspace_graph.run import CycleResult, Stopwatch
+from pathspace_graph.scale import at_scale
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.knots import refit
+
+from .ckf_curves import CurveState, Expansion
+from .ckf_update import OnCurve, classify, update
+from .landmark_association import ROUGH, Association, Gates, associate, compatible, pair_costs
+from .landmark_map import UNASSOCIATED, landmark_counts, point_map
+
+REACH: Final = 9.0
+"""A curve is extended up to this far ahead of the vehicle (m along the predicted path)."""
+SIGMA_MATCH: Final = 0.6
+"""Sigma (m) of a detection in the registration with the early segment, which is worse than online."""
+PATIENCE: Final = 30.0
+"""Once this length of the beginning has been driven again (m), it closes the loop, however uncertain the
+position is: `SIGMA_PATIENCE` (m) replaces `closing.sigma_max`."""
+SIGMA_PATIENCE: Final = 1000.0
+SIGMA_TIE: Final = 0.15
+"""Standard deviation (m) of the distance between the ends of a curve where the loop closes."""
+TIE_REACH: Final = 1.0
+"""Points of the end that stay farther from the beginning than this (m) are no correspondences."""
+
+
+class _Filter:
+    """What both filters share.
+
+    A cycle that cannot be used is a ReadingError and changes nothing. So is one that is late, since a filter
+    has no earlier pose that could take its detections.
+    """
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        """Keep the settings, and the standard deviation (3,) of a twist (m/s, m/s, rad/s)."""
+        self.settings = settings or MapperSettings()
+        noise = known_noise(odometry_sigma)
+        self.odometry_sigma = noise.odometry
+        self.front_end = FrontEnd(self.settings, noise)
+        self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
+        """State `x = [pose | calibration | control points or landmarks]`."""
+
+    def noise_used(self) -> RunNoise:
+        """Return the noise that is used now, and what was measured so far."""
+        return self.front_end.noise_used
+
+    def vehicle_state(self) -> VehicleState:
+        """Return the newest pose and the calibration, with their joint covariance."""
+        return self.belief.vehicle_state()
+
+
+@at_scale
+class CkfMapper(_Filter):
+    """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points."""
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        super().__init__(settings, odometry_sigma)
+        self.state = CurveState(self.belief, self.settings)
+        self.path = DrivenPath()
+        self.expansion = Expansion(self.settings)
+        self.closed = False
+        self._recent: list[tuple[Array, Detections]] = []
+        self._last_check = 0.0
+
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        """Process one perception cycle: the twists since the last one, and the detections of now."""
+        watch = Stopwatch()
+        cycle = self.front_end.admit(odometry, detections)
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
+        self._predict(reading.motion)
+        detections = self.state.belief.corrected(reading.detections)
+        watch.lap("predict")
+        found = classify(self.state, detections)
+        watch.lap("classify")
+        found = self._expand(detections, found)
+        watch.lap("expand")
+        update(self.state, detections, found)
+        watch.lap("update")
+        self._close(detections)
+        watch.lap("close")
+        used = sum(len(on.rows) for on in found.values())
+        return cycle.counted(self._result(detections.t, used, watch.laps))
+
+    def _predict(self, motion: MeasuredMotion) -> None:
+        """Predict the pose by the motion since the last cycle, and locate it on the curves."""
+        self.state.belief.follow(motion)
+        self.state.locate_vehicle()
+        self.path.update(self.state.pose.copy())
+        self.path.steer(motion.twists)
+
+    def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
+        """Expand the curves; then detections on the new stretch update it with the rest."""
+        if self.closed:
+            return found
+        self.expansion.observe(self.state, detections)
+        free = np.ones(len(detections.labels), bool)
+        for on in found.values():
+            free[on.rows] = False
+        path_ahead = self.path.ahead(self.state.pose, REACH)
+        extended = self.expansion.expand(self.state, detections, path_ahead, free)
+        return classify(self.state, detections) if extended else found
+
+    def _close(self, detections: Detections) -> None:
+        """Look for the early segment after the shortest lap, and close and simplify both curves there."""
+        settings, state = self.settings.closing, self.state
+        if self.closed:
+            return
+        self._recent.append((state.pose.copy(), detections))
+        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - WINDOW]
+        if len(state.curves) == 0 or not near_start(self.path, state.pose, settings):
+            return
+        if self.path.length - self._last_check < settings.check_interval:
+            return
+        self._last_check = self.path.length
+        motion = associate_early_segment(state, self._recent, self.path.beginning)
+        if motion is not None and update_by_correspondences(state, motion):
+            simplify(state, self.expansion.observed)
+            self.closed = True
+
+    def _result(self, t: float, used: int, stages: dict[str, float]) -> CycleResult:
+        curves = self.state.curves
+        left, right = (curves[label].size if label in curves else 0 for label in (LEFT, RIGHT))
+        return CycleResult(t, self.state.pose.copy(), (left, right), used, self.closed, stages)
+
+    def map(self) -> Map:
+        """Return the map as it stands, with the joint covariance of each boundary's control points."""
+        state = self.state
+        curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
+        keys = [state.columns(b, np.arange(curve.size)) for b, curve in sorted(state.curves.items())]
+        columns = np.concatenate([np.zeros(0, np.intp), *keys])
+        return Map(self.closed, curves, state.belief.covariance[np.ix_(columns, columns)])
+
+    def outline(self) -> Map:
+        """Return a copy of the present map without covariances."""
+        curves = {b: SplineBoundary(self.state.spline(b), NO_COVARIANCE) for b in self.state.curves}
+        return Map(self.closed, curves)
+
+
+# --- closing and simplification --------------------------------------------------------------------------
+
+
+def associate_early_segment(
+    state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
+) -> Motion | None:
+    """Return the motion that moves the newest detections onto the beginning of the curves, or None."""
+    closing = replace(
+        state.settings.closing, sigma_reading=SIGMA_MATCH, patience=PATIENCE, sigma_patience=SIGMA_PATIENCE
+    )
+    covariance = state.belief.covariance[:POSE, :POSE]
+    times = [detections.t for _, detections in cycles]
+    found = register(_recent(state, cycles), times, covariance, beginning, closing)
+    return None if found is None else found.motion
+
+
+def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveMap:
+    """Return the curves, the newest poses and their detections as the registration takes them."""
+    track = CurveMap(state.settings)
+    for label in state.curves:
+        track.state.add_boundary(label, state.boundary(label), state.control_points(label))
+    for cycle, (pose, detections) in enumerate(cycles):
+        track.variables.insert(pose_keys(np.array([cycle])), pose)
+        track.detections.append(detections, cycle)
+    track.detections.used[:] = True  # a filter keeps no record of what its curves explained
+    return track
+
+
+def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
+    """Make one Kalman update: the end of each curve lies on its beginning, at the correspondences.
+
+    `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where the motion moves S(u), near the end, on S(w), with
+    the normal n. Along the tangent all k correspondences are one result of the registration, so each has
+    sqrt(k) times its sigma. Returns False, and does nothing, if an end has not reached its beginning yet.
+    """
+    overlaps = {label: _overlap(state, label, motion) for label in state.curves}
+    if not all(len(u) for u, _ in overlaps.values()):
+        return False
+    rows, columns = [], []
+    for label, (u, w) in overlaps.items():
+        spline = state.spline(label)
+        basis = spline.basis_matrix(u) - spline.basis_matrix(w)
+        tangents = spline.tangent_unit(w)
+        normals = left_of(tangents)
+        by_axis = [(basis[:, :, None] * axis[:, None, :]).reshape(len(u), -1) for axis in (normals, tangents)]
+        rows.append(np.concatenate(by_axis))
+        columns.append(state.columns(label, np.arange(spline.size)))
+    matrix = block_diag(*rows)
+    along, counts = state.settings.closing.sigma_max, [len(r) // 2 for r in rows]
+    sigma = np.concatenate([np.repeat([SIGMA_TIE, along * np.sqrt(k)], k) for k in counts])
+    measured, noise = np.zeros(len(matrix)), np.diag(sigma**2)
+    state.belief.update(np.concatenate(columns), lambda x: x @ matrix.T, measured, noise)
+    return True
+
+
+def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Array]:
+    """Return parameters (k,) near the end of a curve, and those (k,) of the points they are moved on."""
+    spline = state.spline(label)
+    high = spline.domain[1]
+    u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
+    moved = motion.apply(spline.evaluate(u))
+    zero = np.zeros(len(u))
+    beginning = min(BEGINNING, BEGINNING_SHARE * high)
+    foot = state.foot_points(label, moved, zero, zero + beginning)
+    on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
+    return u[on], foot.u[on]
+
+
+def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
+    """Make both curves periodic, on curvature-weighted knots (paper: Simplification)."""
+    for label in state.curves:
+        boundary = state.boundary(label)
+        points, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
+        foot = boundary.find(state.control_points(label), points, zero, zero + boundary.confirmed_end)
+        boundary.cone_parameters = np.sort(foot.u).tolist()
+        periodic = make_periodic(
+            boundary, state.control_points(label), state.settings, state.settings.ckf.knots
+        )
+        degree = state.settings.spline.degree
+        points = np.concatenate([periodic.points, periodic.points[:degree]])
+        curve = BSpline(periodic.knots, points, degree, periodic=True)
+        matrix = refit(state.spline(label), curve, periodic.overlap.new_parameter).new_from_old
+        state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
+        state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
+
+
+# --- the baseline ----------------------------------------------------------------------------------------
+
+
+@at_scale
+class LandmarkCkf(_Filter):
+    """Maps cones as points: predict, associate, update, create.
+
+    The paper describes its baseline as "a similarly structured state and overall implementation style", with
+    the Mahalanobis distance as the cost of the assignment (section Results). Where it leaves something open,
+    the choice makes the baseline no weaker than it has to be: the gates are those of the landmark graph, a
+    detection is associated only with a landmark of its own label, a track becomes a landmark after
+    `ckf.sightings` detections (with 1, every detection beyond the gate creates one, as in the description),
+    and the calibration of the odometry is in its state too.
+
+    Landmarks are never merged, and the loop never closes. So ghosts stay, as the paper says of its baseline.
+    """
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        super().__init__(settings, odometry_sigma)
+        self.labels: IntArray = np.zeros(0, np.intp)
+        """(n,) Labels of the landmarks."""
+        self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
+        """Tracks by label that are not landmarks yet."""
+
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        """Process one perception cycle: the twists since the last one, and the detections of now."""
+        watch = Stopwatch()
+        cycle = self.front_end.admit(odometry, detections)
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
+        self.belief.follow(reading.motion)
+        detections = self.belief.corrected(reading.detections)
+        watch.lap("predict")
+        found = self._associate(detections)
+        watch.lap("associate")
+        self._update(detections, found.landmark)
+        watch.lap("update")
+        self._create(detections, found.new)
+        watch.lap("create")
+        used, sizes = int((found.landmark != UNASSOCIATED).sum()), landmark_counts(self.labels)
+        return cycle.counted(
+            CycleResult(detections.t, self.belief.pose.copy(), sizes, used, False, watch.laps)
+        )
+
+    def _associate(self, detections: Detections) -> Association:
+        """Assign the detections to the nearby landmarks, by the joint covariance of pose and landmarks."""
+        points = to_map(detections.points_vehicle, self.belief.pose[None])
+        nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH)[1])
+        predicted, covariances = self._predict(nearby)
+        cost = pair_costs(detections.points_vehicle, detections.covariances, predicted, covariances)
+        cost[~compatible(detections.labels, self.labels[nearby])] = np.inf
+        found = associate(cost, Gates.of(self.settings.landmark))
+        matched = found.landmark != UNASSOCIATED
+        landmark = np.full(len(detections.labels), UNASSOCIATED, np.intp)
+        landmark[matched] = nearby[found.landmark[matched]]
+        return Association(landmark, found.new)
+
+    def _predict(self, landmarks: IntArray) -> tuple[Array, Array]:
+        """Return where landmarks (k,) should be detected (k, 2) and covariances (k, 2, 2), vehicle frame."""
+        k = len(landmarks)
+        if k == 0:
+            return np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
+        predicted = self.belief.predict_detections(landmarks)
+        blocks = predicted.covariance.reshape(k, POINT, k, POINT)
+        return predicted.mean.reshape(k, POINT), blocks[np.arange(k), :, np.arange(k)]
+
+    def _update(self, detections: Detections, landmark: IntArray) -> None:
+        """Make one Kalman update with all associated detections."""
+        rows = np.flatnonzero(landmark != UNASSOCIATED)
+        if len(rows) == 0:
+            return
+        columns = self.belief.measuring_columns(point_columns(landmark[rows]))
+        noise = block_diag(*detections.covariances[rows])
+        measured = detections.points_vehicle[rows].ravel()
+        self.belief.update(columns, self.belief.measuring(landmark[rows]), measured, noise)
+
+    def _create(self, detections: Detections, new: BoolArray) -> None:
+        """Add a landmark for each track that has enough detections beyond the gate of every landmark."""
+        points = to_map(detections.points_vehicle, self.belief.pose[None])
+        covariances = rotated(detections.covariances, np.full(len(points), self.belief.pose[2]))
+        chosen = [np.zeros(0, np.intp)]
+        for label, tentative in self.tentative.items():
+            rows = np.flatnonzero(new & (detections.labels == label))
+            tentative.add(points[rows], covariances[rows], detections.t)
+            confirmed = np.flatnonzero(tentative.counts >= self.settings.ckf.sightings)
+            offset = points[rows][:, None] - tentative.points[confirmed][None]
+            distance = np.hypot(offset[..., 0], offset[..., 1])
+            if distance.size:
+                near = distance.min(axis=0) < self.settings.growth.merge_radius
+                chosen.append(rows[np.unique(distance.argmin(axis=0)[near])])
+                tentative.remove(confirmed[near])
+        rows = np.concatenate(chosen)
+        if len(rows):
+            self.belief.add_points(detections.points_vehicle[rows], detections.covariances[rows])
+            self.labels = np.concatenate([self.labels, detections.labels[rows]])
+
+    def map(self) -> Map:
+        """Return the map as it stands, with the joint covariance of each boundary's landmarks."""
+        return point_map(self.belief.points, self.labels, self.belief.covariance[HEAD:, HEAD:], False)
+
+    def outline(self) -> Map:
+        """Return a copy of the present map without covariances."""
+        return point_map(self.belief.points, self.labels, None, False)

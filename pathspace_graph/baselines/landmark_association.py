@@ -1,0 +1,225 @@
+"""Which detection is of which landmark, and which landmarks are one cone.
+
+The Hungarian assignment on Mahalanobis distances, with two gates.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.sensor import by_sensor
+from pathspace_graph.graph.variables import POINT
+from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.mapping.tentative import nearest_within
+from pathspace_graph.settings.batch import LandmarkSettings
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import GrowthSettings
+
+from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother, LandmarkState, two_rows
+
+ROUGH: Final = 5.0
+"""A landmark farther from every detection of a cycle than this (m) is not tested at all."""
+HELD_MARGIN: Final = 1e-9
+"""Cost of a held pair below the match gate, as a share: exactly at the gate, round-off would decide."""
+
+
+@dataclass(frozen=True, eq=False)
+class Association:
+    """The landmark of each of the m detections of one perception cycle."""
+
+    landmark: IntArray
+    """(m,) Column of each detection's landmark, or UNASSOCIATED."""
+    new: BoolArray
+    """(m,) Set where a detection lies beyond the create gate of every compatible landmark."""
+
+
+@dataclass(frozen=True)
+class Gates:
+    """Two gates on squared Mahalanobis distances with two degrees of freedom."""
+
+    match: float
+    """A detection may be associated with a landmark below this distance."""
+    create: float
+    """It may create a landmark if it is above this distance from every compatible landmark."""
+
+    @staticmethod
+    @cache
+    def of(settings: LandmarkSettings) -> "Gates":
+        """Return the chi-square quantiles of the two probabilities in the settings."""
+        return Gates(chi2_quantile(settings.match, POINT), chi2_quantile(settings.create, POINT))
+
+
+# --- the assignment --------------------------------------------------------------------------------------
+
+
+def associate(cost: Array, gates: Gates) -> Association:
+    """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
+
+    cost (m, n) holds the squared Mahalanobis distances of all m detections of a cycle to n landmarks. It is
+    infinite where the labels are not compatible. Both m and n may be zero.
+    """
+    landmark = np.full(len(cost), UNASSOCIATED, np.intp)
+    rows, columns = linear_sum_assignment(np.minimum(cost, gates.match))
+    chosen = cost[rows, columns] < gates.match
+    landmark[rows[chosen]] = columns[chosen]
+    return Association(landmark, np.asarray((cost > gates.create).all(axis=1)))
+
+
+def squared_mahalanobis(innovations: Array, covariances: Array) -> Array:
+    """Return `r' S^-1 r` (...,) of innovations (..., 2) with covariances (..., 2, 2), in closed form."""
+    x, y = innovations[..., 0], innovations[..., 1]
+    xx, xy, yy = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+    return np.asarray((yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy))
+
+
+def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_covariances: Array) -> Array:
+    """Return the squared Mahalanobis distances (m, n) with `S_ij = H_j Sigma H_j' + K_i`, vehicle frame.
+
+    points (m, 2) and covariances K (m, 2, 2) are those of the detections. predicted (n, 2) and
+    predicted_covariances `H Sigma H'` (n, 2, 2) are those of the landmarks. Sigma is the joint covariance of
+    pose and landmark, so it contains the cross terms.
+    """
+    innovations = predicted[None] - points[:, None]
+    return squared_mahalanobis(innovations, predicted_covariances[None] + covariances[:, None])
+
+
+def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates) -> Array:
+    """Return the costs, where pairs that are `held` already stay in the match gate up to the create gate.
+
+    Else detections at the edge would change for ever, and cuts would favour those measured too far away.
+    """
+    inside = (1.0 - HELD_MARGIN) * gates.match
+    return np.where(held & (cost < gates.create), np.minimum(cost, inside), cost)
+
+
+def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
+    """Return for each pair (m, n) whether the detection has the landmark's label or an unknown one."""
+    return np.asarray((labels[:, None] == landmark_labels[None]) | (labels == UNKNOWN)[:, None])
+
+
+# --- online ----------------------------------------------------------------------------------------------
+
+
+def associate_newest(
+    smoother: LandmarkSmoother, new: slice, eligible: BoolArray, cycle: int | None = None
+) -> None:
+    """Associate the rows `new` of the newest pose, or late ones of a `cycle`, with landmarks.
+
+    Only landmarks whose entry in `eligible` (n,) is set take part. A detection between the gates becomes
+    AMBIGUOUS, and so does one in the match gate of a landmark with another label, for whose own label it
+    votes.
+    """
+    detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings.landmark
+    rows = np.arange(new.start, new.stop)
+    points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
+    near = nearest_within(state.landmarks, points, ROUGH)[1]
+    landmarks = np.flatnonzero(near & eligible)
+    gates, numbers = Gates.of(settings), state.numbers[landmarks]
+    predicted = predict(smoother, landmarks, cycle)
+    any_label = pair_costs(detections.point[rows], detections.covariance[rows], *predicted)
+    same_label = compatible(detections.label[rows], state.labels[landmarks])
+    found = associate(np.where(same_label, any_label, np.inf), gates)
+    matched = found.landmark != UNASSOCIATED
+    detections.take(rows[matched], numbers[found.landmark[matched]])
+    explained = (any_label < gates.match).any(axis=1)
+    detections.landmark[rows[~matched & (~found.new | explained)]] = AMBIGUOUS
+    if explained.any():
+        state.vote(detections.label[rows[explained]], numbers[any_label[explained].argmin(axis=1)])
+
+
+def predict(smoother: LandmarkSmoother, landmarks: IntArray, cycle: int | None = None) -> tuple[Array, Array]:
+    """Return where landmarks (k,), by position, should be detected from the pose of a cycle, vehicle frame.
+
+    It is the newest pose by default. The places (k, 2) are in m. Their covariances `H_j Sigma H_j'` (k, 2, 2)
+    have the joint covariance Sigma of pose and landmark in the last step, zero before the first step.
+    """
+    state, k = smoother.map.state, len(landmarks)
+    cycles = np.full(k, smoother.next_cycle - 1 if cycle is None else cycle)
+    poses, zero = smoother.variables.poses_at(cycles), np.zeros((k, POINT))
+    expected = landmark_residuals(poses, state.landmarks[landmarks], zero)
+    if smoother.last_step is None or k == 0:
+        return expected.residual, np.zeros((k, POINT, POINT))
+    columns = len(smoother.variables.sensor)
+    sensor = by_sensor(expected.residual, np.tile(smoother.map.twist, (k, 1)))[:, :, :columns]
+    jacobian = np.concatenate([expected.by_pose, -sensor, expected.by_landmark], axis=2)
+    rows = two_rows(cycles, state.numbers[landmarks], jacobian, zero)
+    return expected.residual, smoother.predicted_covariance(rows, together=POINT)
+
+
+def associate_created(
+    points: Array, cycles: IntArray, landmarks: Array, settings: GrowthSettings
+) -> tuple[IntArray, IntArray]:
+    """Return the rows of the detections that belong to new landmarks (k, 2), and the landmark of each.
+
+    points (m, 2), map frame, are the detections of cycles (m,). One belongs to the nearest landmark within
+    the merge radius, and only the nearest detection of each cycle does.
+    """
+    if len(points) == 0 or len(landmarks) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    nearest, near = nearest_within(points, landmarks, settings.merge_radius)
+    rows = np.argsort(np.hypot(*(points - landmarks[nearest]).T), kind="stable")
+    rows = rows[near[rows]]
+    _, first = np.unique(np.column_stack([cycles[rows], nearest[rows]]), axis=0, return_index=True)
+    chosen = rows[first]
+    return chosen, nearest[chosen]
+
+
+# --- merging ---------------------------------------------------------------------------------------------
+
+
+def find_duplicates(
+    state: LandmarkState, known: int, covariance: Callable[[IntArray], Array], settings: MapperSettings
+) -> tuple[IntArray, IntArray]:
+    """Return the positions (k,) of landmarks, and of the older landmarks of the same cone."""
+    newer, older = pairs_within(state.landmarks[:known], state.labels[:known], settings.growth.merge_radius)
+    involved, index = np.unique(np.concatenate([newer, older]), return_inverse=True)
+    if len(involved) == 0:
+        return newer, older
+    k, (i, j) = len(involved), index.reshape(2, -1)
+    blocks = covariance(state.keys[involved]).reshape(k, POINT, k, POINT)
+    spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
+    offset = state.landmarks[newer] - state.landmarks[older]
+    same = compatible_pairs(newer, older, offset, spread, settings.landmark)
+    return newer[same], older[same]
+
+
+def pairs_within(landmarks: Array, labels: IntArray, radius: float) -> tuple[IntArray, IntArray]:
+    """Return the indices (k,) of landmarks, and of older ones of the same label within `radius` (m)."""
+    offset = landmarks[:, None] - landmarks[None]
+    near = (np.hypot(offset[..., 0], offset[..., 1]) < radius) & (labels[:, None] == labels[None])
+    newer, older = np.nonzero(np.tril(near, -1))
+    return newer, older
+
+
+def compatible_pairs(
+    newer: IntArray, older: IntArray, offset: Array, covariances: Array, settings: LandmarkSettings
+) -> IntArray:
+    """Return the indices of the pairs (k,) that are one cone, by the gate on their Mahalanobis distance.
+
+    offset (k, 2) and covariances (k, 2, 2) are those of the differences. The nearest pair is taken first, and
+    each landmark is in one pair at most.
+    """
+    distance = squared_mahalanobis(offset, covariances + SIGMA_MERGE**2 * np.eye(POINT))
+    taken: set[int] = set()
+    chosen = []
+    for row in np.argsort(distance)[: int((distance < Gates.of(settings).match).sum())].tolist():
+        pair = {int(newer[row]), int(older[row])}
+        if taken.isdisjoint(pair):
+            taken |= pair
+            chosen.append(row)
+    return np.array(chosen, np.intp)
+
+
+def merge(smoother: LandmarkSmoother, gone: IntArray, kept: IntArray) -> None:
+    """Merge the landmarks at positions `gone` (k,) into those at `kept` (k,), and make one step."""
+    keys = smoother.map.state.keys
+    smoother.merge(keys[gone], keys[kept])
+    smoother.map.merge(gone, kept)
+    smoother.step()

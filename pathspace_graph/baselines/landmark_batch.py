@@ -1,0 +1,401 @@
+"""The Hungarian landmark graph over a whole log: all poses and landmarks at once, associations refreshed.
+
+With oracle associations, the true landmark of every detection is given. No estimator can know them. The limit
+of a run is computed from this solution. It is the batch's own system with the same calibration of the
+odometry, but without robust weights, since there are no outliers.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
+
+from pathspace_graph.errors import solving
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.noise import KnownNoise, huber_loss
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.residuals import landmark_residuals
+from pathspace_graph.factors.se2 import rotated, to_map
+from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
+from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph, owners
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import POINT, POSE, indices, pose_keys
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.results import BatchRun, RunNoise
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
+from pathspace_graph.laps import LapCounter
+from pathspace_graph.mapping.motion import known_noise
+from pathspace_graph.mapping.tentative import TentativeTracks
+from pathspace_graph.run import settings_dict, split_odometry
+from pathspace_graph.scale import log_at_scale
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .landmark_association import (
+    ROUGH,
+    Gates,
+    associate,
+    associate_created,
+    compatible,
+    find_duplicates,
+    hysteresis_costs,
+    squared_mahalanobis,
+)
+from .landmark_fixed_lag import LandmarkFixedLag
+from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
+
+Ints = NDArray[np.int64]
+
+NAME: Final = "landmark-batch"
+"""The estimator's name on the command line."""
+MAX_ROUNDS: Final = 10
+"""All detections are associated anew at most this number of times."""
+SETTLED: Final = 1e-3
+"""Largest share of the detections that changed their landmark in the last round."""
+MAX_STEPS: Final = 80
+"""Most steps of a round's optimization."""
+TOLERANCE: Final = 1e-6
+"""It ends where |cost_before - cost_after| is at most this share of the cost."""
+
+
+@log_at_scale
+class LandmarkBatch:
+    """Maps cones as points with all poses of a log; the start is the online run of `LandmarkFixedLag`."""
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        self.settings = settings or MapperSettings()
+        self.noise = known_noise(odometry_sigma)
+
+    def solve(self, log: Log) -> BatchRun:
+        """Solve a log: associate, optimize, merge and remove landmarks, until the associations stay."""
+        with threadpool_limits(limits=1), solving("the batch"):
+            return self._solve(log)
+
+    def _solve(self, log: Log) -> BatchRun:
+        system = LandmarkSystem.of_log(log, self.settings, self.noise)
+        system, state = start_online(log, system, self.noise)
+        system.optimize(state)
+        rounds, converged = 0, False
+        while not converged and rounds < MAX_ROUNDS:
+            rounds += 1
+            converged = self._refresh(system, state) <= SETTLED * len(system.detections)
+            system.optimize(state)
+        return self._result(system, state, converged)
+
+    def _refresh(self, system: "LandmarkSystem", state: LandmarkState) -> int:
+        """Associate anew, merge and remove landmarks; return how many associations have changed."""
+        detections, problem = system.detections, system.eliminated(state)
+        before, known = detections.landmark.copy(), len(state)
+        Reassociation(state, detections, problem, self.settings, system.chain.stamps).run()
+        gone, kept = find_duplicates(state, known, problem.joint, self.settings)
+        detections.merge(state.numbers[gone], state.numbers[kept])
+        remove_rare(state, detections, self.settings.growth.sightings)
+        return int((before != detections.landmark).sum())
+
+    def _result(self, system: "LandmarkSystem", state: LandmarkState, converged: bool) -> BatchRun:
+        laps, problem, poses = LapCounter(), system.eliminated(state), state.variables.poses.copy()
+        for pose in poses:
+            laps.update(pose)
+        return BatchRun(
+            estimator=NAME,
+            settings=settings_dict(self.settings),
+            map=point_map(state.landmarks, state.labels, problem.joint(state.keys), laps.completed > 0),
+            trajectory_t=system.chain.stamps,
+            trajectory=poses,
+            cycles=(),
+            laps=laps.completed,
+            converged=converged,
+            noise=system.noise,
+        )
+
+
+# --- the problem -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkSystem:
+    """Minimizes `1/2 |odometry|^2 + sum rho(associated detections) + 1/2 |calibration, first pose|^2`.
+
+    The associations are constant, and a detection without a landmark costs nothing.
+    """
+
+    detections: LandmarkDetections
+    """Detections of the whole log."""
+    chain: LogOdometry
+    """Odometry of the whole log."""
+    settings: MapperSettings
+    noise: RunNoise
+    """Noise that is used."""
+
+    @classmethod
+    def of_log(cls, log: Log, settings: MapperSettings, noise: KnownNoise) -> "LandmarkSystem":
+        """Return the problem of a log without any association; `noise` is what is known before."""
+        judged = judge_log(log, noise, settings)
+        detections = LandmarkDetections.of(judged.cycles, twists=judged.chain.twists)
+        return cls(detections, judged.chain, judged.settings, judged.noise)
+
+    def cost(self, state: LandmarkState) -> float:
+        """Return half the sum of squares at a state, with Huber's loss of the detections."""
+        losses = huber_loss(self._detection_rows(state, np.inf).residual, self.settings.gate.huber)
+        drive = self.chain.rows_at(state.variables, self.settings.calibration)
+        return half_square(drive) + float(losses.sum())
+
+    def rows(self, state: LandmarkState) -> list[Rows]:
+        """Return the Gauss-Newton rows at a state, where each row of a detection has its Huber weight."""
+        drive = self.chain.rows_at(state.variables, self.settings.calibration)
+        return [*drive, self._detection_rows(state, self.settings.gate.huber)]
+
+    def eliminated(self, state: LandmarkState) -> Elimination:
+        """Return the linear problem at a state, with the poses eliminated."""
+        return Elimination(linear_graph(self.rows(state), state.variables), state.variables.layout)
+
+    def _detection_rows(self, state: LandmarkState, huber: float) -> Rows:
+        rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
+        labels = state.labels[state.positions(indices(rows.keys[:, -1]))]
+        return replace(rows, owner=owners(rows.owner, labels == RIGHT))
+
+    def optimize(self, state: LandmarkState) -> None:
+        """Move a state to the optimum by Levenberg-Marquardt; the associations stay, the map is damped."""
+        variables, cost, damping = state.variables, self.cost(state), Damping()
+        for _ in range(MAX_STEPS):
+            problem, before = self.eliminated(state), variables.values
+            variables.values = before + problem.step(damping.weight * np.diagonal(problem.information))
+            gain = cost - self.cost(state)
+            if gain < 0.0:
+                variables.values = before
+                damping.grow()
+                if damping.exhausted:
+                    break
+                continue
+            cost -= gain
+            damping.lower()
+            if gain <= TOLERANCE * cost:
+                break
+        self.detections.correct(variables.sensor)
+
+
+def insert_drive(state: LandmarkState, calibration: Array, poses: Array) -> None:
+    """Make the calibration, (2,) or (7,), and the poses (P, 3) of the whole log variables of a state."""
+    state.variables.insert_calibrations(calibration)
+    state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
+
+
+def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[LandmarkSystem, LandmarkState]:
+    """Return the last map of the online run, with each pose and association as it left the window."""
+    online, detections = LandmarkFixedLag(system.settings, noise), system.detections
+    smoother, track = online.smoother, online.smoother.map
+    poses = np.zeros((len(log.cycles), POSE))
+    landmark = np.full(len(detections), UNASSOCIATED, np.intp)
+    begins = np.searchsorted(detections.cycle, np.arange(len(log.cycles)))
+    for odometry, cycle in split_odometry(log):
+        online.update(odometry, cycle)
+        first = smoother.first_cycle
+        poses[first : smoother.next_cycle] = smoother.variables.poses
+        landmark[begins[first] : begins[first] + len(track.detections)] = track.detections.landmark
+    final = np.arange(track.state.next_number)
+    for gone, kept in sorted(track.merged_into.items()):  # ascending, so that `kept` is final already
+        final[gone] = final[kept]
+    rows = np.flatnonzero(landmark >= 0)
+    detections.take(rows, final[landmark[rows]])
+    state = LandmarkState()
+    state.add(track.state.landmarks, track.state.labels, track.state.numbers)
+    state.votes, state.next_number = track.state.votes, track.state.next_number
+    insert_drive(state, smoother.variables.calibrations, poses)
+    chain = replace(
+        system.chain, calibration_sigma=np.array(online.believed.odometry.sigmas_calibration)
+    )  # with the priors that the online run believed in the end
+    return replace(system, settings=online.believed, chain=chain), state
+
+
+# --- associations between two rounds ---------------------------------------------------------------------
+
+
+class Reassociation:
+    """Repeats the Hungarian assignment of every cycle, and creates landmarks from unassociated detections."""
+
+    def __init__(
+        self,
+        state: LandmarkState,
+        detections: LandmarkDetections,
+        problem: Elimination,
+        settings: MapperSettings,
+        stamps: Array,
+    ) -> None:
+        self.state, self.detections, self.problem = state, detections, problem
+        self.settings, self.stamps = settings, stamps
+        self.gates = Gates.of(settings.landmark)
+        self.points_map = to_map(detections.point, state.variables.poses_at(detections.cycle))
+
+    def run(self) -> None:
+        """Set the landmark of every detection, and add new landmarks to the state."""
+        self._create(self._assign())
+
+    def _assign(self) -> IntArray:
+        """Assign every cycle anew, and return the rows of detections that may create landmarks."""
+        detections = self.detections
+        rows, landmarks, distances = self._nearby_pairs()
+        cost = self._costs(rows, landmarks)
+        held = detections.landmark[rows] == self.state.numbers[landmarks]
+        cost = hysteresis_costs(cost, held, self.gates)
+        relabel(self.state, detections.label, rows, landmarks, cost, self.gates.match)
+        detections.landmark[:] = UNASSOCIATED
+        free = np.ones(len(detections), bool)
+        starts = np.searchsorted(detections.cycle[rows], np.arange(len(self.stamps) + 1))
+        for begin, end in pairwise(starts.tolist()):
+            self._assign_cycle(rows[begin:end], landmarks[begin:end], cost[begin:end], free)
+        # a landmark with another label explains it, or one that a new landmark would be merged with
+        known = (cost < self.gates.match) | (distances < self.settings.growth.merge_radius)
+        free[rows[known]] = False
+        return np.flatnonzero(free & ~detections.used)
+
+    def _assign_cycle(self, rows: IntArray, landmarks: IntArray, cost: Array, free: BoolArray) -> None:
+        detected, i = np.unique(rows, return_inverse=True)
+        candidates, j = np.unique(landmarks, return_inverse=True)
+        table = np.full((len(detected), len(candidates)), np.inf)
+        table[i, j] = cost
+        table[~compatible(self.detections.label[detected], self.state.labels[candidates])] = np.inf
+        found = associate(table, self.gates)
+        matched = found.landmark != UNASSOCIATED
+        self.detections.take(detected[matched], self.state.numbers[candidates[found.landmark[matched]]])
+        free[detected] = found.new
+
+    def _nearby_pairs(self) -> tuple[IntArray, IntArray, Array]:
+        """Return the detections (k,), ascending, landmarks and distances (m) of pairs in the rough gate."""
+        points, tree = KDTree(self.points_map), KDTree(self.state.landmarks)
+        pairs = points.sparse_distance_matrix(tree, ROUGH, output_type="coo_matrix")
+        order = np.argsort(pairs.row, kind="stable")
+        return pairs.row[order].astype(np.intp), pairs.col[order].astype(np.intp), pairs.data[order]
+
+    def _costs(self, rows: IntArray, landmarks: IntArray) -> Array:
+        state, detections = self.state, self.detections
+        cycles, poses = detections.cycle[rows], state.variables.poses_at(detections.cycle[rows])
+        r = landmark_residuals(poses, state.landmarks[landmarks], detections.point[rows])
+        jacobian = np.concatenate([r.by_pose, r.by_landmark], axis=2)
+        spread = predicted_covariances(self.problem, cycles, state.keys[landmarks], jacobian)
+        return squared_mahalanobis(r.residual, spread + detections.covariance[rows])
+
+    def _create(self, free: IntArray) -> None:
+        """Add landmarks where enough of the detections `free` (m,) lie together, as the online run does."""
+        detections = self.detections
+        for label in BOUNDARIES:
+            rows = free[detections.label[free] == label]
+            points, cycles = self._confirmed(rows), detections.cycle[rows]
+            chosen, landmark = associate_created(self.points_map[rows], cycles, points, self.settings.growth)
+            numbers = self.state.add(points, np.full(len(points), label, np.intp))
+            detections.take(rows[chosen], numbers[landmark])
+
+    def _confirmed(self, rows: IntArray) -> Array:
+        """Return the tracks (k, 2) with enough of these detections, map frame; a batch forgets none."""
+        detections = self.detections
+        tentative = TentativeTracks(replace(self.settings.growth, forget_after=np.inf))
+        poses = self.state.variables.poses_at(detections.cycle[rows])
+        covariances = rotated(detections.covariance[rows], poses[:, 2])
+        found = [np.zeros((0, POINT))]
+        for cycle in np.unique(detections.cycle[rows]):
+            now = detections.cycle[rows] == cycle
+            tentative.add(self.points_map[rows[now]], covariances[now], float(self.stamps[cycle]))
+            confirmed = tentative.confirmed()
+            found.append(tentative.points[confirmed])
+            tentative.remove(confirmed)
+        return np.concatenate(found)
+
+
+def relabel(
+    state: LandmarkState, labels: IntArray, rows: IntArray, landmarks: IntArray, cost: Array, gate: float
+) -> None:
+    """Give each landmark the label of most detections in its gate, by pairs (k,) of rows and landmarks."""
+    inside = cost < gate
+    state.votes = np.zeros_like(state.votes)
+    state.vote(labels[rows[inside]], state.numbers[landmarks[inside]])
+
+
+def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray, jacobian: Array) -> Array:
+    """Return `J Sigma J'` (m, 2, 2) of landmarks with keys (m,), as detected from the poses of cycles (m,).
+
+    J (m, 2, 5) is the derivative by [pose | landmark], and Sigma contains their cross terms.
+    """
+    landmark = problem.map.columns(keys)[:, None] + np.arange(POINT)
+    pose = POSE * cycles[:, None] + np.arange(POSE)
+    joint = np.empty((len(cycles), POSE + POINT, POSE + POINT))
+    joint[:, :POSE, :POSE] = problem.pose_marginals[cycles]
+    joint[:, :POSE, POSE:] = problem.cross_covariance[pose[:, :, None], landmark[:, None, :]]
+    joint[:, POSE:, :POSE] = np.swapaxes(joint[:, :POSE, POSE:], 1, 2)
+    joint[:, POSE:, POSE:] = problem.map_covariance[landmark[:, :, None], landmark[:, None, :]]
+    return np.asarray(jacobian @ joint @ np.swapaxes(jacobian, 1, 2))
+
+
+def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: int) -> None:
+    """Remove landmarks with fewer detections than `fewest`; those detections become unassociated."""
+    counts = np.bincount(state.positions(detections.landmark[detections.used]), minlength=len(state))
+    gone = counts < fewest
+    detections.landmark[np.isin(detections.landmark, state.numbers[gone])] = UNASSOCIATED
+    state.variables.remove(state.keys[gone])
+    state.keep(~gone)
+
+
+# --- oracle associations ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkSolution:
+    """The optimum of a landmark batch with oracle associations."""
+
+    trajectory_t: Array
+    """(n,) Stamps of the perception cycles, in s."""
+    trajectory: Array
+    """(n, 3) Smoothed poses (x, y, theta) in m and rad, map frame; theta is not wrapped."""
+    landmark_ids: Ints
+    """(m,) The associations' numbers of all landmarks that were detected, ascending."""
+    landmarks: Array
+    """(m, 2) Positions of the landmarks in m, map frame."""
+    covariance: Array | None
+    """(2m, 2m) Joint covariance of the landmarks in m^2, or None if it was not requested."""
+    error: float
+    """Half the sum of the squared whitened residuals."""
+
+
+def solve_landmarks(
+    log: Log, associations: Ints, *, with_covariance: bool = False, settings: MapperSettings | None = None
+) -> LandmarkSolution:
+    """Minimize all squared Mahalanobis distances over poses, calibration and landmarks; no loss is robust.
+
+    associations (R,) holds the landmark of each detection in file order; negative ones are left out.
+    """
+    settings = settings or MapperSettings()
+    settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
+    system = LandmarkSystem.of_log(log, settings, KnownNoise(log.odometry_sigma))
+    state = start_oracle(system, associations)
+    system.optimize(state)
+    return LandmarkSolution(
+        trajectory_t=system.chain.stamps,
+        trajectory=state.variables.poses.copy(),
+        landmark_ids=state.numbers.astype(np.int64),
+        landmarks=state.landmarks.copy(),
+        covariance=system.eliminated(state).joint(state.keys) if with_covariance else None,
+        error=system.cost(state),
+    )
+
+
+def start_oracle(system: LandmarkSystem, associations: Ints) -> LandmarkState:
+    """Associate the system's detections with landmarks (R,), and return the state by dead reckoning."""
+    detections, rows = system.detections, np.flatnonzero(associations >= 0)
+    numbers, first, landmark = np.unique(associations[rows], return_index=True, return_inverse=True)
+    detections.take(rows, numbers[landmark])
+    calibration = np.array(system.settings.calibrations)
+    poses = system.chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
+    points = to_map(detections.point[rows[first]], poses[detections.cycle[rows[first]]])
+    labels = detections.label[rows]
+    votes = np.stack(
+        [np.bincount(landmark[labels == label], minlength=len(numbers)) for label in (LEFT, RIGHT, UNKNOWN)]
+    )
+    state = LandmarkState()
+    state.add(points, votes.argmax(axis=0).astype(np.intp), numbers.astype(np.intp))
+    state.votes = votes[: len(BOUNDARIES)].T
+    insert_drive(state, calibration, poses)
+    return state

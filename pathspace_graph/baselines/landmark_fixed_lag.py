@@ -1,0 +1,334 @@
+"""The Hungarian landmark graph online: cones are points in the same fixed-lag smoother as the curves.
+
+The loop closes where enough of the landmarks seen now are those of the beginning. The landmarks seen now and
+those not seen for long have one joint covariance. So a set of pairs can be tested as a whole, since each
+accepted pair moves all others (joint compatibility, Neira and Tardos 2001).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.factors.residuals import chi2_quantile
+from pathspace_graph.factors.se2 import rotated, to_map
+from pathspace_graph.front_end.front_end import FrontEnd, at_nearest_pose
+from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.variables import POINT
+from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import RunNoise, VehicleState
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.motion import (
+    doubt_calibrations,
+    known_noise,
+    predict,
+    smoother_settings,
+    vehicle_state,
+)
+from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.registration import near_start
+from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
+from pathspace_graph.run import CycleResult, Readings, Stopwatch
+from pathspace_graph.scale import at_scale
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .landmark_association import (
+    Gates,
+    associate_created,
+    associate_newest,
+    find_duplicates,
+    merge,
+    squared_mahalanobis,
+)
+from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
+
+UNSEEN: Final = 40.0
+"""Path length (m) without a detection after which a landmark is old: none is associated near the start."""
+MIN_PAIRS: Final = 4
+"""Landmarks that must be recognized together to close the loop, a third of them of each colour."""
+MIN_LEAD: Final = 2.0
+"""Least lead of the recognized pairs over any other set, where each landmark counts as one gate."""
+
+
+@at_scale
+class LandmarkFixedLag:
+    """Maps cones as points: predict, associate, create, update, close, marginalize.
+
+    Window, odometry and robust weights are those of `FixedLagMapper`, but each detection has one landmark in
+    place of a curve. `odometry_sigma` (3,) is the standard deviation of a twist reading (m/s, m/s, rad/s).
+    """
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        self.settings = settings or MapperSettings()
+        noise = known_noise(odometry_sigma)
+        self.odometry_sigma = noise.odometry
+        self.front_end = FrontEnd(self.settings, noise)
+        self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
+        self.smoother.window.exact = True
+        self.path = DrivenPath()
+        self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
+        """Tracks by label that are not landmarks yet."""
+        self.believed = self.settings
+        """Settings with the priors of the calibrations as they are now."""
+        self.closed = False
+        self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
+        self._last_check = 0.0
+
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        """Process one perception cycle: the twists since the last one, and the detections of now."""
+        watch = Stopwatch()
+        cycle = self.front_end.admit(odometry, detections, self.smoother.times)
+        if cycle.late:
+            return cycle.counted(self._use_late(cycle.detections, watch))
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
+        motion, detections = reading.motion, reading.detections
+        predict(self.smoother, self.path, motion, detections.t, self.settings)
+        watch.lap("predict")
+        new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
+        self._use(new, detections.t, watch)
+        if not self.closed:
+            self.believed = doubt_calibrations(
+                self.smoother, self.believed, reading.sensor_doubted, reading.measured
+            )
+        watch.lap("update")
+        self._close()
+        watch.lap("close")
+        self.smoother.marginalize()
+        watch.lap("marginalize")
+        return cycle.counted(self._result(detections.t, watch.laps))
+
+    def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
+        """Use the detections of a late cycle at its time, without a pose of their own."""
+        detections = self.front_end.use_late(detections, self.smoother.times)
+        late = at_nearest_pose(self.smoother, detections, self.settings.motion)
+        new = self.smoother.map.add_late(late)
+        self._use(new, detections.t, watch, late.cycle)
+        watch.lap("update")
+        used = int(self.smoother.map.detections.used[new].sum())
+        return replace(self._result(detections.t, watch.laps), readings=used)
+
+    def _use(self, new: slice, t: float, watch: Stopwatch, cycle: int | None = None) -> None:
+        eligible = np.ones(len(self.smoother.map.state), bool)
+        if (
+            not self.closed and self._near_start()
+        ):  # one detection alone can't tell which old landmark it shows
+            eligible = ~self._old()
+        associate_newest(self.smoother, new, eligible, cycle)
+        watch.lap("associate")
+        created = self._create(new, t)
+        watch.lap("create")
+        for _ in range(self.settings.steps_grown if created else self.settings.steps):
+            self.smoother.step()
+
+    def _create(self, new: slice, t: float) -> bool:
+        """Add detections without a landmark to the tracks, and return whether any became landmarks."""
+        detections, created = self.smoother.map.detections, False
+        free = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
+        for label, tentative in self.tentative.items():
+            rows = free[detections.label[free] == label]
+            poses = self.smoother.variables.poses_at(detections.cycle[rows])
+            covariances = rotated(detections.covariance[rows], poses[:, 2])
+            tentative.add(to_map(detections.point[rows], poses), covariances, t)
+            confirmed = tentative.confirmed()
+            if len(confirmed):
+                self._add_landmarks(label, tentative.points[confirmed].copy())
+                tentative.remove(confirmed)
+                created = True
+        return created
+
+    def _add_landmarks(self, label: int, points: Array) -> None:
+        """Add landmarks at points (k, 2), and associate the detections in the window that created them."""
+        detections, state = self.smoother.map.detections, self.smoother.map.state
+        rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
+        cycles = detections.cycle[rows]
+        points_map = to_map(detections.point[rows], self.smoother.variables.poses_at(cycles))
+        chosen, landmark = associate_created(points_map, cycles, points, self.settings.growth)
+        held, landmark = np.unique(landmark, return_inverse=True)
+        numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
+        detections.take(rows[chosen], numbers)
+        state.vote(detections.label[rows[chosen]], numbers)
+
+    def _near_start(self) -> bool:
+        return near_start(self.path, self.smoother.variables.poses[-1], self.settings.closing)
+
+    def _old(self) -> BoolArray:
+        last_detected = self._last_detected[self.smoother.map.state.numbers]
+        return np.asarray(last_detected < self.path.length - UNSEEN)
+
+    def _close(self) -> None:
+        """Close the loop or, once it has closed, merge duplicates; this is tried every few metres."""
+        detections, state, length = self.smoother.map.detections, self.smoother.map.state, self.path.length
+        detected = np.unique(detections.landmark[detections.used])
+        unknown = np.zeros(state.next_number - len(self._last_detected))
+        self._last_detected = np.append(self._last_detected, unknown)
+        self._last_detected[detected] = length
+        if length - self._last_check < self.settings.closing.check_interval:
+            return
+        self._last_check = length
+        if self.closed:
+            self._merge(*find_duplicates(state, len(state), self.smoother.last_covariance, self.settings))
+        elif self._near_start():
+            reach = self.settings.closing.radius + self.settings.closing.drift * length
+            recent, old = state.positions(detected), np.flatnonzero(self._old())
+            pairs = detect_loop(self.smoother, recent, old, reach)
+            if pairs is not None:
+                optimize_loop(self.smoother, pairs)
+                self._merge(pairs.recent, pairs.old)
+                self.closed, self.smoother.window.exact = True, False
+
+    def _merge(self, gone: IntArray, kept: IntArray) -> None:
+        if len(gone):
+            numbers = self.smoother.map.state.numbers
+            np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
+            merge(self.smoother, gone, kept)
+
+    def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
+        detections, sizes = self.smoother.map.detections, landmark_counts(self.smoother.map.state.labels)
+        used = int((detections.used & (detections.cycle == self.smoother.next_cycle - 1)).sum())
+        return CycleResult(t, self.smoother.variables.poses[-1].copy(), sizes, used, self.closed, stages)
+
+    def map(self) -> Map:
+        """Return the map as it stands, with the joint covariance of each boundary's landmarks."""
+        state = self.smoother.map.state
+        if len(state) == 0:
+            return Map(self.closed, {})
+        joint = self.smoother.last_covariance(state.keys)
+        return point_map(state.landmarks, state.labels, joint, self.closed)
+
+    def outline(self) -> Map:
+        """Return a copy of the present map without covariances."""
+        state = self.smoother.map.state
+        return point_map(state.landmarks, state.labels, None, self.closed)
+
+    def window_poses(self) -> Array:
+        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        return self.smoother.variables.poses.copy()
+
+    def readings(self) -> Readings:
+        """Return the detections of the newest cycle as they were used or gated, with their landmarks."""
+        table, state = self.smoother.map.detections, self.smoother.map.state
+        rows = np.flatnonzero(table.cycle == self.smoother.next_cycle - 1)
+        used = table.used[rows]
+        points = to_map(table.point[rows], self.smoother.variables.poses_at(table.cycle[rows]))
+        feet = np.full(points.shape, np.nan)
+        feet[used] = state.landmarks[state.positions(table.landmark[rows[used]])]
+        return Readings(points, table.label[rows], used, feet)
+
+    def noise_used(self) -> RunNoise:
+        """Return the noise that is used now, and what was measured so far."""
+        return self.front_end.noise_used
+
+    def vehicle_state(self) -> VehicleState:
+        """Return the newest pose and the calibration, with their joint covariance."""
+        return vehicle_state(self.smoother)
+
+
+# --- closing ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LoopPairs:
+    """A hypothesis: pairs of landmarks that are the same cone."""
+
+    recent: IntArray
+    """(k,) Positions of landmarks that were seen lately."""
+    old: IntArray
+    """(k,) Positions of the landmarks of the beginning that they are."""
+    distance: float
+    """Squared Mahalanobis distance of all pairs together, with 2 k degrees of freedom."""
+
+    def score(self, gate: float) -> float:
+        """Return `k gate - d^2`: how much better the pairs explain the detections than new landmarks do."""
+        return len(self.recent) * gate - self.distance
+
+    def overlaps(self, other: "LoopPairs") -> bool:
+        """Return whether both hypotheses have a pair in common."""
+        pairs = set(zip(self.recent.tolist(), self.old.tolist(), strict=True))
+        return not pairs.isdisjoint(zip(other.recent.tolist(), other.old.tolist(), strict=True))
+
+
+class JointCompatibility:
+    """Tests sets of pairs against the joint Gaussian of some recent and some old landmarks.
+
+    `scale` multiplies all standard deviations. Two estimates of one cone may differ by SIGMA_MERGE more.
+    """
+
+    def __init__(self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float) -> None:
+        state = smoother.map.state
+        self.recent, self.old = recent, old
+        both = np.concatenate([recent, old])
+        self.mean = state.landmarks[both].copy()
+        self.covariance = scale**2 * smoother.last_covariance(state.keys[both])
+        self.same_label = state.labels[recent][:, None] == state.labels[old][None]
+
+    def distances(self, mean: Array, covariance: Array) -> Array:
+        """Return the squared Mahalanobis distances (k, n) of all pairs; other labels give infinity."""
+        k, points = len(self.recent), len(mean)
+        blocks = covariance.reshape(points, POINT, points, POINT).transpose(0, 2, 1, 3)
+        marginal = blocks[np.arange(points), np.arange(points)]
+        cross = blocks[:k, k:]
+        spread = marginal[:k, None] + marginal[None, k:] - cross - np.swapaxes(cross, 2, 3)
+        spread = spread + SIGMA_MERGE**2 * np.eye(POINT)
+        return np.where(self.same_label, squared_mahalanobis(mean[:k, None] - mean[None, k:], spread), np.inf)
+
+    def conditioned(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
+        """Return the Gaussian given that recent landmark i is old landmark j: one Kalman update."""
+        a, b = POINT * i, POINT * (len(self.recent) + j)
+        cross = covariance[:, a : a + POINT] - covariance[:, b : b + POINT]
+        spread = cross[a : a + POINT] - cross[b : b + POINT] + SIGMA_MERGE**2 * np.eye(POINT)
+        gain = np.linalg.solve(spread, cross.T).T
+        innovation = mean[i] - mean[len(self.recent) + j]
+        return mean - (gain @ innovation).reshape(-1, POINT), covariance - gain @ cross.T
+
+    def grow(self, i: int, j: int, gate: float) -> LoopPairs:
+        """Return a hypothesis that begins with one pair and adds the best pair while that is in the gate."""
+        mean, covariance, total = self.mean, self.covariance, 0.0
+        distances = self.distances(mean, covariance)
+        free = np.ones(distances.shape, bool)
+        chosen: list[tuple[int, int]] = []
+        while distances[i, j] < gate:
+            chosen.append((i, j))
+            total += float(distances[i, j])
+            free[i], free[:, j] = False, False
+            mean, covariance = self.conditioned(mean, covariance, i, j)
+            distances = np.where(free, self.distances(mean, covariance), np.inf)
+            i, j = divmod(int(distances.argmin()), distances.shape[1])
+        index = np.array(chosen, np.intp).reshape(-1, 2)
+        return LoopPairs(self.recent[index[:, 0]], self.old[index[:, 1]], total)
+
+
+def detect_loop(
+    smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach: float
+) -> LoopPairs | None:
+    """Return the pairs, within `reach` (m), of the best hypothesis; None if it is not clear or too small."""
+    points = smoother.map.state.landmarks
+    old = old[nearest_within(points[old], points[recent], reach)[1]]
+    if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
+        return None
+    gate = Gates.of(smoother.map.settings.landmark).match
+    test = JointCompatibility(smoother, recent, old, smoother.map.settings.closing.prior_scale)
+    seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
+    if len(seeds) == 0:
+        return None
+    hypotheses = [test.grow(int(i), int(j), gate) for i, j in seeds]
+    best = max(hypotheses, key=lambda pairs: pairs.score(gate))
+    others = [pairs.score(gate) for pairs in hypotheses if not pairs.overlaps(best)]
+    if best.score(gate) - max(others, default=0.0) < MIN_LEAD * gate:
+        return None
+    labels = smoother.map.state.labels[best.recent]
+    enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
+    if not enough or len(labels) < MIN_PAIRS:
+        return None
+    joint = chi2_quantile(smoother.map.settings.landmark.create, POINT * len(labels))
+    return best if best.distance < joint else None
+
+
+def optimize_loop(smoother: LandmarkSmoother, pairs: LoopPairs) -> None:
+    """Solve the whole loop with the pairs held together, each submap in its own frame; merge them later."""
+    smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([pairs.recent, pairs.old])]
+    smoother.solve_loop(smoother.map.settings.closing.iterations, None)

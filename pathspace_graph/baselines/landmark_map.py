@@ -1,0 +1,264 @@
+"""The landmark map: landmarks with their variables, detections with associations, and their rows.
+
+Two rows for each detection, on the keys of pose and landmark.
+"""
+
+from dataclasses import dataclass, field
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.noise import huber_weights, whiteners
+from pathspace_graph.factors.residuals import landmark_residuals
+from pathspace_graph.factors.sensor import restored
+from pathspace_graph.front_end.front_end import LateDetections
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.variables import (
+    LANDMARK_LETTER,
+    POINT,
+    POSE,
+    SENSOR_KEY,
+    Variables,
+    landmark_keys,
+    pose_keys,
+)
+from pathspace_graph.io.log import Detections
+from pathspace_graph.io.map import NO_COVARIANCE, Map, PointBoundary
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.mapping.detections import DetectionColumns
+from pathspace_graph.settings.mapper import MapperSettings
+
+UNASSOCIATED: Final = -1
+"""Landmark of a detection that has none, and that may create one."""
+AMBIGUOUS: Final = -2
+"""Landmark of a detection that has none, and that must not create one."""
+SIGMA_MERGE: Final = 0.1
+"""Standard deviation (m) of the distance between two landmarks of one cone, beyond their covariance."""
+NO_PAIRS: IntArray = np.zeros((0, 2), np.intp)
+
+
+class LandmarkState:
+    """Landmarks, oldest first. A landmark's number is that of its key and never changes."""
+
+    def __init__(self, variables: Variables | None = None) -> None:
+        self.variables = variables or Variables()
+        """Landmarks, calibration and poses by key."""
+        self.numbers: IntArray = np.zeros(0, np.intp)
+        """(n,) Numbers of the landmarks, ascending."""
+        self.labels: IntArray = np.zeros(0, np.intp)
+        """(n,) Labels of the landmarks."""
+        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)
+        """(n, 2) Detections with the left and the right label on each landmark."""
+        self.next_number = 0
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @property
+    def keys(self) -> IntArray:
+        """Return the keys (n,) of the landmarks."""
+        return landmark_keys(self.numbers)
+
+    @property
+    def landmarks(self) -> Array:
+        """Return the landmarks (n, 2) in the map frame, in m: a view."""
+        return self.variables.block(LANDMARK_LETTER).reshape(-1, POINT)
+
+    def positions(self, numbers: IntArray) -> IntArray:
+        """Return the position of each of these numbers, of any shape, all of which must be known."""
+        return self.numbers.searchsorted(numbers)
+
+    def add(self, points: Array, labels: IntArray, numbers: IntArray | None = None) -> IntArray:
+        """Add landmarks (k, 2) with labels (k,) behind the others, and return their numbers (k,).
+
+        `numbers` must be ascending, and none may be less than `next_number`; by default they follow it.
+        """
+        new = self.next_number + np.arange(len(labels)) if numbers is None else numbers
+        self.variables.insert(landmark_keys(new), points.ravel())
+        self.numbers = np.concatenate([self.numbers, new])
+        self.labels = np.concatenate([self.labels, labels])
+        self.votes = np.concatenate([self.votes, np.zeros((len(labels), len(BOUNDARIES)), np.intp)])
+        self.next_number = int(new[-1]) + 1 if len(new) else self.next_number
+        return new
+
+    def vote(self, labels: IntArray, numbers: IntArray) -> None:
+        """Count detections with labels (k,) on landmarks (k,), which take the label of their majority.
+
+        Else a landmark created by a few detections with the wrong label would keep it for ever.
+        """
+        known = np.isin(labels, BOUNDARIES)
+        np.add.at(self.votes, (self.positions(numbers[known]), labels[known]), 1)
+        most = self.votes.argmax(axis=1)
+        outvoted = self.votes[np.arange(len(most)), most] > self.votes[np.arange(len(most)), self.labels]
+        self.labels = np.where(outvoted, most, self.labels)
+
+    def keep(self, stays: BoolArray) -> None:
+        """Remove the landmarks whose entry in `stays` (n,) is not set; the variables stay as they are."""
+        self.numbers, self.labels, self.votes = self.numbers[stays], self.labels[stays], self.votes[stays]
+
+
+@dataclass
+class LandmarkDetections(DetectionColumns):
+    """Detections with the landmark that each of them is associated with."""
+
+    landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
+    """Number of each detection's landmark, or UNASSOCIATED or AMBIGUOUS."""
+
+    @property
+    def used(self) -> BoolArray:
+        """Return (m,) whether each detection has a landmark, and so is a row of the graph."""
+        return self.landmark >= 0
+
+    def _clear_associations(self) -> None:
+        self.landmark = np.full(len(self), UNASSOCIATED, np.intp)
+
+    def merge(self, gone: IntArray, kept: IntArray) -> None:
+        """Associate all detections of landmarks `gone` (k,), by number, with `kept` (k,)."""
+        for number, became in zip(gone.tolist(), kept.tolist(), strict=True):
+            self.landmark[self.landmark == number] = became
+
+    def take(self, rows: IntArray, numbers: IntArray) -> None:
+        """Associate detections (k,) with landmarks (k,)."""
+        self.landmark[rows], self.changed[rows] = numbers, True
+
+
+class LandmarkMap:
+    """The landmarks and the detections of the window, as the engine sees them (`graph.window:MapRows`)."""
+
+    reached_inactive = False
+    """No landmark is ever inactive."""
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self.settings = settings
+        self.state = LandmarkState()
+        self.variables = self.state.variables
+        self.detections = LandmarkDetections()
+        """Detections from the poses in the window."""
+        self.twist: Array = np.zeros(POSE)
+        """(3,) Twist of the vehicle at the newest detections, in m/s, m/s and rad/s."""
+        self.loop_pairs: IntArray = NO_PAIRS
+        """(k, 2) Numbers of two landmarks each that are held together while the loop closes."""
+        self.merged_into: dict[int, int] = {}
+        """From the number of each landmark that was merged to the number of the one that was kept."""
+
+    def add(self, detections: Detections, cycle: int, twist: Array) -> slice:
+        """Add the corrected detections of the newest cycle, made at a twist (3,); return their rows."""
+        self.twist = twist
+        rows = self.detections.append(detections, cycle, twist)
+        self.correct()
+        return rows
+
+    def add_late(self, late: LateDetections) -> slice:
+        """Add late detections to those of their pose, corrected; return their rows."""
+        rows = self.detections.append(late.detections, late.cycle, late.twist)
+        self.correct()
+        return rows
+
+    def changed(self) -> IntArray:
+        return self.detections.cycle[self.detections.changed]
+
+    def rows(self, cycles: IntArray) -> list[Rows]:
+        chosen = self.detections.used & self.detections.in_cycles(cycles)
+        return [landmark_rows(self.state, self.detections, np.flatnonzero(chosen), self.settings.gate.huber)]
+
+    def correct(self) -> None:
+        self.detections.correct(self.variables.sensor)
+
+    def linearized(self, cycles: IntArray) -> None:
+        self.detections.mark_linearized()
+
+    @property
+    def structure(self) -> object:
+        """Return another object whenever other landmarks are held together than before."""
+        return self.loop_pairs
+
+    def gauge(self, whole: bool) -> list[Rows]:
+        """Return no rows, since the detections alone hold the landmarks."""
+        return []
+
+    def linear_gauge(self, whole: bool) -> list[Rows]:
+        """Return `(l_i - l_j) / sigma_merge`, two rows for each loop pair."""
+        if len(self.loop_pairs) == 0:
+            return []
+        pairs = self.state.landmarks[self.state.positions(self.loop_pairs)]
+        axes = np.concatenate([np.eye(POINT), -np.eye(POINT)], axis=1) / SIGMA_MERGE
+        keys = np.repeat(landmark_keys(self.loop_pairs), POINT, axis=0)
+        residual = (pairs[:, 0] - pairs[:, 1]).ravel() / SIGMA_MERGE
+        return [Rows(keys, np.tile(axes, (len(pairs), 1)), residual, keys[:, 0])]
+
+    def activate(self, keys: IntArray) -> None:
+        """Do nothing, since every landmark is always active."""
+
+    def activate_all(self) -> None:
+        """Do nothing, since every landmark is always active."""
+
+    def drop_cycle(self, cycle: int) -> None:
+        self.detections.keep_from(cycle + 1)
+
+    def merge(self, gone: IntArray, kept: IntArray) -> None:
+        """Move the detections and votes of landmarks `gone` (k,) to `kept` (k,), both given by position."""
+        state = self.state
+        gone_numbers, kept_numbers = state.numbers[gone], state.numbers[kept]
+        self.detections.merge(gone_numbers, kept_numbers)
+        np.add.at(state.votes, kept, state.votes[gone])
+        stays = np.ones(len(state), bool)
+        stays[gone] = False
+        state.keep(stays)
+        self.loop_pairs = NO_PAIRS
+        self.merged_into.update(zip(gone_numbers.tolist(), kept_numbers.tolist(), strict=True))
+
+
+LandmarkSmoother: TypeAlias = FixedLagSmoother[LandmarkMap]
+
+
+def landmark_rows(
+    state: LandmarkState, detections: LandmarkDetections, chosen: IntArray, huber: float
+) -> Rows:
+    """Return the rows `w W (R^T (l - t) - z)` of associated detections (m,), with `W' W = K^-1`.
+
+    The factor w is the square root of each row's own Huber weight. The detections z are corrected by the
+    sensor's calibration, and the residuals are those of measured ones (`factors.sensor:restored`).
+    """
+    cycles, numbers = detections.cycle[chosen], detections.landmark[chosen]
+    points = state.landmarks[state.positions(numbers)]
+    sensor = state.variables.sensor
+    seen = detections.corrected(chosen, sensor)
+    predicted = landmark_residuals(state.variables.poses_at(cycles), points, seen)
+    measured, twists = detections.measured[chosen], detections.twist[chosen]
+    inverse, by_calibration = restored(predicted.residual, measured, twists, sensor)
+    white = whiteners(detections.covariance[chosen])
+    residual = np.einsum("mij,mj->mi", white @ inverse, predicted.residual)
+    weight = np.sqrt(huber_weights(residual, huber))
+    blocks = inverse @ predicted.by_pose, by_calibration, inverse @ predicted.by_landmark
+    jacobian = white @ np.concatenate(blocks, axis=2)
+    return two_rows(cycles, numbers, jacobian * weight[:, :, None], residual * weight)
+
+
+def two_rows(cycles: IntArray, numbers: IntArray, jacobian: Array, residual: Array) -> Rows:
+    """Return Jacobians (m, 2, n) and residuals (m, 2) as rows on [pose | landmark], owned by the cycles."""
+    keys = [pose_keys(cycles), landmark_keys(numbers)]
+    if jacobian.shape[2] > POSE + POINT:
+        keys.insert(1, np.full(len(cycles), SENSOR_KEY))
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    both = np.repeat(np.stack(keys, axis=1), POINT, axis=0)
+    return Rows(both, flat, residual.ravel(), np.repeat(cycles, POINT))
+
+
+def landmark_counts(labels: IntArray) -> tuple[int, int]:
+    """Return the number of landmarks with the left and with the right label."""
+    return int((labels == LEFT).sum()), int((labels == RIGHT).sum())
+
+
+def point_map(points: Array, labels: IntArray, joint: Array | None, closed: bool) -> Map:
+    """Return landmarks (n, 2) by label, each boundary with its block of the joint covariance (2 n, 2 n)."""
+    boundaries, order = {}, [np.zeros(0, np.intp)]
+    for label in BOUNDARIES:
+        chosen = np.flatnonzero(labels == label)
+        if len(chosen):
+            order.append((POINT * chosen[:, None] + np.arange(POINT)).ravel())
+            covariance = NO_COVARIANCE if joint is None else joint[np.ix_(order[-1], order[-1])]
+            boundaries[label] = PointBoundary(points[chosen].copy(), covariance)
+    columns = np.concatenate(order)
+    return Map(closed, boundaries, None if joint is None else joint[np.ix_(columns, columns)])

@@ -1,1 +1,0 @@
-"""Estimators that map a track as one centre line with a width, the paper's future work."""

@@ -1,1 +1,0 @@
-"""The landmark estimators with Hungarian association, which the curves are compared with."""

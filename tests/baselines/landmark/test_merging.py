@@ -1,0 +1,97 @@
+"""Two landmarks of one cone are found by their joint covariance, and merging them is an exact constraint."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pathspace_graph.baselines.landmark_association import (
+    compatible_pairs,
+    find_duplicates,
+    merge,
+    pairs_within,
+)
+from pathspace_graph.baselines.landmark_batch import remove_rare
+from pathspace_graph.baselines.landmark_map import LandmarkState
+from pathspace_graph.graph.gaussian import normal_equations
+from pathspace_graph.graph.variables import Layout
+from pathspace_graph.io.log import Log
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.settings.batch import LandmarkSettings
+from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
+
+from .scenes import QUADRATIC, driven, oracle_system
+
+
+def test_pairs_have_one_label_and_the_newer_landmark_comes_first() -> None:
+    landmarks = np.array([[0.0, 0.0], [0.5, 0.0], [0.2, 0.0], [9.0, 0.0]])
+    newer, older = pairs_within(landmarks, np.array([LEFT, RIGHT, LEFT, LEFT]), 1.0)
+    np.testing.assert_array_equal(newer, [2])
+    np.testing.assert_array_equal(older, [0])
+
+
+def test_a_landmark_is_in_one_pair_only_which_is_the_best() -> None:
+    """2 fits 0 better than 1 does; 3 and 0 are too far apart for their covariance."""
+    newer, older, settings = np.array([1, 2, 3]), np.array([0, 0, 0]), LandmarkSettings()
+    offset = np.array([[0.3, 0.0], [0.1, 0.0], [0.0, 0.9]])
+    covariances = np.tile(0.01 * np.eye(2), (3, 1, 1))
+    np.testing.assert_array_equal(compatible_pairs(newer, older, offset, covariances, settings), [1])
+    wide = 9.0 * covariances[2:] + np.eye(2)
+    assert len(compatible_pairs(newer[2:], older[2:], offset[2:], wide, settings)) == 1
+
+
+@pytest.mark.parametrize(("correlation", "known", "expected"), [(0.0, 3, 1), (0.99, 3, 0), (0.0, 2, 0)])
+def test_the_joint_covariance_decides_whether_two_are_one_cone(
+    correlation: float, known: int, expected: int
+) -> None:
+    """0.5 m is little between independent landmarks with a sigma of 1 m, and much if they share the error."""
+    state = LandmarkState()
+    state.add(np.array([[0.0, 0.0], [9.0, 0.0], [0.5, 0.0]]), np.full(3, LEFT))
+    joint = np.asarray(np.kron(correlation + (1.0 - correlation) * np.eye(3), np.eye(2)), np.float64)
+    entries = Layout(state.keys).entries
+    newer, older = find_duplicates(
+        state, known, lambda keys: joint[np.ix_(entries(keys), entries(keys))], MapperSettings()
+    )
+    np.testing.assert_array_equal(newer, [2] * expected)
+    np.testing.assert_array_equal(older, [0] * expected)
+
+
+@pytest.mark.parametrize("tolerance", [1e-12, 10.0])  # with the second, no factor becomes stale by itself
+def test_merging_is_the_constraint_that_both_are_equal(tolerance: float) -> None:
+    stale = RelinearizeSettings(tolerance, tolerance)
+    smoother = driven(8, replace(QUADRATIC, lag=0.3, relinearize=stale))
+    layout, variables, state = smoother.layout, smoother.variables, smoother.map.state
+    hessian, vector = normal_equations(smoother.linear_graph(), layout)
+    negative_gradient = vector - hessian @ (variables.values - variables.reference)
+    constraint = np.zeros((2, layout.size))
+    constraint[:, layout.entries(state.keys[[4]])] = np.eye(2)
+    constraint[:, layout.entries(state.keys[[0]])] = -np.eye(2)
+    kkt = np.block([[hessian, constraint.T], [constraint, np.zeros((2, 2))]])
+    step = np.linalg.solve(kkt, np.append(negative_gradient, -constraint @ variables.values))[: layout.size]
+    expected = (variables.values + step)[layout.entries(state.keys[:4])]
+    before = state.landmarks[0].copy()
+    merge(smoother, np.array([4]), np.array([0]))
+    np.testing.assert_array_equal(state.numbers, np.arange(4))
+    assert smoother.map.merged_into == {4: 0}
+    assert set(smoother.map.detections.landmark.tolist()) == {0, 1, 2, 3}
+    np.testing.assert_allclose(state.landmarks, expected.reshape(-1, 2), atol=1e-3)
+    assert np.abs(expected[:2] - before).max() > 0.01
+
+
+def test_a_duplicate_in_the_batch_is_merged_and_every_cone_stays(bean: Log) -> None:
+    system, state = oracle_system(bean, 60)
+    detections, settings, count = system.detections, system.settings, len(state)
+    numbers, counts = np.unique(detections.landmark[detections.used], return_counts=True)
+    often = numbers[counts.argmax()]
+    original = state.positions(np.array([often]))
+    duplicate = state.add(state.landmarks[original] + 0.05, state.labels[original])
+    rows = np.flatnonzero(detections.landmark == often)
+    detections.take(rows[::2], np.repeat(duplicate, len(rows[::2])))
+    system.optimize(state)
+    gone, kept = find_duplicates(state, len(state), system.eliminated(state).joint, settings)
+    detections.merge(state.numbers[gone], state.numbers[kept])
+    remove_rare(state, detections, 1)
+    assert len(state) == len(state.landmarks) == count
+    assert (detections.landmark[rows] == often).all()
