@@ -573,6 +573,40 @@ py::array_t<bool> rows_holding(const Ints& keys, const Ints& ascending) {
   return out;
 }
 
+py::tuple relative_rows(const Array& root, const Array& right, const Array& local, const Array& values,
+                        const Ints& turning, const Ints& headings) {
+  const Index r = root.shape(0), q = local.shape(0), width = q + 3;
+  expect(root.size() == r * q && right.size() == r && values.size() == width);
+  const double* frame = values.data() + q;
+  const Turn turn(frame[2]);
+  std::vector<double> there(values.data(), frame), off(q);
+  for (Index k = 0; k < turning.size(); ++k) {
+    double* at = &there[turning.data()[k]];
+    const double dx = at[0] - frame[0], dy = at[1] - frame[1];
+    at[0] = turn.c * dx + turn.s * dy, at[1] = -turn.s * dx + turn.c * dy;
+  }
+  for (Index k = 0; k < headings.size(); ++k) there[headings.data()[k]] -= frame[2];
+  for (Index j = 0; j < q; ++j) off[j] = there[j] - local.data()[j];
+  Array jacobian(Shape{r, width}), residual(r);
+  for (Index i = 0; i < r; ++i) {
+    const double* A = root.data() + i * q;
+    double* J = jacobian.mutable_data() + i * width;
+    double sum = -right.data()[i], by[3] = {0.0, 0.0, 0.0};
+    for (Index j = 0; j < q; ++j) sum += A[j] * off[j];
+    std::copy_n(A, q, J);
+    for (Index k = 0; k < turning.size(); ++k) {
+      const Index x = turning.data()[k];
+      J[x] = A[x] * turn.c - A[x + 1] * turn.s, J[x + 1] = A[x] * turn.s + A[x + 1] * turn.c;
+      by[0] -= J[x], by[1] -= J[x + 1];
+      by[2] += A[x] * there[x + 1] - A[x + 1] * there[x];
+    }
+    for (Index k = 0; k < headings.size(); ++k) by[2] -= A[headings.data()[k]];
+    std::copy_n(by, 3, J + q);
+    residual.mutable_data()[i] = sum;
+  }
+  return py::make_tuple(jacobian, residual);
+}
+
 Ints spread(const Ints& starts, const Ints& widths) {
   const Index count = starts.shape(0);
   expect(widths.size() == count);
@@ -1094,6 +1128,7 @@ PYBIND11_MODULE(_kernels, module) {
              py::arg("information"), py::arg("vector"), py::arg("entries"), py::arg("change"));
   module.def("moved_residual", &moved_residual);
   module.def("parted", &parted);
+  module.def("relative_rows", &relative_rows);
   module.def("rows_holding", &rows_holding);
   module.def("columns_of", &columns_of);
   module.def("by_sensor", &by_sensor);

@@ -120,7 +120,7 @@ class MotionCheck:
         motion = self._integrate(odometry, t)
         columns = by_errors(measured, motion.odometry.twist)
         detections = replace(detections, points_vehicle=measured + columns @ self.errors.mean)
-        variances = 0.5 * np.trace(detections.covariances, axis1=1, axis2=2)
+        variances = 0.5 * (detections.covariances[:, 0, 0] + detections.covariances[:, 1, 1])
         self._recent.forget(t)
         self._recent.correct(self.errors.mean)
         self._limit = DOUBT_AGAIN if t - self._doubted_at < DISTRUST else self.settings.doubt

@@ -257,8 +257,12 @@ class FixedLagSmoother(Generic[M_co]):
         if whole and self.chain is not None:
             marginal = sparse_marginal(self.linear_graph(True), keys)
             return factorize(marginal, Layout(np.sort(keys))).covariance(keys)
-        layout = self.variables.layout if whole else self.layout
-        return factorize(self.linear_graph(whole), layout).covariance(keys)
+        if whole:
+            return factorize(self.linear_graph(whole), self.variables.layout).covariance(keys)
+        graph = graph_of(self.absolute_prior(), *self.user_factors.linearized(self.variables))
+        layout, rows = self.layout, self.window.fresh_rows(self._cycles)
+        hessian, _ = newton_system(graph, rows, layout, np.zeros(layout.size))
+        return FactoredSystem(layout, cholesky(hessian)).covariance(keys)
 
     def predicted_covariance(self, rows: Rows, together: int = 1) -> Array:
         """Return `rows.predicted_covariance` (m / k, k, k) of every k = `together` rows in the last step."""

@@ -131,6 +131,11 @@ class WindowFactors(Generic[M_co]):
         """Return all rows as they were linearized last, `J d + r` with d = value - reference."""
         return [*self.measured.groups, *self.gauge.groups, *self.linear_gauge.groups]
 
+    def fresh_rows(self, cycles: IntArray) -> list[Rows]:
+        """Return the rows of some cycles and the weak priors on the active map points, as `fresh` does."""
+        weak = [*self.map.gauge(False), *self.map.linear_gauge(False)]
+        return at_reference([*self._rows(cycles), *weak], self.variables)
+
     def fresh(self, cycles: IntArray, whole: bool) -> list[gtsam.GaussianFactor]:
         """Return factors of some cycles and weak priors, linearized at the variables' values.
 

@@ -19,6 +19,7 @@ for _module in (
     "front_end.gate",
     "front_end.scan_matching",
     "front_end.sightings",
+    "graph.relative",
     "graph.rows",
     "mapping.path",
 ):
@@ -131,6 +132,13 @@ CASES: dict[str, Arguments] = {
         1.2,
         poses(rng, 1)[0],
         information(rng, 3),
+    ),
+    "relative_rows": lambda rng: (
+        rng.normal(size=(COUNT, 9)),
+        rng.normal(size=COUNT),
+        *(rng.normal(size=size) for size in (9, 12)),
+        np.array([2, 4, 6]),
+        np.array([8]),
     ),
     "squared": lambda rng: (
         rng.normal(size=3),
