@@ -119,13 +119,10 @@ def _cones(sightings: Sightings) -> _Cones | None:
     ranges = np.maximum(np.hypot(*table.point.T), np.finfo(float).tiny)
     turn = rotations(table.pose[:, 2])
     ray = np.einsum("nij,nj->ni", turn, table.point / ranges[:, None])
-    points = to_map(table.point, table.pose)
     i, j = pairs(table.cone)
     near = np.abs(table.t[j] - table.t[i]) < NEAR_TIME
-    both = i[near], j[near]
-    return _Cones(
-        table, begins, both, ranges, ray, left_of(ray), points, _columns(table, begins, table.point)
-    )
+    known = table, begins, (i[near], j[near]), ranges, ray, left_of(ray), to_map(table.point, table.pose)
+    return _Cones(*known, _columns(table, begins, table.point))
 
 
 def _columns(table: Sightings, begins: IntArray, seen: Array) -> Array:
