@@ -181,6 +181,8 @@ class MeasuredNoise:
         Without those errors alone that are `shown`, if asked for.
         """
         errors = self.shown if shown else self.sensor
+        if not errors.any():
+            return points
         return shifted(points, np.broadcast_to(twist, (len(points), 3)), errors)
 
 

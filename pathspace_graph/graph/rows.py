@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import gtsam
@@ -67,7 +67,7 @@ class Rows:
         """Return which of a row's keys each derivative (n,) is by, and which entry of its variable."""
         return _pattern(self.widths)
 
-    @property
+    @cached_property
     def widths(self) -> tuple[int, ...]:
         """Return the widths (k,) of each row's variables."""
         return tuple([_width(letter) for letter in (self.keys[0] >> INDEX_BITS).tolist()])

@@ -296,7 +296,7 @@ class Variables:
         """Return a copy of the values (n,) of keys (k,), one after the other."""
         return self.values[self.layout.entries(keys)]
 
-    def change(self, columns: IntArray) -> Array:
+    def change(self, columns: IntArray | slice) -> Array:
         """Return `value - reference`, the unknowns, at some entries."""
         return np.asarray(self.values[columns] - self.reference[columns])
 

@@ -117,6 +117,8 @@ class WindowFactors(Generic[M_co]):
         """Odometry between each pose of the window and the next."""
         self.exact = False
         """If true, the tolerances are zero: factors of all variables that moved are linearized again."""
+        self.lengthened = -1
+        """Cycle of the newest pose until the odometry led on from it, whose rows lack that odometry."""
         self.measured = KeptRows()
         """Rows of detections, and of the odometry to the next cycle, by perception cycle."""
         self.gauge = KeptRows()
@@ -164,6 +166,7 @@ class WindowFactors(Generic[M_co]):
         if self.map.reached_inactive or any(among(rows.keys, inactive).any() for rows in groups):
             return False
         self.measured.replace(stale, groups, self.variables)
+        self.lengthened = -1
         self.map.linearized(stale)
         self._relinearize_gauge(moved)
         entries = self.variables.layout.entries(moved)
@@ -198,9 +201,9 @@ class WindowFactors(Generic[M_co]):
         return layout.keys[np.logical_or.reduceat(moved, layout.starts)]
 
     def _stale(self, cycles: IntArray, moved: IntArray) -> IntArray:
-        stale = ~among(cycles, np.sort(self.measured.owners))
+        stale = ~among(cycles, np.sort(self.measured.owners)) | (cycles == self.lengthened)
         stale |= among(cycles, np.sort(np.append(self.map.changed(), self.measured.holding(moved))))
-        return cycles[stale]
+        return np.asarray(cycles[stale])
 
     def _relinearize_gauge(self, moved: IntArray) -> None:
         if self.map.structure is not self._structure:
