@@ -32,6 +32,36 @@ struct Turn {
   double c, s;
 };
 
+// Solve A x = b for three unknowns by elimination with pivoting, in place.
+void solve3(double (*A)[3], double* b) {
+  for (int k = 0; k < 3; ++k) {
+    int best = k;
+    for (int i = k + 1; i < 3; ++i)
+      if (std::abs(A[i][k]) > std::abs(A[best][k])) best = i;
+    if (best != k) std::swap_ranges(A[k], A[k] + 3, A[best]), std::swap(b[k], b[best]);
+    for (int i = k + 1; i < 3; ++i) {
+      const double by = A[i][k] / A[k][k];
+      for (int j = k + 1; j < 3; ++j) A[i][j] -= by * A[k][j];
+      b[i] -= by * b[k];
+    }
+  }
+  for (int k = 2; k >= 0; --k) {
+    for (int j = k + 1; j < 3; ++j) b[k] -= A[k][j] * b[j];
+    b[k] /= A[k][k];
+  }
+}
+
+// The inverse of a matrix (3, 3), row after row.
+void inverse3(const double* matrix, double* out) {
+  for (int c = 0; c < 3; ++c) {
+    double A[3][3], column[3] = {0.0, 0.0, 0.0};
+    std::copy_n(matrix, 9, &A[0][0]);
+    column[c] = 1.0;
+    solve3(A, column);
+    for (int r = 0; r < 3; ++r) out[3 * r + c] = column[r];
+  }
+}
+
 // --- foot points ------------------------------------------------------------------------------------------
 
 struct Tolerances {  // the constants of footpoint.py
@@ -389,15 +419,59 @@ py::tuple refined(const py::object& spans, const Array& control_points, const Ar
 
 using Columns = py::array_t<double, py::array::f_style>;
 
-void add_rows(Columns hessian, Array gradient, const Ints& columns, const Array& jacobian,
-              const Array& residual, const Array& change) {
+// The columns of one row after another; the keys of neighbouring rows are mostly the same.
+class RowColumns {
+ public:
+  RowColumns(const Ints& keys, const Ints& starts, const Ints& sought, const Ints& key, const Ints& entry)
+      : keys_(keys), starts_(starts), sought_(sought), key_(key), entry_(entry), k_(sought.shape(1)),
+        wanted_(k_), begin_(k_), columns_(key.shape(0)) {
+    expect(entry.size() == key.size() && starts.size() == keys.size());
+  }
+
+  const std::vector<Index>& of(Index row) {
+    const Index* known = keys_.data();
+    const Index* last = known + keys_.shape(0);
+    bool same = row > 0;
+    for (Index j = 0; j < k_; ++j) {
+      const Index wanted = sought_.data()[row * k_ + j];
+      if (row > 0 && wanted == wanted_[j]) continue;
+      const Index* place = std::lower_bound(known, last, wanted);
+      wanted_[j] = wanted, same = false;
+      begin_[j] = place == last || *place != wanted ? kUnknown : starts_.data()[place - known];
+    }
+    for (std::size_t j = 0; j < columns_.size() && !same; ++j) {
+      const Index first = begin_[key_.data()[j]];
+      columns_[j] = first == kUnknown ? kUnknown : first + entry_.data()[j];
+    }
+    return columns_;
+  }
+
+  const std::vector<Index>& known(Index row) {
+    const std::vector<Index>& found = of(row);
+    if (std::find(begin_.begin(), begin_.end(), kUnknown) != begin_.end())
+      throw py::value_error("expected rows on known variables, found others");
+    return found;
+  }
+
+  static constexpr Index kUnknown = -1;
+
+ private:
+  const Ints &keys_, &starts_, &sought_, &key_, &entry_;
+  Index k_;
+  std::vector<Index> wanted_, begin_, columns_;
+};
+
+void add_rows(Columns hessian, Array gradient, const Ints& keys, const Ints& starts, const Ints& sought,
+              const Ints& key, const Ints& entry, const Array& jacobian, const Array& residual,
+              const Array& change) {
   const Index rows = jacobian.shape(0), width = jacobian.shape(1), n = gradient.shape(0);
   expect(hessian.size() == n * n && change.size() == n && residual.size() == rows);
-  expect(columns.size() == rows * width);
+  expect(sought.shape(0) == rows && key.size() == width);
   double* H = hessian.mutable_data();
   double* g = gradient.mutable_data();
+  RowColumns columns(keys, starts, sought, key, entry);
   for (Index i = 0; i < rows; ++i) {
-    const Index* at = columns.data() + i * width;
+    const std::vector<Index>& at = columns.known(i);
     const double* J = jacobian.data() + i * width;
     double r = residual.data()[i];
     for (Index a = 0; a < width; ++a) r += J[a] * change.data()[at[a]];
@@ -411,25 +485,126 @@ void add_rows(Columns hessian, Array gradient, const Ints& columns, const Array&
   }
 }
 
+void add_prior(Columns hessian, Array gradient, const Columns& information, const Array& vector,
+               const Ints& entries, const Array& change) {
+  const Index n = gradient.shape(0), m = entries.shape(0);
+  expect(hessian.size() == n * n && change.size() == n && vector.size() == m && information.size() == m * m);
+  const Index* at = entries.data();
+  double* H = hessian.mutable_data();
+  double* g = gradient.mutable_data();
+  for (Index a = 0; a < m; ++a) g[at[a]] += vector.data()[a];
+  for (Index b = 0; b < m; ++b) {
+    const double* column = information.data() + b * m;
+    const double by = change.data()[at[b]];
+    for (Index a = 0; a < m; ++a) g[at[a]] -= column[a] * by;
+    for (Index a = b; a < m; ++a) H[at[a] + at[b] * n] += column[a];
+  }
+}
+
 Ints columns_of(const Ints& keys, const Ints& starts, const Ints& sought, const Ints& key,
                 const Ints& entry) {
-  const Index rows = sought.shape(0), k = sought.shape(1), width = key.shape(0);
-  const Index* known = keys.data();
-  const Index* last = known + keys.shape(0);
-  Ints columns(Shape{rows, width});
-  std::vector<Index> begin(k);  // UNKNOWN is -1
+  const Index rows = sought.shape(0), width = key.shape(0);
+  Ints out(Shape{rows, width});
+  RowColumns columns(keys, starts, sought, key, entry);
   for (Index i = 0; i < rows; ++i) {
-    for (Index j = 0; j < k; ++j) {
-      const Index wanted = sought.data()[i * k + j];
-      const Index* place = std::lower_bound(known, last, wanted);
-      begin[j] = place == last || *place != wanted ? -1 : starts.data()[place - known];
-    }
-    for (Index j = 0; j < width; ++j) {
-      const Index first = begin[key.data()[j]];
-      columns.mutable_data()[i * width + j] = first < 0 ? -1 : first + entry.data()[j];
-    }
+    const std::vector<Index>& at = columns.of(i);
+    std::copy(at.begin(), at.end(), out.mutable_data() + i * width);
   }
-  return columns;
+  return out;
+}
+
+Array moved_residual(const Ints& keys, const Ints& starts, const Ints& sought, const Ints& key,
+                     const Ints& entry, const Array& jacobian, const Array& residual, const Array& change) {
+  const Index rows = sought.shape(0), width = key.shape(0);
+  expect(jacobian.size() == rows * width && residual.size() == rows);
+  Array out(rows);
+  RowColumns columns(keys, starts, sought, key, entry);
+  for (Index i = 0; i < rows; ++i) {
+    const std::vector<Index>& at = columns.known(i);
+    double by_change = 0.0;
+    for (Index j = 0; j < width; ++j) by_change += jacobian.data()[i * width + j] * change.data()[at[j]];
+    out.mutable_data()[i] = residual.data()[i] - by_change;
+  }
+  return out;
+}
+
+py::tuple parted(const Ints& keys, const Array& jacobian, const Array& residual, const Ints& owner,
+                 const Ints& gone) {
+  const Index rows = owner.shape(0), k = keys.shape(1), width = jacobian.shape(1);
+  expect(keys.shape(0) == rows && jacobian.shape(0) == rows && residual.size() == rows);
+  std::vector<bool> goes(rows);
+  Index count = 0;
+  for (Index i = 0; i < rows; ++i) {
+    goes[i] = std::binary_search(gone.data(), gone.data() + gone.shape(0), owner.data()[i]);
+    count += goes[i];
+  }
+  py::tuple out(8);
+  for (const bool which : {false, true}) {
+    const Index size = which ? count : rows - count;
+    Ints own_keys(Shape{size, k}), own_owner(size);
+    Array own_jacobian(Shape{size, width}), own_residual(size);
+    Index* to_keys = own_keys.mutable_data();
+    Index* to_owner = own_owner.mutable_data();
+    double* to_jacobian = own_jacobian.mutable_data();
+    double* to_residual = own_residual.mutable_data();
+    for (Index i = 0; i < rows; ++i) {
+      if (goes[i] != which) continue;
+      to_keys = std::copy_n(keys.data() + i * k, k, to_keys);
+      to_jacobian = std::copy_n(jacobian.data() + i * width, width, to_jacobian);
+      *to_residual++ = residual.data()[i];
+      *to_owner++ = owner.data()[i];
+    }
+    const int at = which ? 4 : 0;
+    out[at] = own_keys, out[at + 1] = own_jacobian, out[at + 2] = own_residual, out[at + 3] = own_owner;
+  }
+  return out;
+}
+
+py::array_t<bool> rows_holding(const Ints& keys, const Ints& ascending) {
+  const Index rows = keys.shape(0), k = keys.shape(1);
+  const Index* first = ascending.data();
+  const Index* last = first + ascending.shape(0);
+  py::array_t<bool> out(rows);
+  for (Index i = 0; i < rows; ++i) {
+    const Index* own = keys.data() + i * k;
+    out.mutable_data()[i] =
+        std::any_of(own, own + k, [&](Index key) { return std::binary_search(first, last, key); });
+  }
+  return out;
+}
+
+py::tuple relative_rows(const Array& root, const Array& right, const Array& local, const Array& values,
+                        const Ints& turning, const Ints& headings) {
+  const Index r = root.shape(0), q = local.shape(0), width = q + 3;
+  expect(root.size() == r * q && right.size() == r && values.size() == width);
+  const double* frame = values.data() + q;
+  const Turn turn(frame[2]);
+  std::vector<double> there(values.data(), frame), off(q);
+  for (Index k = 0; k < turning.size(); ++k) {
+    double* at = &there[turning.data()[k]];
+    const double dx = at[0] - frame[0], dy = at[1] - frame[1];
+    at[0] = turn.c * dx + turn.s * dy, at[1] = -turn.s * dx + turn.c * dy;
+  }
+  for (Index k = 0; k < headings.size(); ++k) there[headings.data()[k]] -= frame[2];
+  for (Index j = 0; j < q; ++j) off[j] = there[j] - local.data()[j];
+  Array jacobian(Shape{r, width}), residual(r);
+  for (Index i = 0; i < r; ++i) {
+    const double* A = root.data() + i * q;
+    double* J = jacobian.mutable_data() + i * width;
+    double sum = -right.data()[i], by[3] = {0.0, 0.0, 0.0};
+    for (Index j = 0; j < q; ++j) sum += A[j] * off[j];
+    std::copy_n(A, q, J);
+    for (Index k = 0; k < turning.size(); ++k) {
+      const Index x = turning.data()[k];
+      J[x] = A[x] * turn.c - A[x + 1] * turn.s, J[x + 1] = A[x] * turn.s + A[x + 1] * turn.c;
+      by[0] -= J[x], by[1] -= J[x + 1];
+      by[2] += A[x] * there[x + 1] - A[x + 1] * there[x];
+    }
+    for (Index k = 0; k < headings.size(); ++k) by[2] -= A[headings.data()[k]];
+    std::copy_n(by, 3, J + q);
+    residual.mutable_data()[i] = sum;
+  }
+  return py::make_tuple(jacobian, residual);
 }
 
 Ints spread(const Ints& starts, const Ints& widths) {
@@ -630,6 +805,25 @@ py::tuple integrated(const Array& durations, const Array& twists, const Array& s
   return py::make_tuple(Array(Shape{3}, end), covariance, by_calibration);
 }
 
+Array whitener(const Array& covariance, double least) {
+  expect(covariance.size() == 9);
+  const double* K = covariance.data();
+  double L[3][3] = {}, values[9] = {};
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j <= i; ++j) {
+      double sum = K[3 * i + j] + (i == j ? least * least : 0.0);
+      for (int k = 0; k < j; ++k) sum -= L[i][k] * L[j][k];
+      L[i][j] = i == j ? std::sqrt(sum) : sum / L[j][j];
+    }
+  for (int j = 0; j < 3; ++j)
+    for (int i = j; i < 3; ++i) {
+      double sum = i == j ? 1.0 : 0.0;
+      for (int k = j; k < i; ++k) sum -= L[i][k] * values[3 * k + j];
+      values[3 * i + j] = sum / L[i][i];
+    }
+  return Array(Shape{3, 3}, values);
+}
+
 py::tuple odometry_residuals(const Array& starts, const Array& ends, const Array& deltas,
                              double series_below) {
   const Index m = deltas.shape(0);
@@ -696,24 +890,26 @@ py::tuple weighted_means(const Array& points, const Array& recent, double reach,
   return py::make_tuple(means, totals);
 }
 
-py::tuple matched(const Array& recent, const Array& points_vehicle, const Array& variances, const Array& pose,
-                  double reach, const py::tuple& limits) {
+// A step of `match`: how many are matched, the information and the gradient at a pose, and the cost there.
+Index match_step(const Array& recent, const Array& points_vehicle, const Array& variances, const double* pose,
+                 double reach, const py::tuple& limits, double* information, double* gradient, bool* is_matched,
+                 double* total) {
   const Index m = points_vehicle.shape(0);
   const double farthest = limits[0].cast<double>(), min_weight = limits[1].cast<double>();
   const double huber = limits[2].cast<double>(), sigma_cone = limits[3].cast<double>();
-  expect(variances.size() == m && pose.size() == 3);
-  const Array place(Shape{1, 3}, pose.data());
+  const Array place(Shape{1, 3}, pose);
   const Array points = to_map(points_vehicle, place);
   const py::tuple beside = weighted_means(points, recent, reach, farthest);
   const Array means = beside[0].cast<Array>(), weights = beside[1].cast<Array>();
   double w = 0.0, wx = 0.0, wy = 0.0, turning = 0.0, cost = 0.0, g[3] = {0.0, 0.0, 0.0};
-  py::array_t<bool> is_matched(m);
+  Index count = 0;
   for (Index i = 0; i < m; ++i) {
-    const bool own = is_matched.mutable_data()[i] = weights.data()[i] > min_weight;
-    if (!own) continue;
+    is_matched[i] = weights.data()[i] > min_weight;
+    if (!is_matched[i]) continue;
+    ++count;
     const double* p = points.data() + 2 * i;
     const double ex = p[0] - means.data()[2 * i], ey = p[1] - means.data()[2 * i + 1];
-    const double ax = p[0] - pose.data()[0], ay = p[1] - pose.data()[1];
+    const double ax = p[0] - pose[0], ay = p[1] - pose[1];
     const double square = ex * ex + ey * ey;
     double precision =
         1.0 / (variances.data()[i] * (1.0 + 1.0 / weights.data()[i]) + sigma_cone * sigma_cone);
@@ -724,29 +920,199 @@ py::tuple matched(const Array& recent, const Array& points_vehicle, const Array&
     cost += square * precision;
   }
   const double values[9] = {w, 0.0, wy, 0.0, w, wx, wy, wx, turning};
-  return py::make_tuple(Array(Shape{3, 3}, values), Array(Shape{3}, g), is_matched, cost);
+  std::copy_n(values, 9, information);
+  std::copy_n(g, 3, gradient);
+  *total = cost;
+  return count;
+}
+
+py::tuple matched(const Array& recent, const Array& points_vehicle, const Array& variances, const Array& start,
+                  const Array& reaches, const py::tuple& limits) {
+  const Index m = points_vehicle.shape(0);
+  const double min_matched = limits[4].cast<double>(), least_share = limits[5].cast<double>();
+  double pose[3], information[9], gradient[3], cost = 0.0;
+  expect(start.size() == 3 && variances.size() == m && reaches.size() > 0);
+  std::copy_n(start.data(), 3, pose);
+  py::array_t<bool> is_matched(m);
+  for (Index k = 0; k < reaches.size(); ++k) {
+    const Index count = match_step(recent, points_vehicle, variances, pose, reaches.data()[k], limits,
+                                   information, gradient, is_matched.mutable_data(), &cost);
+    if (count < min_matched) break;
+    double A[3][3];
+    for (int i = 0; i < 9; ++i) A[i / 3][i % 3] = information[i] * (i % 4 ? 1.0 : 1.0 + least_share);
+    solve3(A, gradient);
+    for (int i = 0; i < 3; ++i) pose[i] -= gradient[i];
+  }
+  return py::make_tuple(Array(Shape{3}, pose), Array(Shape{3, 3}, information), is_matched, cost);
+}
+
+py::tuple off_prediction(const Array& pose, const Array& information, double excess, const Array& predicted,
+                         const Array& covariance) {
+  expect(pose.size() == 3 && information.size() == 9 && predicted.size() == 3 && covariance.size() == 9);
+  const double* x = predicted.data();
+  const Turn turn(x[2]);
+  const double T[3][3] = {{turn.c, turn.s, 0.0}, {-turn.s, turn.c, 0.0}, {0.0, 0.0, 1.0}};
+  double spread[9], off[3] = {0.0, 0.0, 0.0}, K[9];
+  inverse3(information.data(), spread);
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) {
+      off[i] += T[i][j] * (pose.data()[j] - x[j]);
+      double sum = 0.0;
+      for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b) sum += T[i][a] * spread[3 * a + b] * T[j][b];
+      K[3 * i + j] = excess * sum + covariance.data()[3 * i + j];
+    }
+  return py::make_tuple(Array(Shape{3}, off), Array(Shape{3, 3}, K));
+}
+
+double squared(const Array& off, const Array& covariance, const Array& shifts, const Array& errors) {
+  expect(off.size() == 3 && covariance.size() == 9 && shifts.size() == 6 && errors.size() == 4);
+  const double *S = shifts.data(), *P = errors.data();
+  double A[3][3], solved[3], square = 0.0;
+  for (int i = 0; i < 3; ++i) {
+    solved[i] = off.data()[i];
+    for (int j = 0; j < 3; ++j) {
+      A[i][j] = covariance.data()[3 * i + j];
+      for (int a = 0; a < 2; ++a)
+        for (int b = 0; b < 2; ++b) A[i][j] += S[2 * i + a] * P[2 * a + b] * S[2 * j + b];
+    }
+  }
+  solve3(A, solved);
+  for (int i = 0; i < 3; ++i) square += off.data()[i] * solved[i];
+  return square;
+}
+
+void inverse2(const double* A, double* out) {
+  const double det = A[0] * A[3] - A[1] * A[2];
+  out[0] = A[3] / det, out[1] = -A[1] / det, out[2] = -A[2] / det, out[3] = A[0] / det;
+}
+
+// The Kalman update of SensorErrors.update.
+py::tuple learned(const Array& mean, const Array& errors, const Array& drift, const Array& off,
+                  const Array& covariance, const Array& shifts, double share) {
+  expect(mean.size() == 2 && errors.size() == 4 && drift.size() == 4 && off.size() == 3);
+  expect(covariance.size() == 9 && shifts.size() == 6);
+  const double* S = shifts.data();
+  double weighted[2][3], grown[4], information[4], P[4];
+  for (int e = 0; e < 2; ++e) {
+    double A[3][3];
+    std::copy_n(covariance.data(), 9, &A[0][0]);
+    for (int i = 0; i < 3; ++i) weighted[e][i] = share * S[2 * i + e];
+    solve3(A, weighted[e]);
+  }
+  for (int i = 0; i < 4; ++i) grown[i] = errors.data()[i] + drift.data()[i];
+  inverse2(grown, information);
+  double gain[2] = {0.0, 0.0}, out[2];
+  for (int e = 0; e < 2; ++e)
+    for (int i = 0; i < 3; ++i) {
+      gain[e] += weighted[e][i] * off.data()[i];
+      for (int f = 0; f < 2; ++f) information[2 * e + f] += weighted[e][i] * S[2 * i + f];
+    }
+  inverse2(information, P);
+  for (int e = 0; e < 2; ++e) out[e] = mean.data()[e] + P[2 * e] * gain[0] + P[2 * e + 1] * gain[1];
+  return py::make_tuple(Array(Shape{2}, out), Array(Shape{2, 2}, P));
+}
+
+// --- gate -------------------------------------------------------------------------------------------------
+
+py::tuple usable(const Array& points, const Array& covariances, const py::tuple& limits) {
+  const Index m = points.shape(0);
+  expect(points.size() == 2 * m && covariances.size() == 4 * m);
+  const double min_range = limits[0].cast<double>(), max_range = limits[1].cast<double>();
+  const double asymmetry = limits[2].cast<double>(), determinant = limits[3].cast<double>();
+  const double min_sigma = limits[4].cast<double>(), max_sigma = limits[5].cast<double>();
+  py::array_t<bool> near(m), definite(m);
+  for (Index i = 0; i < m; ++i) {
+    const double* K = covariances.data() + 4 * i;
+    const double distance = std::hypot(points.data()[2 * i], points.data()[2 * i + 1]);
+    near.mutable_data()[i] = distance >= min_range && distance <= max_range;
+    const double det = K[0] * K[3] - K[1] * K[2];
+    const double largest = 0.5 * (K[0] + K[3]) + std::hypot(0.5 * (K[0] - K[3]), K[1]);
+    definite.mutable_data()[i] = K[0] > 0.0 && K[3] > 0.0 && std::abs(K[1] - K[2]) <= asymmetry * largest &&
+                                 det > determinant * K[0] * K[3] && det >= min_sigma * min_sigma * largest &&
+                                 largest <= max_sigma * max_sigma;
+  }
+  return py::make_tuple(near, definite);
 }
 
 // --- sightings --------------------------------------------------------------------------------------------
 
-Array gated_squares(const Array& points, const Array& others, const Array& place, const Array& along,
-                    const Array& across) {
-  const Index m = points.shape(0), n = others.shape(0);
-  expect(points.size() == 2 * m && others.size() == 2 * n && place.size() == 2);
-  expect(along.size() == m && across.size() == m);
-  Array squares(Shape{m, n});
-  for (Index i = 0; i < m; ++i) {
-    const double* p = points.data() + 2 * i;
-    double rx = p[0] - place.data()[0], ry = p[1] - place.data()[1];
+// Points, and the gates along and across the rays to them from a place.
+struct Gates {
+  Gates(const Array& points, const Array& along, const Array& across, const double* place)
+      : points(points.data()), along(along.data()), across(across.data()), place(place) {}
+
+  double square(Index i, const double* other) const {
+    const double* p = points + 2 * i;
+    double rx = p[0] - place[0], ry = p[1] - place[1];
     const double range = std::max(std::hypot(rx, ry), std::numeric_limits<double>::min());
     rx /= range, ry /= range;
-    for (Index j = 0; j < n; ++j) {
-      const double dx = others.data()[2 * j] - p[0], dy = others.data()[2 * j + 1] - p[1];
-      const double a = (dx * rx + dy * ry) / along.data()[i], c = (dy * rx - dx * ry) / across.data()[i];
-      squares.mutable_data()[i * n + j] = a * a + c * c;
-    }
+    const double dx = other[0] - p[0], dy = other[1] - p[1];
+    const double a = (dx * rx + dy * ry) / along[i], c = (dy * rx - dx * ry) / across[i];
+    return a * a + c * c;
   }
-  return squares;
+
+  const double *points, *along, *across, *place;
+};
+
+py::tuple assigned(const Array& points, const Ints& labels, const Array& ranges, const Array& place,
+                   const Array& along, const Array& across, const Array& known, const Ints& known_labels,
+                   const Array& nearest, const py::tuple& weights) {
+  const Index m = points.shape(0), n = known.shape(0);
+  expect(points.size() == 2 * m && labels.size() == m && ranges.size() == m && place.size() == 2);
+  expect(along.size() == m && across.size() == m);
+  expect(known.size() == 2 * n && known_labels.size() == n && nearest.size() == n);
+  const double nearer = weights[0].cast<double>(), farther = weights[1].cast<double>();
+  const Gates gates(points, along, across, place.data());
+  Ints cones(m);
+  Array moved(Shape{n, 2}, known.data()), least(Shape{n}, nearest.data());
+  std::vector<Index> counts(n, 0), lone;
+  std::vector<double> sums(2 * n, 0.0), closest(n, kInfinity);
+  Index* cone = cones.mutable_data();
+  for (Index i = 0; i < m; ++i) {
+    double best = 1.0;
+    cone[i] = -1;
+    for (Index j = 0; j < n; ++j) {
+      if (known_labels.data()[j] != labels.data()[i]) continue;
+      const double square = gates.square(i, known.data() + 2 * j);
+      if (square < best) best = square, cone[i] = j;
+    }
+    if (cone[i] >= 0) ++counts[cone[i]];
+  }
+  for (Index i = 0; i < m; ++i) {
+    if (cone[i] < 0) continue;
+    const Index j = cone[i];
+    for (int c = 0; c < 2; ++c) sums[2 * j + c] += points.data()[2 * i + c] / static_cast<double>(counts[j]);
+    closest[j] = std::min(closest[j], ranges.data()[i]);
+  }
+  for (Index j = 0; j < n; ++j) {
+    if (counts[j] == 0) continue;
+    const double weight = closest[j] <= nearest.data()[j] ? nearer : farther;
+    for (int c = 0; c < 2; ++c) {
+      double& at = moved.mutable_data()[2 * j + c];
+      at += weight * (sums[2 * j + c] - at);
+    }
+    least.mutable_data()[j] = std::min(nearest.data()[j], closest[j]);
+  }
+  // Each of the others is a cone of its own, unless it lies beside an earlier one that is.
+  for (Index i = 0; i < m; ++i)
+    if (cone[i] < 0) lone.push_back(i);
+  std::vector<Index> first(lone.size());
+  Index count = n;
+  for (std::size_t a = 0; a < lone.size(); ++a) {
+    first[a] = static_cast<Index>(a);
+    for (std::size_t b = 0; b < a; ++b)
+      if (labels.data()[lone[a]] == labels.data()[lone[b]] &&
+          gates.square(lone[a], points.data() + 2 * lone[b]) < 1.0) {
+        first[a] = static_cast<Index>(b);
+        break;
+      }
+  }
+  std::vector<Index> number(lone.size(), -1);
+  for (std::size_t a = 0; a < lone.size(); ++a)
+    if (first[a] == static_cast<Index>(a)) number[a] = count++;
+  for (std::size_t a = 0; a < lone.size(); ++a) cone[lone[a]] = number[first[a]];
+  return py::make_tuple(cones, moved, least);
 }
 
 }  // namespace
@@ -756,7 +1122,14 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("searched", &searched);
   module.def("refined", &refined);
   module.def("add_rows", &add_rows, py::arg("hessian").noconvert(), py::arg("gradient").noconvert(),
-             py::arg("columns"), py::arg("jacobian"), py::arg("residual"), py::arg("change"));
+             py::arg("keys"), py::arg("starts"), py::arg("sought"), py::arg("key"), py::arg("entry"),
+             py::arg("jacobian"), py::arg("residual"), py::arg("change"));
+  module.def("add_prior", &add_prior, py::arg("hessian").noconvert(), py::arg("gradient").noconvert(),
+             py::arg("information"), py::arg("vector"), py::arg("entries"), py::arg("change"));
+  module.def("moved_residual", &moved_residual);
+  module.def("parted", &parted);
+  module.def("relative_rows", &relative_rows);
+  module.def("rows_holding", &rows_holding);
   module.def("columns_of", &columns_of);
   module.def("by_sensor", &by_sensor);
   module.def("shifted", &shifted);
@@ -767,6 +1140,11 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("integrated", &integrated);
   module.def("weighted_means", &weighted_means);
   module.def("matched", &matched);
-  module.def("gated_squares", &gated_squares);
+  module.def("assigned", &assigned);
+  module.def("off_prediction", &off_prediction);
+  module.def("squared", &squared);
+  module.def("learned", &learned);
+  module.def("usable", &usable);
+  module.def("whitener", &whitener);
   module.def("spread", &spread);
 }

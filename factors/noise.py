@@ -1,6 +1,7 @@
 """Noise: whitening, Huber's robust loss, and what was measured of a drive's odometry and detections."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar, Final
 
 import numpy as np
@@ -133,6 +134,11 @@ class MeasuredNoise:
         """Return the white noise (3,) of a twist with the effect of white noise and slow part together."""
         return np.asarray(np.hypot(self.odometry, self.drift / np.sqrt(self.interval)))
 
+    @cached_property
+    def _inflations(self) -> Array:
+        known = [one for one in (self.along, self.across) if one is not None]
+        return np.array([one.inflation(self.count, self.period) for one in known])
+
     def covariances(self, points: Array, *, inflated: bool) -> Array | None:
         """Return the covariances (m, 2, 2) of detections at points (m, 2), vehicle frame; None if unknown.
 
@@ -141,9 +147,7 @@ class MeasuredNoise:
         if self.along is None or self.across is None:
             return None
         ranges = np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)
-        factors = [
-            one.inflation(self.count, self.period) if inflated else 1.0 for one in (self.along, self.across)
-        ]
+        factors = self._inflations if inflated else np.ones(2)
         along = factors[0] * self.along.sigmas(ranges) ** 2
         across = factors[1] * self.across.sigmas(ranges) ** 2
         ray = points / ranges[:, None]
@@ -158,7 +162,7 @@ class MeasuredNoise:
         """
         if self.along is None or self.across is None:
             return covariances
-        roots = np.sqrt([one.inflation(self.count, self.period) for one in (self.along, self.across)])
+        roots = np.sqrt(self._inflations)
         if (roots < STAYS).all():
             return covariances
         ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
@@ -166,14 +170,20 @@ class MeasuredNoise:
         wider = np.einsum("mki,k,mkj->mij", axes, roots, axes)
         return np.asarray(wider @ covariances @ wider)
 
-    @property
+    @cached_property
     def shown(self) -> Array:
         """Return those errors (5,) of the sensor that are more than `SURE` sigmas; the others are zero."""
         return np.where(np.abs(self.sensor) > SURE * self.sensor_sigma, self.sensor, 0.0)
 
-    def corrected(self, points: Array, twist: Array) -> Array:
-        """Return detections at points (m, 2), vehicle frame, without the constant errors of the sensor."""
-        return shifted(points, np.broadcast_to(twist, (len(points), 3)), self.sensor)
+    def corrected(self, points: Array, twist: Array, *, shown: bool = False) -> Array:
+        """Return detections at points (m, 2), vehicle frame, without the constant errors of the sensor.
+
+        Without those errors alone that are `shown`, if asked for.
+        """
+        errors = self.shown if shown else self.sensor
+        if not errors.any():
+            return points
+        return shifted(points, np.broadcast_to(twist, (len(points), 3)), errors)
 
 
 def ray_sigmas(points: Array, covariances: Array) -> Array:

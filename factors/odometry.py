@@ -1,6 +1,6 @@
 """Odometry between two perception cycles: twists integrated on SE(2), with covariance and calibration."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import lapack
@@ -61,8 +61,10 @@ def integrate_twists(durations: Array, twists: Array, sigma: Array) -> Integrate
     """
     if len(durations) == 0:
         return integrated_odometry(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
-    whole = integrated_odometry(*_integrated(durations, twists, np.broadcast_to(sigma, twists.shape)))
-    return replace(whole, twist=twists[-1])
+    sigmas = np.empty(twists.shape)
+    sigmas[:] = sigma  # `broadcast_to` takes ten times as long
+    motion = _integrated(durations, twists, sigmas)
+    return IntegratedOdometry(*motion, _whitener(motion[1], MIN_SIGMA), twists[-1])
 
 
 @compiled
@@ -79,10 +81,16 @@ def _integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, 
 
 def integrated_odometry(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
     """Return the odometry with its whitener; `MIN_SIGMA` lifts a covariance of zero."""
-    floored = covariance + np.eye(3) * MIN_SIGMA**2
-    root, _ = lapack.dpotrf(floored, lower=1)
+    whitener = _whitener(covariance, MIN_SIGMA)
+    return IntegratedOdometry(delta, covariance, calibration_jacobian, whitener)
+
+
+@compiled
+def _whitener(covariance: Array, least: float) -> Array:
+    """Return lower triangular W (3, 3) with `W' W` the inverse of a covariance (3, 3) plus `least^2`."""
+    root, _ = lapack.dpotrf(covariance + np.eye(3) * least**2, lower=1)
     whitener, _ = lapack.dtrtri(root, lower=1)
-    return IntegratedOdometry(delta, covariance, calibration_jacobian, np.ascontiguousarray(whitener))
+    return np.ascontiguousarray(whitener)
 
 
 def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:

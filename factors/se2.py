@@ -1,5 +1,7 @@
 """Rigid motions of the plane, SE(2): a pose is `(x, y, theta)` in m, m and rad."""
 
+from math import cos, sin
+
 import numpy as np
 
 from .arrays import Array
@@ -13,7 +15,7 @@ def wrap_angle(angle: Array) -> Array:
 
 def rotation(theta: float) -> Array:
     """Return R(theta) (2, 2), which turns a vector from the vehicle frame to the map frame."""
-    c, s = np.cos(theta), np.sin(theta)
+    c, s = cos(theta), sin(theta)
     return np.array([[c, -s], [s, c]])
 
 
@@ -41,10 +43,13 @@ def compose(pose: Array, delta: Array) -> Array:
 
     Headings are added and not wrapped, so that whole turns accumulate.
     """
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    dx, dy = delta[..., 0], delta[..., 1]
-    moved = [pose[..., 0] + c * dx - s * dy, pose[..., 1] + s * dx + c * dy, pose[..., 2] + delta[..., 2]]
-    return np.array(moved).T
+    if pose.ndim == delta.ndim == 1:
+        (x, y, theta), (dx, dy, turn) = pose.tolist(), delta.tolist()
+        c, s = cos(theta), sin(theta)
+        return np.array([x + c * dx - s * dy, y + s * dx + c * dy, theta + turn])
+    cosine, sine, along, left = np.cos(pose[..., 2]), np.sin(pose[..., 2]), delta[..., 0], delta[..., 1]
+    x, y = pose[..., 0] + cosine * along - sine * left, pose[..., 1] + sine * along + cosine * left
+    return np.array([x, y, pose[..., 2] + delta[..., 2]]).T
 
 
 def inverse(pose: Array) -> Array:

@@ -133,7 +133,9 @@ def _array(value: Any, memo: Memo) -> Any:
 
 def _sequence(value: Any, memo: Memo) -> Any:
     """Return a copy of a list, a tuple, a set or a deque; one of shared values is copied at once."""
-    if all(_COPIERS.get(kind, _object) is None for kind in set(map(type, value))):
+    kinds = set(map(type, value))
+    fixed = kinds == {np.ndarray} and not any(one.flags.writeable for one in value)
+    if fixed or all(_COPIERS.get(kind, _object) is None for kind in kinds):
         return value if type(value) is tuple else value.copy()
     if isinstance(value, tuple):
         items = [copied(one, memo) for one in value]

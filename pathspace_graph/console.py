@@ -35,6 +35,8 @@ class _Output(Console):
     def on_broken_pipe(self) -> None:
         """Leave a closed pipe to the command line; rich would exit with 1."""
         raise  # noqa: PLE0704
+
+
 @contextmanager
 def verbosity(level: str) -> Iterator[None]:
     """Set the level, by its name, within the context."""

@@ -73,7 +73,7 @@ def marginal_keys(window: LinearWindow) -> list[int]:
 
 
 def time_gtsam(window: LinearWindow) -> dict[str, tuple[float, float]]:
-    """Return the wall times (s) of (`optimize`, `marginal`) by ordering, once each."""
+    """Return the processor times (s) of (`optimize`, `marginal`) by ordering, once each."""
     graph, staying = window.graph, gtsam.KeyVector(marginal_keys(window))
     marginal = _seconds(partial(graph.marginal, staying))
     return {
@@ -83,8 +83,8 @@ def time_gtsam(window: LinearWindow) -> dict[str, tuple[float, float]]:
 
 
 def _seconds(call: Callable[[], object]) -> float:
-    """Return the wall time (s) of the second of two calls."""
+    """Return the processor time (s) of the second of two calls."""
     call()
-    begin = time.perf_counter()
+    begin = time.thread_time()
     call()
-    return time.perf_counter() - begin
+    return time.thread_time() - begin

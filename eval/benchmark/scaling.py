@@ -52,7 +52,7 @@ class LaneTimes:
 
     lane: Lane
     seconds: list[float] = field(default_factory=list)
-    """Wall time of each update, s."""
+    """Processor time of each update, s."""
     sizes: list[int] = field(default_factory=list)
     """Number of control points or landmarks after each update."""
     stopped: str = ""
@@ -64,7 +64,7 @@ class LaneTimes:
         for cycle in split_odometry(self.lane.log):
             try:
                 timed_wait(estimator)
-                estimate, seconds = timed_update(estimator, *cycle)
+                estimate, _, seconds = timed_update(estimator, *cycle)
             except Exception as error:  # the table reports any failure
                 self.stopped = " ".join(f"{type(error).__name__}: {error}".split())
                 return

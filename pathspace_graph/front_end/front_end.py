@@ -99,7 +99,8 @@ class FrontEnd:
         noise, twist = self.noise, odometry.twist[-1] if len(odometry.t) else np.zeros(3)
         of_orange = is_orange(detections)
         in_lane = is_in_orange_lane(detections, of_orange)
-        orange, detections = detections.where(of_orange), detections.where(~of_orange)
+        orange = detections.where(of_orange)
+        detections = detections.where(~of_orange) if len(orange.labels) else detections
         checked = noise.for_check(detections, twist)
         motion = self._motion.update(odometry, checked, may_doubt=noise.is_settled)
         sides = self._sides
@@ -182,13 +183,15 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
 
 def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
     """Return whether the nearest cones are orange: the vehicle comes to a track, or is at a gate."""
+    if of_orange.sum() < NEAREST:
+        return False
     nearest = np.argsort(np.hypot(*detections.points_vehicle.T), kind="stable")[:NEAREST]
-    return len(nearest) == NEAREST and bool(of_orange[nearest].all())
+    return bool(of_orange[nearest].all())
 
 
 def is_orange(detections: Detections) -> BoolArray:
     """Return which detections (m,) are of orange cones."""
-    return np.isin(detections.labels, POINTS)
+    return np.asarray(detections.labels >= min(POINTS))
 
 
 def measure_log(log: Log) -> MeasuredNoise | None:

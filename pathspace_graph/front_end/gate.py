@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, ReadingError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, read_log
 from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.lengths import scaled
@@ -43,6 +44,7 @@ MIN_DETERMINANT: Final = 1e-12
 """Least det of a covariance over xx * yy; below, it is singular to double precision."""
 MAX_ASYMMETRY: Final = 1e-6
 """Largest difference of the entries xy and yx of a covariance, by its larger eigenvalue."""
+_COVARIANCES: Final = (MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA, MAX_SIGMA)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +133,9 @@ class Gate:
             self.refused += 1
             self._refused_at = _stamp_or_none(detections)
             raise
-        admitted = replace(admitted, refused=self.refused, notice="" if self._dropping else admitted.notice)
+        if self.refused or (self._dropping and admitted.notice):
+            notice = "" if self._dropping else admitted.notice
+            admitted = replace(admitted, refused=self.refused, notice=notice)
         self.refused, self._dropping, self._refused_at = 0, admitted.dropped > 0, None
         return admitted
 
@@ -268,9 +272,8 @@ def possible_detections(detections: Detections, t: float, limits: LimitSettings)
     labels = _labels(detections.labels, count)
     if count > MAX_DETECTIONS:
         raise ReadingError("detections.points_vehicle", f"at most {MAX_DETECTIONS} rows", count)
-    distance = np.hypot(points[:, 0], points[:, 1])  # not that of a point that is not finite
-    near = (distance >= MIN_RANGE) & (distance <= limits.range_max)
-    good = near & _has_covariance(covariances)
+    near, definite = _usable(points, covariances, (MIN_RANGE, limits.range_max, *_COVARIANCES))
+    good = near & definite
     if good.all():
         return Detections(t, points, covariances, labels), ""
     row = int(good.argmin())
@@ -284,16 +287,25 @@ def possible_detections(detections: Detections, t: float, limits: LimitSettings)
     return Detections(t, points[good], covariances[good], labels[good]), notice
 
 
-def _has_covariance(covariances: Array) -> BoolArray:
-    """Return whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible size."""
+@compiled
+def _usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tuple[BoolArray, BoolArray]:
+    """Return whether points (m, 2), vehicle frame, are where a sensor can see; those not finite are not.
+
+    The second result is whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible
+    size; the smaller eigenvalue is the determinant by the larger one. The limits are MIN_RANGE, the largest
+    range, and `_COVARIANCES`.
+    """
+    min_range, max_range, asymmetry, determinant, min_sigma, max_sigma = limits
+    distance = np.hypot(points[:, 0], points[:, 1])
+    near = (distance >= min_range) & (distance <= max_range)
     xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
         det = xx * yy - xy * yx
         largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
-        good = (xx > 0.0) & (yy > 0.0) & (np.abs(xy - yx) <= MAX_ASYMMETRY * largest)
-        good &= (det > MIN_DETERMINANT * xx * yy) & (det >= MIN_SIGMA**2 * largest)
-        good &= largest <= MAX_SIGMA**2
-    return np.asarray(good)
+        good = (xx > 0.0) & (yy > 0.0) & (np.abs(xy - yx) <= asymmetry * largest)
+        good &= (det > determinant * xx * yy) & (det >= min_sigma**2 * largest)
+        good &= largest <= max_sigma**2
+    return np.asarray(near), np.asarray(good)
 
 
 def _labels(values: Any, count: int) -> IntArray:

@@ -76,6 +76,8 @@ class _Cones:
 
     table: Sightings
     begins: IntArray
+    pairs: tuple[IntArray, IntArray]
+    """Ordered pairs of sightings of one cone that are less than `NEAR_TIME` apart, by index."""
     ranges: Array
     """(n,) Range of the cone as the sensor measures it, without noise (m)."""
     ray: Array
@@ -117,8 +119,10 @@ def _cones(sightings: Sightings) -> _Cones | None:
     ranges = np.maximum(np.hypot(*table.point.T), np.finfo(float).tiny)
     turn = rotations(table.pose[:, 2])
     ray = np.einsum("nij,nj->ni", turn, table.point / ranges[:, None])
-    points = to_map(table.point, table.pose)
-    return _Cones(table, begins, ranges, ray, left_of(ray), points, _columns(table, begins, table.point))
+    i, j = pairs(table.cone)
+    near = np.abs(table.t[j] - table.t[i]) < NEAR_TIME
+    known = table, begins, (i[near], j[near]), ranges, ray, left_of(ray), to_map(table.point, table.pose)
+    return _Cones(*known, _columns(table, begins, table.point))
 
 
 def _columns(table: Sightings, begins: IntArray, seen: Array) -> Array:
@@ -196,9 +200,8 @@ def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], o
 
     `odometry` is the drift (3,) by root of s that white noise of the twists makes.
     """
-    i, j = pairs(cones.table.cone)
-    t, ranges = cones.table.t, cones.ranges
-    near = (ranges[j] < NEAR * ranges[i]) & (np.abs(t[j] - t[i]) < NEAR_TIME)
+    (i, j), t, ranges = cones.pairs, cones.table.t, cones.ranges
+    near = ranges[j] < NEAR * ranges[i]
     i, j = i[near], j[near]
     rows, begins, counts = np.unique(i, return_index=True, return_counts=True)
     enough = counts >= 2
@@ -262,14 +265,15 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
     i, j = pairs(cone)
     lag = t[j] - t[i]
     place = np.digitize(lag, LAGS) - 1
+    of_lag = [place == k for k in range(len(LAGS) - 1)]
     product = whitened[i] * whitened[j] - 0.5 * (own[i] + own[j])
     scale = max(float((whitened**2 - own).mean()), 0.25)
-    enough = [k for k in range(len(LAGS) - 1) if (place == k).sum() >= MIN_ROWS // 2]
+    enough = [own for own in of_lag if own.sum() >= MIN_ROWS // 2]
     if not enough:
         return 0.0, 1.0
-    lags = np.array([lag[place == k].mean() for k in enough])
-    correlations = np.array([product[place == k].mean() for k in enough]) / scale
-    weights = np.sqrt([(place == k).sum() for k in enough])
+    lags = np.array([lag[own].mean() for own in enough])
+    correlations = np.array([product[own].mean() for own in enough]) / scale
+    weights = np.sqrt([own.sum() for own in enough])
     best = (np.inf, 0.0, 1.0)
     for time in TIMES:
         model = np.exp(-lags / time)

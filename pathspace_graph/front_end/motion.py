@@ -24,6 +24,7 @@ from .scan_matching import (
     by_errors,
     match,
     misfit_at,
+    off_prediction,
     reaches,
 )
 
@@ -115,7 +116,7 @@ class MotionCheck:
         motion = self._integrate(odometry, t)
         columns = by_errors(measured, motion.odometry.twist)
         detections = replace(detections, points_vehicle=measured + columns @ self.errors.mean)
-        variances = 0.5 * np.trace(detections.covariances, axis1=1, axis2=2)
+        variances = 0.5 * (detections.covariances[:, 0, 0] + detections.covariances[:, 1, 1])
         self._recent.forget(t)
         self._recent.correct(self.errors.mean)
         self._limit = DOUBT_AGAIN if t - self._doubted_at < DISTRUST else self.settings.doubt
@@ -240,9 +241,7 @@ class MotionCheck:
 
     def _denies(self, matched: Match, difference: Difference) -> bool:
         """Return whether a match of detections is too far off a motion."""
-        off, covariance = difference.off, self.errors.covariance_of(difference)
-        enough = matched.matched >= MIN_DOUBTING
-        return enough and bool(off @ np.linalg.solve(covariance, off) > self._limit**2)
+        return matched.matched >= MIN_DOUBTING and self.errors.square_of(difference) > self._limit**2
 
     def _match(
         self, detections: Detections, variances: Array, start: Array, reaches: Sequence[float]
@@ -253,14 +252,9 @@ class MotionCheck:
 
     def _difference(self, odometry: IntegratedOdometry, predicted: Array, matched: Match) -> Difference:
         """Return how far the detections are from the predicted pose (3,), in the vehicle's frame."""
-        turn = _to_vehicle(predicted[2])
-        spread = np.linalg.inv(matched.information) * self._excess
-        way = turn[:2, :2] @ (predicted[:2] - self._recent.seen_from)
-        return Difference(
-            off=turn @ (matched.pose - predicted),
-            covariance=turn @ spread @ turn.T + odometry.covariance,
-            shifts=self.errors.shifts(way, odometry.twist),
-        )
+        known = matched.pose, matched.information, self._excess, predicted, odometry.covariance
+        way = rotation(predicted[2]).T @ (predicted[:2] - self._recent.seen_from)
+        return Difference(*off_prediction(*known), self.errors.shifts(way, odometry.twist))
 
     @property
     def _excess(self) -> float:

@@ -96,7 +96,7 @@ class NoiseLearner:
         covariances = measured.covariances(points, inflated=False) if self.of_detections else None
         return replace(
             detections,
-            points_vehicle=replace(measured, sensor=measured.shown).corrected(points, twist),
+            points_vehicle=measured.corrected(points, twist, shown=True),
             covariances=detections.covariances if covariances is None else covariances,
         )
 

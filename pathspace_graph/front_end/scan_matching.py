@@ -126,8 +126,8 @@ class Match:
     @property
     def is_certain(self) -> bool:
         """Whether the detections hold the pose in every direction."""
-        share = np.linalg.det(self.information) / max(float(self.information.diagonal().prod()), _TINY)
-        return bool(share > LEAST_SHARE)
+        (w, _, a), (_, _, b), (_, _, turning) = self.information.tolist()  # of x and y: w times the identity
+        return bool(w * (w * turning - a * a - b * b) / max(w * w * turning, _TINY) > LEAST_SHARE)
 
 
 def match(
@@ -139,18 +139,11 @@ def match(
     the weighted mean of the recent detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) +
     SIGMA_CONE^2` with n_i the sum of the weights. The variances (m,) are those of one coordinate (m^2).
     """
-    pose = start.copy()
-    for reach in reaches:
-        limits = (FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE)
-        information, gradient, matched, cost = _matched(
-            recent.points, points_vehicle, variances, pose, reach, limits
-        )
-        if matched.sum() < MIN_MATCHED:
-            break
-        regular = information + np.diag(LEAST_SHARE * information.diagonal())
-        pose = pose - np.linalg.solve(regular, gradient)
-    count = int(matched.sum())
-    return Match(pose, information, matched, cost / max(count, 1))
+    limits = (FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE, MIN_MATCHED, LEAST_SHARE)
+    pose, information, matched, cost = _matched(
+        recent.points, points_vehicle, variances, start, reaches, limits
+    )
+    return Match(pose, information, matched, cost / max(int(matched.sum()), 1))
 
 
 @compiled
@@ -158,12 +151,36 @@ def _matched(
     recent: Array,
     points_vehicle: Array,
     variances: Array,
+    start: Array,
+    reaches: Sequence[float],
+    limits: tuple[float, ...],
+) -> tuple[Array, Array, BoolArray, float]:
+    """Return the pose (3,) of `match`, and of its last step what `_match_step` returns but the gradient.
+
+    The limits are FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE, MIN_MATCHED and LEAST_SHARE.
+    """
+    pose, (min_matched, least_share) = start.copy(), limits[4:]
+    for reach in reaches:
+        information, gradient, matched, cost = _match_step(
+            recent, points_vehicle, variances, pose, reach, limits
+        )
+        if matched.sum() < min_matched:
+            break
+        regular = information + np.diag(least_share * information.diagonal())
+        pose = pose - np.linalg.solve(regular, gradient)
+    return pose, information, matched, cost
+
+
+def _match_step(
+    recent: Array,
+    points_vehicle: Array,
+    variances: Array,
     pose: Array,
     reach: float,
-    limits: tuple[float, float, float, float],
+    limits: tuple[float, ...],
 ) -> tuple[Array, Array, BoolArray, float]:
     """Return information (3, 3), gradient (3,), which detections (m,) match, and their weighted cost."""
-    farthest, min_weight, huber, sigma_cone = limits
+    farthest, min_weight, huber, sigma_cone = limits[:4]
     points = to_map(points_vehicle, pose[None])
     means, weights = _weighted_means(points, recent, reach, farthest)
     matched = weights > min_weight
@@ -252,15 +269,19 @@ class SensorErrors:
         known = zip(self.mean.tolist(), self.covariance.diagonal().tolist(), ERRORS, strict=True)
         return any(mean**2 > limit * (variance + prior[at] ** 2) for mean, variance, at in known)
 
+    def follow(self, velocity: Array, dt: float) -> None:
+        """Take the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""
+        share = min(dt / (0.5 * MEMORY), 1.0)
+        self._velocity = self._velocity + share * (velocity - self._velocity)
+
     def covariance_of(self, difference: Difference) -> Array:
         """Return the covariance (3, 3) of a difference, with what is not known of the errors."""
         shifts = difference.shifts
         return np.asarray(difference.covariance + shifts @ self.covariance @ shifts.T)
 
-    def follow(self, velocity: Array, dt: float) -> None:
-        """Take the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""
-        share = min(dt / (0.5 * MEMORY), 1.0)
-        self._velocity = self._velocity + share * (velocity - self._velocity)
+    def square_of(self, difference: Difference) -> float:
+        """Return the square of a difference in standard deviations, by `covariance_of`."""
+        return _squared(difference.off, difference.covariance, difference.shifts, self.covariance)
 
     def shifts(self, way: Array, velocity: Array) -> Array:
         """Return the derivatives (3, 2) of how far a match is off the odometry, by the errors.
@@ -268,18 +289,50 @@ class SensorErrors:
         Way (2,) and velocity (3,) are in the vehicle frame (m, m/s, m/s, rad/s). Changes of the velocity
         beyond the accelerations of a vehicle are slip, and not latency.
         """
-        shifts = np.empty((3, len(ERRORS)))
-        shifts[:, 0] = way[1], -way[0], 0.0
-        shifts[:, 1] = np.clip(self._velocity - velocity, -self._possible, self._possible)
-        return shifts
+        off = np.minimum(np.maximum(self._velocity - velocity, -self._possible), self._possible)
+        (ahead, left), (x, y, turn) = way.tolist(), off.tolist()
+        return np.array([[left, x], [-ahead, y], [0.0, turn]])
 
     def update(self, difference: Difference, dt: float) -> None:
         """Learn from a match that agrees with the odometry, dt (s) after the last cycle.
 
         Matches share the remembered detections, so one counts by the share of its own time.
         """
-        shifts, share = difference.shifts, min(dt / MEMORY, 1.0)
-        weighted = share * np.linalg.solve(difference.covariance, shifts).T
-        information = np.linalg.inv(self.covariance + dt * self._drift) + weighted @ shifts
-        self.covariance = np.asarray(np.linalg.inv(information))
-        self.mean = self.mean + self.covariance @ weighted @ difference.off
+        measured = difference.off, difference.covariance, difference.shifts, min(dt / MEMORY, 1.0)
+        self.mean, self.covariance = _learned(self.mean, self.covariance, dt * self._drift, *measured)
+
+
+@compiled
+def off_prediction(
+    pose: Array,
+    information: Array,
+    excess: float,
+    predicted: Array,
+    covariance: Array,
+) -> tuple[Array, Array]:
+    """Return how far a match is off a predicted pose (3,), in its frame, and the covariance of that.
+
+    The variances of the detections are `excess` times what they claim, and the prediction has a covariance.
+    """
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(predicted[2]).T
+    return turn @ (pose - predicted), turn @ (excess * np.linalg.inv(information)) @ turn.T + covariance
+
+
+@compiled
+def _squared(off: Array, covariance: Array, shifts: Array, errors: Array) -> float:
+    """Return `d' (K + S P S')^-1 d` of an offset d (3,) with K (3, 3), S (3, 2) and P (2, 2)."""
+    return float(off @ np.linalg.solve(covariance + shifts @ errors @ shifts.T, off))
+
+
+@compiled
+def _learned(
+    mean: Array, errors: Array, drift: Array, off: Array, covariance: Array, shifts: Array, share: float
+) -> tuple[Array, Array]:
+    """Return mean (2,) and covariance (2, 2) of the errors after a measurement that counts by a share.
+
+    The errors have a covariance (2, 2), which has grown by the drift (2, 2).
+    """
+    weighted = share * np.linalg.solve(covariance, shifts).T
+    known = np.asarray(np.linalg.inv(np.linalg.inv(errors + drift) + weighted @ shifts))
+    return mean + known @ weighted @ off, known

@@ -1,6 +1,5 @@
 """Sightings of cones, followed by dead reckoning, and the twists of a drive: what noise is measured from."""
 
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from math import comb
@@ -17,6 +16,7 @@ from pathspace_graph.io.log import Detections, Odometry
 MAD: Final = 1.4826
 """Standard deviation of a Gaussian by its median absolute deviation."""
 MOST_TWISTS: Final = 4000
+MOST_PARTS: Final = 200
 MIN_SPEED_SHARE: Final = 0.3
 """Share of its median speed below which a vehicle says little of noise in motion."""
 MIN_TWISTS: Final = 30
@@ -27,6 +27,8 @@ MAX_AGE: Final = 3.0
 """Time without a sighting after which a cone counts as another one (s)."""
 GATE: Final = (0.4, 0.06, 1.5)
 """Gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m."""
+FOLLOWING: Final = (0.5, 0.15)
+"""Share by which a cone goes to where it is seen, and where it was seen from nearer before."""
 GATE_SIGMAS: Final = 3.5
 GATE_LEAST: Final = 0.4
 GATE_MOST: Final = 3.5
@@ -139,26 +141,14 @@ class Follower:
             self._by_bias = self._by_bias + np.array([-moved[1] * middle, moved[0] * middle, -(t - self._t)])
         self._pose, self._t = pose.copy(), t
 
-    def _nearest_cone(
-        self, points: Array, labels: IntArray, ranges: Array, pose: Array
-    ) -> tuple[IntArray, Array]:
-        """Return the nearest cone of the same label to each point (m, 2), and its square distance by gate."""
-        if len(self._points) == 0:
-            return np.zeros(len(points), np.intp), np.full(len(points), np.inf)
-        square = self._square(points, self._points, ranges, pose)
-        square[labels[:, None] != self._labels] = np.inf
-        nearest = square.argmin(axis=1)
-        return nearest, square[np.arange(len(points)), nearest]
-
-    def _square(self, points: Array, others: Array, ranges: Array, pose: Array) -> Array:
-        """Return the square (m, n) of the distances of points (m, 2) from others (n, 2) in their gates."""
+    def _gates(self, ranges: Array) -> tuple[Array, Array]:
+        """Return how far along and across its ray a detection (m,) may be from its cone (m)."""
         known = self._known
         if known.along is None or known.across is None:
-            along = across = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
-        else:
-            rays = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
-            along, across = (np.clip(gate, GATE_LEAST, GATE_MOST) for gate in rays)
-        return _gated_squares(points, others, pose[:2], along, across)
+            round_gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
+            return round_gate, round_gate
+        along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
+        return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
 
     def _assign(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float
@@ -167,35 +157,76 @@ class Follower:
 
         Several cameras may see a cone at once, and each counts: the best one alone would favour known errors.
         """
-        place, square = self._nearest_cone(points, labels, ranges, pose)
-        near = square < 1.0
-        rows = np.flatnonzero(near)
-        known, index, counts = np.unique(place[rows], return_inverse=True, return_counts=True)
-        mean, nearest = np.zeros((len(known), 2)), np.full(len(known), np.inf)
-        np.add.at(mean, index, points[rows] / counts[index, None])
-        np.minimum.at(nearest, index, ranges[rows])
-        weight = np.where(nearest <= self._nearest[known], 0.5, 0.15)
-        self._points[known] += weight[:, None] * (mean - self._points[known])
-        self._nearest[known] = np.minimum(self._nearest[known], nearest)
-        self._last[known] = t
-        new = np.flatnonzero(~near)
-        same = self._square(points[new], points[new], ranges[new], pose) < 1.0
-        same &= labels[new][:, None] == labels[new]
-        first = same.argmax(axis=1) if len(new) else new
-        is_first = first == np.arange(len(new))
-        own = is_first[first]
-        cones = self._count + np.cumsum(is_first) - 1
-        self._points = np.concatenate([self._points, points[new[is_first]]])
-        self._labels = np.concatenate([self._labels, labels[new[is_first]]])
-        self._nearest = np.concatenate([self._nearest, ranges[new[is_first]]])
-        self._last = np.concatenate([self._last, np.full(is_first.sum(), t)])
-        found = np.concatenate([self._cones[place[rows]], cones[first[own]]])
-        self._cones = np.concatenate([self._cones, cones[is_first]])
-        self._count += int(is_first.sum())
-        return np.concatenate([rows, new[own]]), found
+        count = len(self._cones)
+        place, self._points, self._nearest = _assigned(
+            points,
+            labels,
+            ranges,
+            pose[:2],
+            *self._gates(ranges),
+            self._points,
+            self._labels,
+            self._nearest,
+            FOLLOWING,
+        )
+        new = np.flatnonzero(place >= count)
+        own, first = np.unique(place[new], return_index=True)
+        first = new[first]
+        self._points = np.concatenate([self._points, points[first]])
+        self._labels = np.concatenate([self._labels, labels[first]])
+        self._nearest = np.concatenate([self._nearest, ranges[first]])
+        self._last = np.concatenate([self._last, np.full(len(first), t)])
+        self._cones = np.concatenate([self._cones, self._count + np.arange(len(own))])
+        self._count += len(own)
+        rows = np.concatenate([np.flatnonzero((place >= 0) & (place < count)), new])
+        self._last[place[rows]] = t
+        return rows, self._cones[place[rows]]
 
 
 @compiled
+def _assigned(
+    points: Array,
+    labels: IntArray,
+    ranges: Array,
+    place: Array,
+    along: Array,
+    across: Array,
+    known: Array,
+    known_labels: IntArray,
+    nearest: Array,
+    weights: tuple[float, float],
+) -> tuple[IntArray, Array, Array]:
+    """Return the cone of each detection at points (m, 2), and places and least ranges of the known cones.
+
+    A detection with gates along and across its ray (m,) from a place (2,) is of the nearest of the known
+    cones (n,) of its label in its gate. The others are new cones from n on, each of the first of those
+    beside it, or -1 where that one is not a cone of its own. A cone goes to its detections by the first of
+    the weights, or by the second where it was seen from nearer before.
+    """
+    index, least, moved = np.full(len(points), -1), nearest.copy(), known.copy()
+    if len(known):
+        square = _gated_squares(points, known, place, along, across)
+        square[labels[:, None] != known_labels] = np.inf
+        best = square.argmin(axis=1)
+        near = square[np.arange(len(points)), best] < 1.0
+        index[near] = best[near]
+    rows = np.flatnonzero(index >= 0)
+    own, inverse, counts = np.unique(index[rows], return_inverse=True, return_counts=True)
+    mean, closest = np.zeros((len(own), 2)), np.full(len(own), np.inf)
+    np.add.at(mean, inverse, points[rows] / counts[inverse, None])
+    np.minimum.at(closest, inverse, ranges[rows])
+    moved[own] += np.where(closest <= nearest[own], *weights)[:, None] * (mean - moved[own])
+    least[own] = np.minimum(nearest[own], closest)
+    new = np.flatnonzero(index < 0)
+    if len(new):
+        same = _gated_squares(points[new], points[new], place, along[new], across[new]) < 1.0
+        first = (same & (labels[new][:, None] == labels[new])).argmax(axis=1)
+        is_first = first == np.arange(len(new))
+        number = np.where(is_first, len(known) + np.cumsum(is_first) - 1, -1)
+        index[new] = number[first]
+    return index, moved, least
+
+
 def _gated_squares(points: Array, others: Array, place: Array, along: Array, across: Array) -> Array:
     """Return `(a_ij / along_i)^2 + (c_ij / across_i)^2` (m, n) of points (m, 2) and others (n, 2).
 
@@ -213,31 +244,22 @@ class TwistRecord:
     """Newest twists that were measured while the vehicle drove."""
 
     def __init__(self) -> None:
-        self._parts: deque[Odometry] = deque()
-        self._count = 0
+        self._parts: list[Odometry] = []
 
     def add(self, odometry: Odometry) -> None:
-        """Add twists; one that only repeats the one before is held, and not measured."""
-        t, twist = odometry.t, odometry.twist
-        if self._parts:
-            t = np.append(self._parts[-1].t[-1], t)
-            twist = np.concatenate([self._parts[-1].twist[-1:], twist])
-        new = (np.diff(t) > 0.0) & (np.diff(twist, axis=0) != 0.0).any(axis=1)
-        new = np.append(not self._parts, new) if len(t) else np.zeros(0, bool)
-        t, twist = t[new], twist[new]
-        if len(t) == 0:
-            return
-        self._parts.append(Odometry(t.copy(), twist.copy()))
-        self._count += len(t)
-        while self._count - len(self._parts[0].t) >= MOST_TWISTS:
-            self._count -= len(self._parts.popleft().t)
+        """Add twists."""
+        self._parts.append(odometry)
+        if len(self._parts) > MOST_PARTS:
+            self._parts = [Odometry(*self._newest)]
 
     @property
     def _newest(self) -> tuple[Array, Array]:
-        """Return the stamps (n,) and the twists (n, 3) that are kept."""
+        """Return the stamps (n,) and the twists (n, 3); one that only repeats the one before is held."""
         t = np.concatenate([np.zeros(0), *(part.t for part in self._parts)])
         twists = np.concatenate([np.zeros((0, 3)), *(part.twist for part in self._parts)])
-        return t[-MOST_TWISTS:], twists[-MOST_TWISTS:]
+        new = np.ones(len(t), bool)
+        new[1:] = (np.diff(t) > 0.0) & (np.diff(twists, axis=0) != 0.0).any(axis=1)
+        return t[new][-MOST_TWISTS:], twists[new][-MOST_TWISTS:]
 
     def white(self) -> tuple[Array, float] | None:
         """Return the white noise (3,) of a twist, and the time between two twists (s).

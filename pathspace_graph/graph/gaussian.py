@@ -218,15 +218,15 @@ def eliminate(
 
 
 def marginalize(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.GaussianFactorGraph:
-    """Return the graph with variables (k,) marginalized out, one after the other.
+    """Return the graph with variables (k,) marginalized out, several of them in a good order.
 
     Factors that hold none of them stay as they are. Keys that no factor holds are ignored.
     """
-    held = keys[np.isin(keys, keys_of(graph))] if len(keys) > 1 else keys
-    if len(held) == 0:
-        return graph
-    _, remaining = graph.eliminatePartialSequential(gtsam.Ordering(held.tolist()))
-    return remaining
+    if len(keys) == 1:
+        return graph.eliminatePartialSequential(gtsam.Ordering(keys.tolist()))[1]
+    held = keys_of(graph)
+    gone = np.isin(held, keys)
+    return sparse_marginal(graph, held[~gone]) if gone.any() else graph
 
 
 def sparse_marginal(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.GaussianFactorGraph:

@@ -56,7 +56,9 @@ class InactiveMap:
         self._old_anchors: IntArray = _NO_KEYS  # they were eliminated with the next conditional
         self._given: IntArray = _NO_KEYS  # active variables that the conditionals depend on
         self._shared: list[gtsam.GaussianFactor] = []
-        self._active: tuple[Layout, Layout] | None = None  # layouts of all and of the active variables
+        self._active: tuple[Layout, Layout, IntArray] | None = (
+            None  # of all, of the active ones, their columns
+        )
 
     def __len__(self) -> int:
         return int(self.net.size())
@@ -68,13 +70,19 @@ class InactiveMap:
 
     def active(self, layout: Layout) -> Layout:
         """Return the layout of the active variables, given that of all variables."""
-        if len(self.keys) == 0:
-            return layout
+        return layout if len(self.keys) == 0 else self._active_part(layout)[1]
+
+    def active_entries(self, layout: Layout) -> IntArray | slice:
+        """Return the columns that the active variables have in the layout of all variables."""
+        return slice(None) if len(self.keys) == 0 else self._active_part(layout)[2]
+
+    def _active_part(self, layout: Layout) -> tuple[Layout, Layout, IntArray]:
         if self._active is None or self._active[0] is not layout:
             active = np.ones(len(layout.keys), bool)
             active[layout.positions(self.keys)] = False
-            self._active = layout, Layout(layout.keys[active])
-        return self._active[1]
+            part = Layout(layout.keys[active])
+            self._active = layout, part, spread(layout.starts[active], part.widths)
+        return self._active
 
     def push(
         self,

@@ -16,6 +16,7 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, relative
 
 from .gaussian import (
@@ -56,11 +57,10 @@ class RelativeFactor:
         The origin of the map frame does not move, so the factor does not hold it.
         """
         keys = np.append(self.keys.keys, self.frame)
-        values, frame = variables.of(self.keys.keys), variables.of(keys[-1:])
-        by_keys, by_frame = rotations(self.keys, frame[2]).T, by_frame_of(values, frame, self.keys)
-        jacobian = self.root @ np.concatenate([by_keys, by_frame], axis=1)
-        residual = self.root @ (to_frame(values, frame, self.keys) - self.local) - self.right
-        now = variables.change(variables.layout.entries(keys))
+        entries = variables.layout.entries(keys)
+        values, columns = variables.values[entries], (self.keys.turning, self.keys.headings)
+        jacobian, residual = _relative_rows(self.root, self.right, self.local, values, *columns)
+        now = variables.change(entries)
         fixed = np.repeat(keys == ORIGIN_KEY, np.append(self.keys.widths, POSE))
         return jacobian_factor(keys[keys != ORIGIN_KEY], jacobian[:, ~fixed], jacobian @ now - residual)
 
@@ -97,6 +97,29 @@ def relative_factor(
     root, right = square_root_form(information[np.ix_(own, own)], vector)
     local = to_frame(variables.values[entries], pose, kept)
     return RelativeFactor(frame, kept, root @ rotations(kept, pose[2]), right, local)
+
+
+@compiled
+def _relative_rows(
+    root: Array, right: Array, local: Array, values: Array, turning: IntArray, headings: IntArray
+) -> tuple[Array, Array]:
+    """Return the derivatives (r, q + 3) and residuals (r,) of a relative factor.
+
+    The values (q + 3,) are those of its variables and then of the frame. The columns of points and poses and
+    those of headings are as in a `Layout`.
+    """
+    frame, c, s = values[-POSE:], np.cos(values[-1]), np.sin(values[-1])
+    by_all, there = np.zeros((len(local), len(values))), values[:-POSE].copy()
+    by_all[np.arange(len(local)), np.arange(len(local))] = 1.0
+    x, y = turning, turning + 1
+    dx, dy = there[x] - frame[0], there[y] - frame[1]
+    there[x], there[y] = c * dx + s * dy, -s * dx + c * dy
+    there[headings] -= frame[2]
+    by_all[x, x], by_all[x, y], by_all[y, x], by_all[y, y] = c, s, -s, c
+    by_all[x, -3], by_all[x, -2], by_all[x, -1] = -c, -s, there[y]
+    by_all[y, -3], by_all[y, -2], by_all[y, -1] = s, -c, -there[x]
+    by_all[headings, -1] = -1.0
+    return root @ by_all, root @ (there - local) - right
 
 
 # --- coordinates in the frame of a pose ------------------------------------------------------------------

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -66,21 +67,18 @@ class Rows:
         """Return which of a row's keys each derivative (n,) is by, and which entry of its variable."""
         return _pattern(self.widths)
 
-    @property
+    @cached_property
     def widths(self) -> tuple[int, ...]:
         """Return the widths (k,) of each row's variables."""
         return tuple([_width(letter) for letter in (self.keys[0] >> INDEX_BITS).tolist()])
 
+    def places(self, layout: Layout) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
+        """Return what tells the column of each derivative: the arguments of `_columns_of`."""
+        return layout.keys, layout.starts, self.keys, *self.pattern
+
     def columns(self, layout: Layout) -> IntArray:
         """Return the column (m, n) of each derivative, which is UNKNOWN where a key is not in the layout."""
-        return _columns_of(layout.keys, layout.starts, self.keys, *self.pattern)
-
-    def columns_in(self, layout: Layout) -> IntArray:
-        """Return the column (m, n) of each derivative; ValueError where the layout does not hold a key."""
-        columns = self.columns(layout)
-        if (columns == UNKNOWN).any():
-            layout.places(self.keys)  # raises the error
-        return columns
+        return _columns_of(*self.places(layout))
 
 
 @cache
@@ -99,6 +97,16 @@ def _columns_of(
     return np.where(begin == UNKNOWN, UNKNOWN, begin + entry)
 
 
+def _known_columns(
+    keys: IntArray, starts: IntArray, sought: IntArray, key: IntArray, entry: IntArray
+) -> IntArray:
+    """Return `_columns_of`; ValueError where a key is UNKNOWN."""
+    columns = _columns_of(keys, starts, sought, key, entry)
+    if (columns == UNKNOWN).any():
+        raise ValueError("expected rows on known variables, found others")
+    return columns
+
+
 @cache
 def _pattern(widths: tuple[int, ...]) -> tuple[IntArray, IntArray]:
     return np.repeat(np.arange(len(widths)), widths), np.concatenate([np.arange(width) for width in widths])
@@ -106,14 +114,29 @@ def _pattern(widths: tuple[int, ...]) -> tuple[IntArray, IntArray]:
 
 def at_reference(groups: Sequence[Rows], variables: Variables) -> list[Rows]:
     """Return rows linearized at the variables' values as `J d + r` with d = value - reference."""
-    change = variables.values - variables.reference
+    change, layout = variables.values - variables.reference, variables.layout
     moved = []
     for rows in groups:
         if len(rows):
-            by_change = rows.jacobian * change[rows.columns_in(variables.layout)]
-            residual = rows.residual - by_change.sum(axis=1)
+            residual = _moved_residual(*rows.places(layout), rows.jacobian, rows.residual, change)
             moved.append(Rows(rows.keys, rows.jacobian, residual, rows.owner))
     return moved
+
+
+@compiled
+def _moved_residual(
+    keys: IntArray,
+    starts: IntArray,
+    sought: IntArray,
+    key: IntArray,
+    entry: IntArray,
+    jacobian: Array,
+    residual: Array,
+    change: Array,
+) -> Array:
+    """Return `r - J c` (m,) with c the change (n,) in the columns that `_known_columns` finds."""
+    columns = _known_columns(keys, starts, sought, key, entry)
+    return np.asarray(residual - (jacobian * change[columns]).sum(axis=1))
 
 
 def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.GaussianConditional]:
@@ -155,7 +178,7 @@ class KeptRows:
 
     def __init__(self) -> None:
         self.groups: list[Rows] = []
-        """Rows on variables of the same widths are one group."""
+        """Rows on variables of the same widths are one group, which is not empty."""
 
     @property
     def owners(self) -> IntArray:
@@ -164,7 +187,7 @@ class KeptRows:
 
     def holding(self, keys: IntArray) -> IntArray:
         """Return the owners of rows that hold any of some ascending keys (k,)."""
-        of_groups = (rows.owner[among(rows.keys, keys).any(axis=1)] for rows in self.groups)
+        of_groups = (rows.owner[_rows_holding(rows.keys, keys)] for rows in self.groups)
         return np.concatenate([np.zeros(0, np.intp), *of_groups])
 
     def replace(self, owners: IntArray, groups: Sequence[Rows], variables: Variables) -> None:
@@ -180,18 +203,13 @@ class KeptRows:
 
     def drop(self, owners: IntArray) -> list[Rows]:
         """Drop the rows of some owners, and return them."""
-        ascending, dropped, kept = np.sort(owners), [], []
-        for rows in self.groups:
-            own = among(rows.owner, ascending)
-            if own.all():
-                dropped.append(rows)
-            elif own.any():
-                dropped.append(rows.where(own))
-                kept.append(rows.where(~own))
-            else:
-                kept.append(rows)
-        self.groups = kept
-        return dropped
+        ascending, both = np.sort(owners), []
+        for rows in self.groups if len(owners) else ():
+            parts = _parted(rows.keys, rows.jacobian, rows.residual, rows.owner, ascending)
+            both.append((Rows(*parts[:4]), Rows(*parts[4:])))
+        if both:
+            self.groups = [kept for kept, _ in both if len(kept)]
+        return [dropped for _, dropped in both if len(dropped)]
 
     def pop(self, owner: int, layout: Layout) -> gtsam.GaussianConditional:
         """Remove the rows of an owner and return them as a factor."""
@@ -204,6 +222,21 @@ def among(keys: IntArray, ascending: IntArray) -> BoolArray:
     if len(ascending) == 0:
         return np.zeros(keys.shape, bool)
     return np.asarray(ascending.take(ascending.searchsorted(keys), mode="clip") == keys)
+
+
+@compiled
+def _rows_holding(keys: IntArray, ascending: IntArray) -> BoolArray:
+    """Return which rows (m,) hold any of some ascending keys, given the keys (m, k) of each."""
+    return np.asarray(among(keys, ascending).any(axis=1))
+
+
+@compiled
+def _parted(
+    keys: IntArray, jacobian: Array, residual: Array, owner: IntArray, gone: IntArray
+) -> tuple[Any, ...]:
+    """Return the columns of rows without those of some ascending owners, and then those of the latter."""
+    own, columns = among(owner, gone), (keys, jacobian, residual, owner)
+    return *(column[~own] for column in columns), *(column[own] for column in columns)
 
 
 def stacked_rows(groups: Sequence[Rows]) -> Rows:
@@ -229,11 +262,9 @@ def newton_system(
     if graph.size():
         own = Layout(keys_of(graph))
         entries = spread(layout.starts[layout.places(own.keys)], own.widths)
-        information, vector = graph.hessian(own.ordering)
-        hessian[np.ix_(entries, entries)] = information
-        gradient[entries] = vector - information @ change[entries]
+        add_prior(hessian, gradient, *graph.hessian(own.ordering), entries, change)
     for rows in groups:
-        add_rows(hessian, gradient, rows.columns_in(layout), rows.jacobian, rows.residual, change)
+        add_rows(hessian, gradient, *rows.places(layout), rows.jacobian, rows.residual, change)
     missing = layout.keys[hessian.diagonal()[layout.starts] == 0.0]
     if len(missing):
         raise SingularSystemError(f"expected a factor on every variable, found none on {names(missing)}")
@@ -241,13 +272,36 @@ def newton_system(
 
 
 @compiled
+def add_prior(
+    hessian: Array, gradient: Array, information: Array, vector: Array, entries: IntArray, change: Array
+) -> None:
+    """Add L (m, m) to the lower triangle of a Hessian (n, n), and `g - L d` to a negative gradient (n,).
+
+    They are on ascending entries (m,), and the unknowns d are `change` (n,) now.
+    """
+    hessian[np.ix_(entries, entries)] += information
+    gradient[entries] += vector - information @ change[entries]
+
+
+@compiled
 def add_rows(
-    hessian: Array, gradient: Array, columns: IntArray, jacobian: Array, residual: Array, change: Array
+    hessian: Array,
+    gradient: Array,
+    keys: IntArray,
+    starts: IntArray,
+    sought: IntArray,
+    key: IntArray,
+    entry: IntArray,
+    jacobian: Array,
+    residual: Array,
+    change: Array,
 ) -> None:
     """Add `J'J` to the lower triangle of a Hessian (n, n), and `-J'(J d + r)` to a negative gradient (n,).
 
-    Derivatives J (m, k) are by the unknowns d of some columns (m, k), which are `change` (n,) now.
+    Derivatives J (m, k) are by the unknowns d in the columns that `_known_columns` finds, which are `change`
+    (n,) now.
     """
+    columns = _known_columns(keys, starts, sought, key, entry)
     A = np.zeros((len(jacobian), len(gradient)))
     A[np.arange(len(jacobian))[:, None], columns] = jacobian
     hessian += A.T @ A

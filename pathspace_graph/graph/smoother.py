@@ -133,7 +133,7 @@ class FixedLagSmoother(Generic[M_co]):
 
     def add_pose(self, t: float, pose: Array, odometry: IntegratedOdometry) -> None:
         """Add the next pose (3,) at t (s), and the odometry that leads to it."""
-        self.window.measured.drop(np.array([self.next_cycle - 1]))
+        self.window.lengthened = self.next_cycle - 1
         self.variables.insert(pose_keys(np.array([self.next_cycle])), pose)
         self.times.append(t)
         self.window.odometry.append(odometry)
@@ -188,7 +188,7 @@ class FixedLagSmoother(Generic[M_co]):
         """Take one Gauss-Newton step; `sigma_step` (m) damps it as a prior on the motion of map points."""
         negative_gradient = self.factorize(sigma_step)
         assert self.last_step is not None
-        entries = self.variables.layout.entries(self.last_step.layout.keys)
+        entries = self.inactive.active_entries(self.variables.layout)
         self.variables.values[entries] += solve(self.last_step.factor, negative_gradient)
         self.map.correct()
 
@@ -202,7 +202,7 @@ class FixedLagSmoother(Generic[M_co]):
         user, layout = self.user_factors.linearized(self.variables), self.layout
         held = self.chain.hold(self.variables) if self.chain is not None else []
         graph = graph_of(self.prior, *user, *held) if user or held else self.prior
-        change = self.variables.change(self.variables.layout.entries(layout.keys))
+        change = self.variables.change(self.inactive.active_entries(self.variables.layout))
         hessian, negative_gradient = newton_system(graph, self.window.groups, layout, change)
         if sigma_step is not None:
             first, last = layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start
@@ -257,8 +257,12 @@ class FixedLagSmoother(Generic[M_co]):
         if whole and self.chain is not None:
             marginal = sparse_marginal(self.linear_graph(True), keys)
             return factorize(marginal, Layout(np.sort(keys))).covariance(keys)
-        layout = self.variables.layout if whole else self.layout
-        return factorize(self.linear_graph(whole), layout).covariance(keys)
+        if whole:
+            return factorize(self.linear_graph(whole), self.variables.layout).covariance(keys)
+        graph = graph_of(self.absolute_prior(), *self.user_factors.linearized(self.variables))
+        layout, rows = self.layout, self.window.fresh_rows(self._cycles)
+        hessian, _ = newton_system(graph, rows, layout, np.zeros(layout.size))
+        return FactoredSystem(layout, cholesky(hessian)).covariance(keys)
 
     def predicted_covariance(self, rows: Rows, together: int = 1) -> Array:
         """Return `rows.predicted_covariance` (m / k, k, k) of every k = `together` rows in the last step."""

@@ -68,6 +68,11 @@ _FIRST_LANDMARK: Final = letter_keys(LANDMARK_LETTER)[0]
 _FIRST_CONTROL: Final = tuple(letter_keys(letter)[0] for letter in CONTROL_LETTERS)
 
 
+_LETTERS: Final = (CALIBRATION_LETTER, SENSOR_LETTER, *CONTROL_LETTERS, LANDMARK_LETTER, POSE_LETTER)
+_LETTER_ENDS: Final = np.array([letter_keys(letter) for letter in _LETTERS], np.intp).ravel()
+_LETTER_PLACES: Final = {letter: 2 * k for k, letter in enumerate(_LETTERS)}
+
+
 def pose_key(cycle: int) -> int:
     """Return the key `symbol('x', cycle)` of the pose at a perception cycle, counted from 0."""
     return FIRST_POSE + int(cycle)
@@ -100,7 +105,8 @@ def are_poses(keys: IntArray) -> BoolArray:
 
 def sizes(keys: IntArray) -> IntArray:
     """Return the number of entries of each key's variable, which its letter determines."""
-    return np.where(are_poses(keys), POSE, np.where(keys == SENSOR_KEY, SENSOR_SIZE, POINT))
+    wider = (POSE - POINT) * are_poses(keys) + (SENSOR_SIZE - POINT) * (keys == SENSOR_KEY)
+    return np.asarray(POINT + wider)
 
 
 def name(key: int) -> str:
@@ -133,7 +139,6 @@ class Layout:
         self.starts: IntArray = ends - self.widths
         """Each key begins at this column (K,)."""
         self.size = int(ends[-1]) if len(keys) else 0
-        self._blocks: dict[str, slice] = {}
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
@@ -179,9 +184,12 @@ class Layout:
 
     def block(self, letter: str) -> slice:
         """Return the columns of all keys of a letter."""
-        if letter not in self._blocks:
-            self._blocks[letter] = slice(*(self.begin(key) for key in letter_keys(letter)))
         return self._blocks[letter]
+
+    @cached_property
+    def _blocks(self) -> dict[str, slice]:
+        begins = np.append(self.starts, self.size)[self.keys.searchsorted(_LETTER_ENDS)].tolist()
+        return {letter: slice(*begins[k : k + 2]) for letter, k in _LETTER_PLACES.items()}
 
     def begin(self, key: int) -> int:
         """Return the first column of a key, or where it would be if the layout held the key."""
@@ -288,7 +296,7 @@ class Variables:
         """Return a copy of the values (n,) of keys (k,), one after the other."""
         return self.values[self.layout.entries(keys)]
 
-    def change(self, columns: IntArray) -> Array:
+    def change(self, columns: IntArray | slice) -> Array:
         """Return `value - reference`, the unknowns, at some entries."""
         return np.asarray(self.values[columns] - self.reference[columns])
 

@@ -117,6 +117,8 @@ class WindowFactors(Generic[M_co]):
         """Odometry between each pose of the window and the next."""
         self.exact = False
         """If true, the tolerances are zero: factors of all variables that moved are linearized again."""
+        self.lengthened = -1
+        """Cycle of the newest pose until the odometry led on from it, whose rows lack that odometry."""
         self.measured = KeptRows()
         """Rows of detections, and of the odometry to the next cycle, by perception cycle."""
         self.gauge = KeptRows()
@@ -130,6 +132,11 @@ class WindowFactors(Generic[M_co]):
     def groups(self) -> list[Rows]:
         """Return all rows as they were linearized last, `J d + r` with d = value - reference."""
         return [*self.measured.groups, *self.gauge.groups, *self.linear_gauge.groups]
+
+    def fresh_rows(self, cycles: IntArray) -> list[Rows]:
+        """Return the rows of some cycles and the weak priors on the active map points, as `fresh` does."""
+        weak = [*self.map.gauge(False), *self.map.linear_gauge(False)]
+        return at_reference([*self._rows(cycles), *weak], self.variables)
 
     def fresh(self, cycles: IntArray, whole: bool) -> list[gtsam.GaussianFactor]:
         """Return factors of some cycles and weak priors, linearized at the variables' values.
@@ -159,6 +166,7 @@ class WindowFactors(Generic[M_co]):
         if self.map.reached_inactive or any(among(rows.keys, inactive).any() for rows in groups):
             return False
         self.measured.replace(stale, groups, self.variables)
+        self.lengthened = -1
         self.map.linearized(stale)
         self._relinearize_gauge(moved)
         entries = self.variables.layout.entries(moved)
@@ -193,9 +201,9 @@ class WindowFactors(Generic[M_co]):
         return layout.keys[np.logical_or.reduceat(moved, layout.starts)]
 
     def _stale(self, cycles: IntArray, moved: IntArray) -> IntArray:
-        stale = ~among(cycles, np.sort(self.measured.owners))
+        stale = ~among(cycles, np.sort(self.measured.owners)) | (cycles == self.lengthened)
         stale |= among(cycles, np.sort(np.append(self.map.changed(), self.measured.holding(moved))))
-        return cycles[stale]
+        return np.asarray(cycles[stale])
 
     def _relinearize_gauge(self, moved: IntArray) -> None:
         if self.map.structure is not self._structure:

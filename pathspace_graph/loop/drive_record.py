@@ -7,6 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from functools import cache
+from math import nan
 from multiprocessing import current_process
 from threading import Thread
 from typing import Any, Final, cast
@@ -85,7 +86,7 @@ class DriveRecord:
         self._motions: list[MeasuredMotion] = []
         self._detections: list[Detections] = []
         self._orange: list[Detections] = []
-        self._beside: dict[int, list[tuple[float, int]]] = {}  # parameter on each curve, and cycle
+        self._beside: dict[int, list[float]] = {}  # parameter on each curve by cycle, NaN before it
         self._reckoned: list[Array] = []
         self._prepared = False
 
@@ -123,7 +124,7 @@ class DriveRecord:
     def estimated(self, state: State) -> None:
         """Add the newest pose, and its parameter on each of the curves."""
         for label in state.boundaries:
-            self._beside.setdefault(label, []).append((float(state.pose_u[label][-1]), len(self.poses)))
+            self._beside.setdefault(label, [nan] * len(self.poses)).append(float(state.pose_u[label][-1]))
         self.poses.append(_kept(state.poses[-1].copy()))
 
     def followed(self, newest: Array) -> None:
@@ -161,7 +162,7 @@ class DriveRecord:
     def recurrence_since(self, place: RecognizedPlace) -> Recurrence:
         """Return the recurrence of the path driven since the vehicle was at a place before."""
         poses, (label, u) = np.array(self._reckoned), next(iter(place.beside.items()))
-        _, before = min(self._beside[label], key=lambda at: abs(at[0] - u))
+        before = int(np.nanargmin(np.abs(np.array(self._beside[label]) - u)))
         driven = path_lengths(poses)
         turn = float(poses[-1, 2] - poses[before, 2])
         return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)

@@ -106,6 +106,8 @@ class Contradictions:
             if len(chosen) < CONES:
                 continue
             chosen = chosen[_is_new(loop, label, tracks.points[chosen])]
+            if len(chosen) < CONES:
+                continue
             chosen = chosen[self._undisputed(label, chosen)]
             points, passed = tracks.points[chosen], tracks.last_t[chosen] < t - SETTLE
             for row in in_rows(points, ROW):

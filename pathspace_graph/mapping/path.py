@@ -115,9 +115,9 @@ class DrivenPath:
         """Update the curvature by `w / v` of body twists (k, 3), if the vehicle is fast enough."""
         if len(twists) == 0:
             return
-        speed, _, rate = twists.mean(axis=0)
+        speed, _, rate = (twists.sum(axis=0) / len(twists)).tolist()
         if speed > MIN_SPEED:
-            now = float(np.clip(rate / speed, -MAX_CURVATURE, MAX_CURVATURE))
+            now = min(max(rate / speed, -MAX_CURVATURE), MAX_CURVATURE)
             self.curvature += CURVATURE_GAIN * (now - self.curvature)
 
     def ahead(self, pose: Array, reach: float) -> PathAhead:

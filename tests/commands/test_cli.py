@@ -21,7 +21,6 @@ from pathspace_graph.io.log import Detections, Log, read_log, write_log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
-from pathspace_graph.options import one_line
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.paths import TRACKS

@@ -15,7 +15,14 @@ from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
 from pathspace_graph.factors.footpoint import joint_foot_points, refine_joint_foot_points
 from pathspace_graph.factors.kernels import _KERNELS, COMPILED, IN_NUMPY, NUMPY_ONLY
 
-for _module in ("front_end.scan_matching", "front_end.sightings", "graph.rows", "mapping.path"):
+for _module in (
+    "front_end.gate",
+    "front_end.scan_matching",
+    "front_end.sightings",
+    "graph.relative",
+    "graph.rows",
+    "mapping.path",
+):
     import_module(f"pathspace_graph.{_module}")  # each registers its functions
 
 Arguments = Callable[[np.random.Generator], tuple[Any, ...]]
@@ -34,11 +41,42 @@ def covariances(rng: np.random.Generator) -> np.ndarray:
     return roots @ roots.transpose(0, 2, 1)
 
 
+def information(rng: np.random.Generator, size: int) -> np.ndarray:
+    root = rng.normal(size=(size, size))
+    return root @ root.T + np.eye(size)
+
+
 def rows_of_a_system(rng: np.random.Generator) -> tuple[Any, ...]:
-    columns = np.array([rng.permutation(30)[:6] for _ in range(COUNT)], np.intp).reshape(COUNT, 6)
     hessian = np.asfortranarray(np.zeros((30, 30)))
-    jacobian, residual = rng.normal(size=(COUNT, 6)), rng.normal(size=COUNT)
-    return hessian, rng.normal(size=30), columns, jacobian, residual, rng.normal(size=30)
+    return hessian, rng.normal(size=30), *rows_with_keys(rng), rng.normal(size=30)
+
+
+def rows_with_keys(rng: np.random.Generator) -> tuple[Any, ...]:
+    """Rows on three of ten variables of three unknowns; neighbouring rows share their first key."""
+    keys = np.sort(rng.choice(1000, 10, replace=False))
+    sought = np.array([rng.permutation(10)[:3] for _ in range(COUNT)], np.intp).reshape(COUNT, 3)
+    sought[1::3] = sought[: len(sought) - 1 : 3]
+    pattern = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
+    return (
+        keys,
+        np.arange(0, 30, 3),
+        keys[sought],
+        *pattern,
+        rng.normal(size=(COUNT, 9)),
+        rng.normal(size=COUNT),
+    )
+
+
+def prior_of_a_system(rng: np.random.Generator) -> tuple[Any, ...]:
+    hessian, entries = np.asfortranarray(np.zeros((30, 30))), np.sort(rng.choice(30, 12, replace=False))
+    information = rng.normal(size=(12, 12))
+    rest = rng.normal(size=12), entries, rng.normal(size=30)
+    return hessian, rng.normal(size=30), np.asfortranarray(information @ information.T), *rest
+
+
+def kept_rows(rng: np.random.Generator) -> tuple[Any, ...]:
+    keys, owner = rng.integers(0, 50, (COUNT, 4)), rng.integers(0, 9, COUNT)
+    return keys, rng.normal(size=(COUNT, 7)), rng.normal(size=COUNT), owner, np.array([2, 3, 7])
 
 
 def some_columns(rng: np.random.Generator) -> tuple[Any, ...]:
@@ -62,6 +100,10 @@ def scan(rng: np.random.Generator) -> tuple[Any, ...]:
 
 CASES: dict[str, Arguments] = {
     "add_rows": rows_of_a_system,
+    "add_prior": prior_of_a_system,
+    "moved_residual": lambda rng: (*rows_with_keys(rng), rng.normal(size=30)),
+    "parted": kept_rows,
+    "rows_holding": lambda rng: (rng.integers(0, 50, (COUNT, 4)), np.array([2, 3, 7, 20])),
     "columns_of": some_columns,
     "spread": lambda rng: (rng.integers(0, 99, COUNT), rng.integers(0, 4, COUNT)),
     "by_sensor": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng)),
@@ -72,12 +114,52 @@ CASES: dict[str, Arguments] = {
     "odometry_residuals": lambda rng: (poses(rng), poses(rng), poses(rng), 1e-3),
     "integrated": lambda rng: (rng.uniform(0.0, 0.1, COUNT), poses(rng), rng.uniform(0.1, 0.2, (COUNT, 3))),
     "weighted_means": lambda rng: (*rng.normal(size=(2, COUNT, 2)), 0.6, 3.0),
-    "matched": lambda rng: (*scan(rng), 1.0, (3.0, 0.7, 2.5, 0.05)),
-    "gated_squares": lambda rng: (
-        *rng.normal(size=(2, COUNT, 2)),
+    "matched": lambda rng: (*scan(rng), [1.0, 0.7], (3.0, 0.7, 2.5, 0.05, 3, 1e-6)),
+    "assigned": lambda rng: (
+        6.0 * rng.normal(size=(COUNT, 2)),
+        rng.integers(0, 2, COUNT),
+        rng.uniform(1.0, 9.0, COUNT),
         rng.normal(size=2),
-        *rng.uniform(1.0, 2.0, (2, COUNT)),
+        *rng.uniform(1.0, 3.0, (2, COUNT)),
+        6.0 * rng.normal(size=(COUNT // 2, 2)),
+        rng.integers(0, 2, COUNT // 2),
+        rng.uniform(1.0, 9.0, COUNT // 2),
+        (0.5, 0.15),
     ),
+    "off_prediction": lambda rng: (
+        poses(rng, 1)[0],
+        information(rng, 3),
+        1.2,
+        poses(rng, 1)[0],
+        information(rng, 3),
+    ),
+    "relative_rows": lambda rng: (
+        rng.normal(size=(COUNT, 9)),
+        rng.normal(size=COUNT),
+        *(rng.normal(size=size) for size in (9, 12)),
+        np.array([2, 4, 6]),
+        np.array([8]),
+    ),
+    "squared": lambda rng: (
+        rng.normal(size=3),
+        information(rng, 3),
+        rng.normal(size=(3, 2)),
+        information(rng, 2),
+    ),
+    "learned": lambda rng: (
+        rng.normal(size=2),
+        *(information(rng, 2) for _ in range(2)),
+        rng.normal(size=3),
+        information(rng, 3),
+        rng.normal(size=(3, 2)),
+        0.3,
+    ),
+    "usable": lambda rng: (
+        rng.normal(size=(COUNT, 2)),
+        covariances(rng) * rng.choice([1.0, -1.0], (COUNT, 1, 1)),
+        (0.5, 2.0, 1e-6, 1e-2, 0.3, 1.5),
+    ),
+    "whitener": lambda rng: (information(rng, 3), 1e-3),
 }
 SEARCHES = {"searched", "refined"}
 
@@ -132,7 +214,7 @@ def test_every_compiled_function_is_tested() -> None:
         ("to_map", lambda rng: (np.zeros((0, 2)), poses(rng, 1))),
         ("detection_rows", lambda rng: detections(rng, 0)),
         ("odometry_residuals", lambda rng: (poses(rng), poses(rng), 1e-5 * poses(rng), 1e-3)),
-        ("matched", lambda rng: (np.zeros((0, 2)), *scan(rng)[1:], 1.0, (3.0, 0.7, 2.5, 0.05))),
+        ("matched", lambda rng: (np.zeros((0, 2)), *scan(rng)[1:], [1.0], (3.0, 0.7, 2.5, 0.05, 3, 1e-6))),
         ("integrated", lambda rng: (np.full(3, 0.1), np.zeros((3, 3)), np.full((3, 3), 0.1))),
     ],
 )
@@ -198,7 +280,7 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="shapes that fit"):
         _KERNELS.to_map(np.zeros((3, 2)), np.zeros((2, 3)))
     with pytest.raises(TypeError):  # the Hessian is changed in place, so a copy of it would be lost
-        _KERNELS.add_rows(np.zeros((2, 3)), *[np.zeros(2)] * 5)
+        _KERNELS.add_rows(np.zeros((2, 3)), *[np.zeros(2)] * 9)
 
 
 def test_the_environment_keeps_the_compiled_versions_out() -> None:
