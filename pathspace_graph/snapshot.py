@@ -54,7 +54,7 @@ Bytes = NDArray[np.uint8]
 FORMAT: Final = "pathspace-snapshot/2"
 PACKAGE: Final = "pathspace_graph."
 ROOMS: Final = (
-    *("batch", "ckf", "factors", "front_end", "graph", "health", "io.log", "landmark", "loop", "mapping"),
+    *("baselines", "batch", "factors", "front_end", "graph", "health", "io.log", "loop", "mapping"),
     *("online", "scale", "settings", "spline"),
 )
 """Rooms and modules whose classes estimators are made of."""
