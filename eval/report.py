@@ -39,13 +39,16 @@ PAGES: Final = {
     "readme-accuracy": "README.md",
     "readme-compared": "README.md",
     "readme-speed": "README.md",
+    "results-tracks": "docs/results.md",
+    "results-laps": "docs/results.md",
+    "results-compared": "docs/results.md",
     "skidpad": "docs/closing.md",
     "camera": "docs/studies.md",
     "faults": "docs/reliability.md",
 }
 """Page of each table, from the root of the project."""
 ROOMS: Final = (
-    *("batch", "centerline", "ckf", "factors", "front_end", "graph", "landmark", "loop", "mapping", "online"),
+    *("baselines", "batch", "factors", "front_end", "graph", "loop", "mapping", "online"),
     *("scale", "settings", "sim", "spline"),
 )
 """Rooms whose sources the figures depend on."""
@@ -64,6 +67,11 @@ SPEED: Final = {
     "closing": "the update that closes the loop [ms]",
 }
 """Figures of the benchmark, each with its label."""
+COMPARED: Final = (
+    *("missed_2m", "missed_1m", "rmse_capped", "mapped_to_truth", "truth_to_mapped", "ghost_landmarks"),
+    *("ghost_metres", "along", "across", "nees", "inside", "closed", "bytes", "bytes_covariance"),
+)
+"""Metrics of the wider comparison."""
 FAULTS: Final = {
     "rmse by clean": ("ratio_mean", 2),
     "least": ("ratio_min", 2),
@@ -167,7 +175,13 @@ class Plan:
         estimators, seeds, laps = (ESTIMATORS[:3], (0, 1), 2) if self.quick else (ESTIMATORS, (0, 1, 2), 5)
         study = Study(name="accuracy", tracks=tracks, estimators=estimators, seeds=seeds, laps=laps)
         frame = self._run(study, folder)
-        return {"readme-accuracy": accuracy_table(frame, laps), "readme-compared": compared_table(frame)}
+        return {
+            "readme-accuracy": accuracy_table(frame, laps),
+            "readme-compared": compared_table(frame),
+            "results-tracks": tracks_table(frame),
+            "results-laps": laps_table(frame),
+            "results-compared": metrics_table(frame),
+        }
 
     def skidpad(self, folder: Path) -> Views:
         """Drive the skidpad, which has no lap."""
@@ -231,6 +245,49 @@ def compared_table(frame: pd.DataFrame) -> View:
     """Return every estimator at the end of its last lap."""
     keys = {"rmse": "rmse [m]", "missed": "missed [%]", "size": "size", "ate": "trajectory error [m]"}
     return ("estimator, last lap", *keys.values()), _by_estimator(frame, tuple(keys))
+
+
+def tracks_table(frame: pd.DataFrame) -> View:
+    """Return the online map and that of the batch, track by track."""
+    online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
+    first, last = online[online["lap"] == 1], last_laps(online)
+    columns = {
+        "rmse, lap 1 [m]": ("rmse", first),
+        "rmse, last lap [m]": ("rmse", last),
+        "rmse, batch [m]": ("rmse", last_laps(batch)),
+        "missed, lap 1 [%]": ("missed", first),
+        "size [% of cones]": ("size_share", last),
+        "within 2σ [%]": ("inside", last),
+        "NEES": ("nees", last),
+    }
+    rows = tuple(
+        (str(track), tuple(_figure(key, part[part["track"] == track]) for key, part in columns.values()))
+        for track in frame["track"].unique()
+    )
+    return ("track", *columns), rows
+
+
+def laps_table(frame: pd.DataFrame) -> View:
+    """Return the rmse of every online estimator after each lap."""
+    online = frame[frame["lap"] > 0]
+    names = [name for name in ESTIMATORS if online[online["estimator"] == name]["lap"].nunique() > 1]
+    rows = tuple(
+        (str(lap), tuple(_figure("rmse", part[part["estimator"] == name]) for name in names))
+        for lap, part in online.groupby("lap")
+    )
+    return ("rmse after lap [m]", *(f"`{name}`" for name in names)), rows
+
+
+def metrics_table(frame: pd.DataFrame) -> View:
+    """Return further metrics of every estimator at the end of its last lap."""
+    last = last_laps(frame)
+    parts = {
+        name: last[last["estimator"] == name] for name in ESTIMATORS if (last["estimator"] == name).any()
+    }
+    rows = tuple(
+        (METRICS[key].heading, tuple(_figure(key, part) for part in parts.values())) for key in COMPARED
+    )
+    return ("last lap", *(f"`{name}`" for name in parts)), rows
 
 
 def skidpad_table(frame: pd.DataFrame) -> View:
