@@ -143,7 +143,7 @@ def _names(command: type[Any]) -> Iterator[str]:
         if is_dataclass(hints[entry.name]):
             names = [f"{prefix}{leaf}" for leaf in leaves(hints[entry.name]())]
         else:
-            names = [] if "Positional" in str(entry.type) else [entry.name]
+            names = [] if "Positional" in str(entry.type) else [_name(command, entry.name)]
         yield from (f"--{name.replace('_', '-')}" for name in names)
     if _estimates(command):
         yield SETTINGS
@@ -189,7 +189,14 @@ def _entries(command: type[Any]) -> Iterator[tuple[str, str]]:
             if "Positional" in str(entry.type):
                 yield entry.name.upper(), text
             else:
-                yield _option(entry.name, hints[entry.name], entry.default), text
+                yield _option(_name(command, entry.name), hints[entry.name], entry.default), text
+
+
+def _name(command: type[Any], field: str) -> str:
+    """Return the name of a field on the command line, which its annotation may give, as `--as`."""
+    hint = get_type_hints(command, include_extras=True)[field]
+    given = (getattr(extra, "name", None) for extra in getattr(hint, "__metadata__", ()))
+    return next(filter(None, given), field)
 
 
 def _groups(command: type[Any]) -> Iterator[tuple[str, str]]:
