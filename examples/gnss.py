@@ -1,4 +1,4 @@
-"""Adds factors of your own on poses: a GNSS receiver measures the position beside the cones.
+"""Add factors of your own on poses: a GNSS receiver measures the position beside the cones.
 
 The mapper takes any GTSAM factor together with a cycle. Here a receiver gives the vehicle's position in the
 map frame once a second. Each fix is a `gtsam.PoseTranslationPrior2D` on the pose of its cycle.
@@ -20,19 +20,19 @@ from pathspace_graph.sim.track_generator import generate_track
 Array = NDArray[np.float64]
 
 SIGMA_GNSS = 0.3
-"""A fix has this standard deviation (m) in each direction."""
+"""Standard deviation of a fix in each direction (m)."""
 EVERY = 10
-"""A fix comes with every tenth perception cycle, which is once a second."""
+"""Cycles from one fix to the next, a second."""
 
 
 def build_log(laps: int = 1, seed: int = 0) -> Log:
-    """Simulates a drive on a generated track."""
+    """Simulate a drive on a generated track."""
     track = generate_track(np.random.default_rng(seed))
     return simulate(track, SimulationSettings(laps=laps), seed)
 
 
 def true_positions(log: Log) -> Array:
-    """Returns the true position (n, 2) of the vehicle at each perception cycle, in m, map frame."""
+    """Return the true position (n, 2) of the vehicle at each perception cycle, in m, map frame."""
     assert log.truth is not None
     stamps = [cycle.t for cycle in log.cycles]
     truth = log.truth
@@ -40,14 +40,14 @@ def true_positions(log: Log) -> Array:
 
 
 def gnss_factor(key: int, fix: Array) -> gtsam.NonlinearFactor:
-    """Returns the factor of a fix (2,) in m, map frame. Huber's loss allows for outliers."""
+    """Return the factor of a fix (2,) in m, map frame. Huber's loss allows for outliers."""
     gaussian = gtsam.noiseModel.Isotropic.Sigma(2, SIGMA_GNSS)
     robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.345), gaussian)
     return gtsam.PoseTranslationPrior2D(key, fix, robust)
 
 
 def drive(log: Log, fixes: Array | None) -> Array:
-    """Returns the estimated position (n, 2) of each cycle, with fixes (n, 2) or without."""
+    """Return the estimated position (n, 2) of each cycle, with fixes (n, 2) or without."""
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     positions = []
     for cycle, (odometry, detections) in enumerate(split_odometry(log)):
@@ -59,7 +59,7 @@ def drive(log: Log, fixes: Array | None) -> Array:
 
 
 def main(laps: int = 1, seed: int = 0) -> tuple[float, float]:
-    """Returns the root mean square error of the position (m) without and with the receiver."""
+    """Return the root mean square error of the position (m) without and with the receiver."""
     log = build_log(laps, seed)
     truth = true_positions(log)
     fixes = truth + np.random.default_rng(seed).normal(0.0, SIGMA_GNSS, truth.shape)

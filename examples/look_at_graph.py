@@ -25,7 +25,7 @@ POSE, CALIBRATION, SENSOR = ord("x"), ord("b"), ord("c")
 
 
 def build_mapper(cycles: int = 150, seed: int = 0) -> FixedLagMapper:
-    """Returns a mapper after a number of cycles on a generated track."""
+    """Return a mapper after a number of cycles on a generated track."""
     log = simulate(generate_track(np.random.default_rng(seed)), SimulationSettings(laps=1), seed)
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     for number, (odometry, detections) in enumerate(split_odometry(log)):
@@ -36,7 +36,7 @@ def build_mapper(cycles: int = 150, seed: int = 0) -> FixedLagMapper:
 
 
 def kind(factor: gtsam.NonlinearFactor) -> str:
-    """Returns the kind of a factor of the mapper, which its class and its keys tell."""
+    """Return the kind of a factor of the mapper, which its class and its keys tell."""
     letters = {gtsam.symbolChr(key) for key in list(factor.keys())}
     if isinstance(factor, gtsam.CustomFactor):
         return "odometry" if CALIBRATION in letters else "spline projection"
@@ -48,7 +48,7 @@ def kind(factor: gtsam.NonlinearFactor) -> str:
 
 
 def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> dict[str, tuple[int, float]]:
-    """Returns the number of factors of each kind, and the sum of their errors (half the squared sigmas)."""
+    """Return the number of factors of each kind, and the sum of their errors (half the squared sigmas)."""
     found: defaultdict[str, tuple[int, float]] = defaultdict(lambda: (0, 0.0))
     for index in range(graph.size()):
         factor = graph.at(index)
@@ -58,7 +58,7 @@ def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> d
 
 
 def draw(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, axes: Axes) -> None:
-    """Draws poses and control points, and a line from the pose of each projection factor to its points."""
+    """Draw poses and control points, and a line from the pose of each projection factor to its points."""
     positions = {
         key: _position(values, key)
         for key in list(values.keys())
@@ -91,7 +91,7 @@ def _position(values: gtsam.Values, key: int) -> np.ndarray:
 
 
 def main(folder: Path = Path(), cycles: int = 150) -> dict[str, tuple[int, float]]:
-    """Writes `graph.dot` and `graph.png` to a folder and returns the errors by kind of factor."""
+    """Write `graph.dot` and `graph.png` to a folder and returns the errors by kind of factor."""
     mapper = build_mapper(cycles)
     graph, values = mapper.graph(), mapper.values()
     graph.saveGraph(str(folder / "graph.dot"), values)

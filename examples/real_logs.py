@@ -37,43 +37,43 @@ from pathspace_graph.labels import BOUNDARIES
 Array = NDArray[np.float64]
 
 BEGIN, MARK = "<!-- real:begin -->", "<!-- real:end -->"
-"""The tables of a page stand between these lines."""
+"""Lines around the tables of a page."""
 LANDMARKS = "landmark-fixed-lag"
-"""The graph of landmarks, whose run stands beside those of the curves."""
+"""Graph of landmarks, whose run stands beside those of the curves."""
 FIRST, LAST = 25.0, 14.0
-"""The last metres of a drive are registered on its first ones."""
+"""Length of the end of a drive, and of its beginning on which it is registered (m)."""
 NEAR = 15.0
-"""Sightings within this range count there (m)."""
+"""Range of the sightings that count there (m)."""
 GATES = (2.0, 1.5, 1.0, 1.0, 0.7, 0.7)
-"""A cone is the nearest one of its colour within this (m), from step to step."""
+"""Distance within which a cone is the nearest one of its colour, from step to step (m)."""
 LEAST = 6
-"""A registration holds with this number of cones."""
+"""Least number of cones of a registration."""
 SAME = 1.0
-"""Two maps nearer than this to each other (m) are of the same cones."""
+"""Distance of two maps of the same cones (m)."""
 TOLD = {
     "latency": ("latency [ms]", 1e3),
     "yaw": ("yaw [degrees]", 180.0 / np.pi),
     "range_scale": ("scale [%]", 100.0),
 }
-"""These errors of the sensor are in the table, in these units."""
+"""Errors of the sensor in the table, in these units."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Holds a log, its runs, and what they are held against."""
+    """A log, its runs, and what they are held against."""
 
     name: str
     log: Log
     runs: dict[str, RunResult]
-    """The results by the name of the command."""
+    """Results by the name of the command."""
     dead_reckoned: Array
-    """(3,) The last pose by odometry alone."""
+    """Last pose (3,) by odometry alone."""
     registered: Array | None
-    """(3,) The last pose by registration; None where the drive does not come back to its beginning."""
+    """Last pose (3,) by registration, where the drive comes back to its beginning."""
 
 
 def convert(folder: Path) -> Log:
-    """Reads a folder as `convert --from csv --columns label=colour --labels left=1 right=0 --y right`."""
+    """Read a folder as `convert --from csv --columns label=colour --labels left=1 right=0 --y right`."""
     files = folder / "odometry.csv", folder / "detections.csv"
     record = read_csv(*files, Columns(("label=colour",)), Units(()), LabelRule(("left=1", "right=0")))
     log = to_log(record, Frames(y_odometry="right", y_detections="right"), NoiseSettings(), folder)
@@ -84,32 +84,26 @@ def convert(folder: Path) -> Log:
 
 
 def cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise, frame: Array) -> Array:
-    """Returns the cones (k, 2) of a label in the frame of a pose (3,), each the mean of its sightings."""
+    """Return the cones (k, 2) of a label in the frame of a pose (3,), each the mean of its sightings."""
     own = []
     for cycle in cycles:
         seen = cycle.detections
         chosen = (seen.labels == label) & (np.hypot(*seen.points_vehicle.T) < NEAR)
-        points, covariances = seen.points_vehicle[chosen], seen.covariances[chosen]
-        detections = replace(seen, points_vehicle=points, covariances=covariances, labels=seen.labels[chosen])
-        own.append(replace(cycle, detections=detections))
+        own.append(replace(cycle, detections=seen.where(chosen)))
     table: Sightings = follow(own, noise)
     corrected = table.point + by_sensor(table.point, table.twist) @ noise.sensor
     points = to_vehicle(to_map(corrected, table.pose), np.tile(frame, (len(table.t), 1)))
     weights = 1.0 / np.maximum(np.hypot(*table.point.T), 1.0) ** 2
-    found = []
-    for cone in np.unique(table.cone):
-        rows = table.cone == cone
-        if rows.sum() > 1:
-            found.append(np.average(points[rows], axis=0, weights=weights[rows]))
-    return np.array(found).reshape(-1, 2)
+    again = [rows for cone in np.unique(table.cone) if (rows := table.cone == cone).sum() > 1]
+    means = [np.average(points[rows], axis=0, weights=weights[rows]) for rows in again]
+    return np.array(means).reshape(-1, 2)
 
 
 def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Array | None:
-    """Returns the last pose (3,) of a drive, by the cones of its end laid on those of its beginning.
+    """Return the last pose (3,) of a drive, by the cones of its end laid on those of its beginning.
 
-    The cones of the last 14 m, in the frame of the last pose, are registered on those of the first 25 m by
-    closest points of the same colour, from starts around dead reckoning. Both stretches are short enough for
-    odometry, and the constant errors of the sensor are taken out.
+    The closest points of the same colour are paired, from starts around dead reckoning. Both stretches are
+    short enough for odometry, and the constant errors of the sensor are taken out.
     """
     poses = np.array([cycle.pose for cycle in cycles])
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
@@ -130,7 +124,7 @@ def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Ar
 
 
 def registered(start: list[Array], end: list[Array], pose: Array) -> tuple[int, float, Array]:
-    """Returns the number of paired cones, minus their mean distance, and the pose (3,) for it."""
+    """Return the number of paired cones, minus their mean distance, and the pose (3,) for it."""
     count, distance = 0, np.inf
     for gate in GATES:
         pairs = []
@@ -156,7 +150,7 @@ def registered(start: list[Array], end: list[Array], pose: Array) -> tuple[int, 
 
 
 def drive(folder: Path, out: Path) -> Drive:
-    """Converts a folder, maps it online and as a batch, and writes log and maps."""
+    """Convert a folder, maps it online and as a batch, and writes log and maps."""
     log = convert(folder)
     write_log(log, out / "logs" / folder.name)
     settings = MapperSettings()
@@ -176,13 +170,13 @@ def drive(folder: Path, out: Path) -> Drive:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Returns a table in Markdown."""
+    """Return a table in Markdown."""
     rule = ["---", *["---:"] * (len(header) - 1)]
     return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows)) + "\n"
 
 
 def off(pose: Array, drive: Drive) -> str:
-    """Returns how far a pose (3,) is from that by registration."""
+    """Return how far a pose (3,) is from that by registration."""
     if drive.registered is None:
         return ""
     distance = np.hypot(*(pose[:2] - drive.registered[:2]))
@@ -191,7 +185,7 @@ def off(pose: Array, drive: Drive) -> str:
 
 
 def runs_table(drives: Sequence[Drive]) -> str:
-    """Returns a row for each run."""
+    """Return a row for each run."""
     header = ["log", "run", "closed", "end off by", "dead reckoning's", "crossings, own"]
     header += ["degraded [%]", "lost [%]", "ms"]
     rows = []
@@ -200,36 +194,28 @@ def runs_table(drives: Sequence[Drive]) -> str:
             health = [record.health for record in result.cycles]
             shares = [f"{100.0 * health.count(word) / len(health):.1f}" for word in ("degraded", "lost")]
             ms = 1e3 * np.mean([record.seconds for record in result.cycles])
-            rows.append(
-                (
-                    one.name,
-                    name,
-                    "yes" if result.map.closed else "no",
-                    off(result.trajectory[-1], one),
-                    off(one.dead_reckoned, one) if name == "online" else "",
-                    "{}, {}".format(*crossings(result.map)) if name != "landmarks" else "",
-                    *(shares if any(health) else ("", "")),
-                    f"{ms:.1f}" if name != "batch" else "",
-                )
-            )
+            row = [one.name, name, "yes" if result.map.closed else "no", off(result.trajectory[-1], one)]
+            row.append(off(one.dead_reckoned, one) if name == "online" else "")
+            row.append("{}, {}".format(*crossings(result.map)) if name != "landmarks" else "")
+            row += shares if any(health) else ["", ""]
+            rows.append([*row, f"{ms:.1f}" if name != "batch" else ""])
     return table(header, rows)
 
 
 def maps_table(drives: Sequence[Drive]) -> str:
-    """Returns the distance between the maps of each two drives around the same cones."""
+    """Return the distance between the maps of each two drives around the same cones."""
     rows = []
     for k, first in enumerate(drives):
         for second in drives[k + 1 :]:
-            apart = {
-                name: aligned_distance(first.runs[name].map, second.runs[name].map) for name in first.runs
-            }
-            if min(apart.values()) < SAME:
-                rows.append((f"{first.name}, {second.name}", *(f"{value:.2f}" for value in apart.values())))
+            both = zip(first.runs.values(), second.runs.values(), strict=True)
+            apart = [aligned_distance(one.map, other.map) for one, other in both]
+            if min(apart) < SAME:
+                rows.append((f"{first.name}, {second.name}", *(f"{value:.2f}" for value in apart)))
     return table(("maps", *(f"{name} [m]" for name in drives[0].runs)), rows) if rows else ""
 
 
 def measured_table(drives: Sequence[Drive]) -> str:
-    """Returns what was measured on each drive, and over all of them the mean with its interval."""
+    """Return what was measured on each drive, and over all of them the mean with its interval."""
     header = ["log", "odometry [m/s, m/s, rad/s]", "along, across at 10 m [m]", "stays [%]"]
     rows, values = [], []
     at = np.array([10.0])
@@ -254,14 +240,12 @@ def measured_table(drives: Sequence[Drive]) -> str:
 
 
 def main(folders: Sequence[Path], out: Path, page: Path | None = None) -> str:
-    """Maps the recordings, writes logs, maps and `real.md` to a folder, and returns the tables.
+    """Map the recordings, writes logs, maps and `real.md` to a folder, and returns the tables.
 
     Where a page is given, its tables between the marks are replaced.
     """
     drives = [drive(folder, out) for folder in folders]
-    text = "\n".join(
-        part for part in (runs_table(drives), maps_table(drives), measured_table(drives)) if part
-    )
+    text = "\n".join(filter(None, (make(drives) for make in (runs_table, maps_table, measured_table))))
     (out / "real.md").write_text(text, encoding="utf-8")
     if page is not None:
         before, _, rest = page.read_text(encoding="utf-8").partition(BEGIN)

@@ -1,4 +1,4 @@
-"""Adds factors of your own on control points: a boundary must pass through a surveyed point.
+"""Add factors of your own on control points: a boundary must pass through a surveyed point.
 
 Somebody has measured the position of one cone of the left boundary to a few centimetres. As soon as the curve
 has grown past it, a factor on the control points there tells the mapper. The factor stays nonlinear while
@@ -23,21 +23,21 @@ from pathspace_graph.sim.track_generator import generate_track
 Array = NDArray[np.float64]
 
 SIGMA_SURVEY = 0.02
-"""The surveyed point has this standard deviation (m)."""
+"""Standard deviation of the surveyed point (m)."""
 REACH = 3.0
-"""The foot point of the surveyed point is searched this far (m) along the curve to both sides."""
+"""Length along the curve, to both sides, in which its foot point is searched (m)."""
 AWAY = 5.0
-"""A curve that is farther from the point than this (m) has not grown past it yet."""
+"""Distance from the point at which a curve has not grown past it yet (m)."""
 
 
 def build_log(laps: int = 1, seed: int = 0) -> Log:
-    """Simulates a drive on a generated track."""
+    """Simulate a drive on a generated track."""
     track = generate_track(np.random.default_rng(seed))
     return simulate(track, SimulationSettings(laps=laps), seed)
 
 
 def survey(log: Log, share: float = 0.4) -> Array:
-    """Returns the left cone (2,) nearest to the vehicle after a share of the drive, in m, map frame."""
+    """Return the left cone (2,) nearest to the vehicle after a share of the drive, in m, map frame."""
     assert log.truth is not None
     cones = log.truth.cones[log.truth.cone_labels == LEFT]
     pose = log.truth.poses[int(share * len(log.truth.poses)), :2]
@@ -45,7 +45,7 @@ def survey(log: Log, share: float = 0.4) -> Array:
 
 
 def survey_factor(mapper: FixedLagMapper, point: Array) -> gtsam.NonlinearFactor | None:
-    """Returns a factor that holds the left boundary on a point (2,), or None while the curve is not there."""
+    """Return a factor that holds the left boundary on a point (2,), or None while the curve is not there."""
     if LEFT not in mapper.boundaries:
         return None
     boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
@@ -64,7 +64,7 @@ def survey_factor(mapper: FixedLagMapper, point: Array) -> gtsam.NonlinearFactor
 
 
 def drive(log: Log, point: Array | None) -> FixedLagMapper:
-    """Maps a log, with a surveyed point (2,) or without, and returns the mapper."""
+    """Map a log, with a surveyed point (2,) or without, and returns the mapper."""
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     added = False
     for odometry, detections in split_odometry(log):
@@ -75,14 +75,14 @@ def drive(log: Log, point: Array | None) -> FixedLagMapper:
 
 
 def distance(mapper: FixedLagMapper, point: Array) -> float:
-    """Returns the distance (m) of the left boundary from a point (2,)."""
+    """Return the distance (m) of the left boundary from a point (2,)."""
     boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
     curve = boundary.evaluate(points, np.linspace(boundary.tables.low, boundary.tables.high, 4000))
     return float(np.hypot(*(curve - point).T).min())
 
 
 def main(laps: int = 1, seed: int = 0) -> tuple[float, float]:
-    """Returns the distance (m) of the boundary from the surveyed point, without and with the factor."""
+    """Return the distance (m) of the boundary from the surveyed point, without and with the factor."""
     log = build_log(laps, seed)
     point = survey(log)
     return distance(drive(log, None), point), distance(drive(log, point), point)

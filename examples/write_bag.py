@@ -1,4 +1,4 @@
-"""Writes a log as a ROS 2 bag, as a car would record it: odometry, and a point cloud of cones with labels.
+"""Write a log as a ROS 2 bag, as a car would record it: odometry, and a point cloud of cones with labels.
 
 It needs no ROS, but the package `rosbags`, which comes with `pip install 'pathspace-graph[ros]'`. Whoever
 has no bag yet can try `pathspace-graph convert` with it.
@@ -19,34 +19,34 @@ from rosbags.typesys import Stores, get_typestore
 from pathspace_graph import Detections, Log, read_log
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-"""These are the messages of ROS 2."""
+"""Messages of ROS 2."""
 EPOCH = 1_700_000_000
-"""The clock of the bag (s since 1970) stands at this where the log's is at 0."""
+"""Clock of the bag (s since 1970) where the log's is at 0."""
 FLOAT32, UINT8 = 7, 2
-"""These are the codes of a point cloud's types."""
+"""Codes of a point cloud's types."""
 COLUMNS = {"x": "<f4", "y": "<f4", "z": "<f4", "label": "u1"}
 """A cone of the cloud has a place in the vehicle frame (m), and the label 0 for left, 1 for right or 2."""
 
 
 def make(name: str, /, **fields: Any) -> Any:
-    """Returns a message."""
+    """Return a message."""
     return STORE.types[name](**fields)
 
 
 def vector(name: str, *values: float) -> Any:
-    """Returns a message with the fields x, y, z and, for four values, w."""
+    """Return a message with the fields x, y, z and, for four values, w."""
     return make(f"geometry_msgs/msg/{name}", **dict(zip("xyzw", values, strict=False)))
 
 
 def header(t: float, frame: str) -> Any:
-    """Returns a header with a stamp (s)."""
+    """Return a header with a stamp (s)."""
     nanoseconds = round(t * 1e9)
     stamp = make("builtin_interfaces/msg/Time", sec=EPOCH + nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
     return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
 def odometry(t: float, twist: np.ndarray) -> Any:
-    """Returns a twist (vx, vy, wz) as `nav_msgs/Odometry`; the pose is left at the origin."""
+    """Return a twist (vx, vy, wz) as `nav_msgs/Odometry`; the pose is left at the origin."""
     vx, vy, wz = (float(value) for value in twist)
     still = make(
         "geometry_msgs/msg/Pose",
@@ -69,7 +69,7 @@ def odometry(t: float, twist: np.ndarray) -> Any:
 
 
 def cloud(cycle: Detections) -> Any:
-    """Returns the cones of a perception cycle as `sensor_msgs/PointCloud2`."""
+    """Return the cones of a perception cycle as `sensor_msgs/PointCloud2`."""
     cones = np.zeros(len(cycle.labels), np.dtype(list(COLUMNS.items())))
     cones["x"], cones["y"] = cycle.points_vehicle.T
     cones["label"] = cycle.labels
@@ -98,7 +98,7 @@ def cloud(cycle: Detections) -> Any:
 
 
 def main(log: Log, bag: Path) -> None:
-    """Writes the odometry to `/odom` and the cones to `/cones`, in the order of their stamps."""
+    """Write the odometry to `/odom` and the cones to `/cones`, in the order of their stamps."""
     twists = zip(log.odometry.t.tolist(), log.odometry.twist, strict=True)
     messages = [(t, "/odom", odometry(t, twist)) for t, twist in twists]
     messages += [(cycle.t, "/cones", cloud(cycle)) for cycle in log.cycles]

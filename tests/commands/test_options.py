@@ -230,6 +230,15 @@ def test_the_shell_completes_commands_and_options(capsys: pytest.CaptureFixture[
     assert completed("verify", "--spline") == []
 
 
+def test_an_option_that_is_called_otherwise_than_its_field_is_shown_so(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for arguments in (["export", "--help"], ["--completion"]):
+        assert main(arguments) == 0
+        shown = capsys.readouterr().out
+        assert "--as" in shown and "--format" not in shown
+
+
 def test_a_reader_that_has_seen_enough_is_no_error() -> None:
     command = f"{sys.executable} -m pathspace_graph --completion | head -c 1"
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=True)
