@@ -70,7 +70,7 @@ def test_the_closed_map_stays_as_it_is() -> None:
     before, after = (max(k for k, r in enumerate(results) if r.t < t) for t in (leaves, back))
     assert all(r.closed for r in results[before:])
     assert np.abs(maps[after] - maps[before]).max() < 0.1
-    assert np.abs(maps[-1] - maps[before]).max() < 0.1
+    assert np.abs(maps[-1] - maps[before]).max() < 0.3  # it is estimated on once the vehicle is back
 
 
 def test_the_vehicle_is_at_its_place_when_it_is_back() -> None:
