@@ -133,10 +133,9 @@ class FixedLagSmoother(Generic[M_co]):
 
     def add_pose(self, t: float, pose: Array, odometry: IntegratedOdometry) -> None:
         """Add the next pose (3,) at t (s), and the odometry that leads to it."""
-        self.window.lengthened = self.next_cycle - 1
+        self.window.lead_on(self.next_cycle - 1, odometry)
         self.variables.insert(pose_keys(np.array([self.next_cycle])), pose)
         self.times.append(t)
-        self.window.odometry.append(odometry)
 
     def add_pose_prior(self, cycle: int, covariance: Array) -> None:
         """Add a prior to the pose of a cycle at its present value, with a covariance (3, 3), map frame."""

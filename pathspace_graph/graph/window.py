@@ -13,6 +13,7 @@ import numpy as np
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.odometry import IntegratedOdometry
 
 from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_form
 from .rows import KeptRows, OdometryChain, Rows, among, at_reference, jacobian_factors, stacked_factor
@@ -117,8 +118,7 @@ class WindowFactors(Generic[M_co]):
         """Odometry between each pose of the window and the next."""
         self.exact = False
         """If true, the tolerances are zero: factors of all variables that moved are linearized again."""
-        self.lengthened = -1
-        """Cycle of the newest pose until the odometry led on from it, whose rows lack that odometry."""
+        self._lengthened = -1  # the rows of this cycle lack the odometry that leads on from it
         self.measured = KeptRows()
         """Rows of detections, and of the odometry to the next cycle, by perception cycle."""
         self.gauge = KeptRows()
@@ -166,12 +166,17 @@ class WindowFactors(Generic[M_co]):
         if self.map.reached_inactive or any(among(rows.keys, inactive).any() for rows in groups):
             return False
         self.measured.replace(stale, groups, self.variables)
-        self.lengthened = -1
+        self._lengthened = -1
         self.map.linearized(stale)
         self._relinearize_gauge(moved)
         entries = self.variables.layout.entries(moved)
         self.variables.linearized[entries] = self.variables.values[entries]
         return True
+
+    def lead_on(self, cycle: int, odometry: IntegratedOdometry) -> None:
+        """Add the odometry that leads from the newest pose, that of a cycle, to the next one."""
+        self.odometry.append(odometry)
+        self._lengthened = cycle
 
     def drop(self, keys: IntArray) -> None:
         """Drop the rows of cycles that hold any of some ascending keys, so that they are linearized again."""
@@ -201,7 +206,7 @@ class WindowFactors(Generic[M_co]):
         return layout.keys[np.logical_or.reduceat(moved, layout.starts)]
 
     def _stale(self, cycles: IntArray, moved: IntArray) -> IntArray:
-        stale = ~among(cycles, np.sort(self.measured.owners)) | (cycles == self.lengthened)
+        stale = ~among(cycles, np.sort(self.measured.owners)) | (cycles == self._lengthened)
         stale |= among(cycles, np.sort(np.append(self.map.changed(), self.measured.holding(moved))))
         return np.asarray(cycles[stale])
 
