@@ -25,7 +25,7 @@ from pathspace_graph.io.parsing import read_json, read_text
 
 from .benchmark.measurement import measure_drive, metrics
 from .experiment.faults import kinds, of_middle_strength, only, outcomes, suite
-from .experiment.frame import RUN_OF, estimate, last_laps
+from .experiment.frame import RUN, RUN_OF, estimate, last_laps
 from .experiment.run import run_study
 from .experiment.study import DEFAULT, Study, find_study, read_study
 from .experiment.tables import TextTable
@@ -312,7 +312,7 @@ def camera_table(frame: pd.DataFrame) -> View:
         (f"`{estimator}`, {STATED.get(variant, variant)}", tuple(_figure(key, part) for key in keys))
         for (estimator, variant), part in last.groupby(["estimator", "variant"], sort=False)
     ]
-    oracle = (_figure("l", last[last["estimator"] == BATCH]), *[Figure(None)] * (len(keys) - 1))
+    oracle = (_figure("l", last.drop_duplicates([*RUN])), *[Figure(None)] * (len(keys) - 1))  # one a drive
     return ("estimator, noise", *keys.values()), (*rows, ("landmarks, told all", oracle))
 
 
