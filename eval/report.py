@@ -177,7 +177,7 @@ class Plan:
     def accuracy(self, folder: Path) -> Views:
         """Drive all estimators on all tracks."""
         tracks: tuple[Path | int, ...] = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
-        estimators, seeds, laps = (ESTIMATORS[:3], (0, 1), 2) if self.quick else (ESTIMATORS, (0, 1, 2), 5)
+        estimators, seeds, laps = (ESTIMATORS[:3], (0, 1), 2) if self.quick else (ESTIMATORS, (0, 1), 5)
         study = Study(name="accuracy", tracks=tracks, estimators=estimators, seeds=seeds, laps=laps)
         frame = self._run(study, folder)
         return {
