@@ -254,7 +254,7 @@ def compared_table(frame: pd.DataFrame) -> View:
 
 
 def tracks_table(frame: pd.DataFrame) -> View:
-    """Return the online map and that of the batch, track by track."""
+    """Return the online map and that of the batch, track by track: too few drives for an interval."""
     online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
     first, last = online[online["lap"] == 1], last_laps(online)
     columns = {
@@ -267,7 +267,12 @@ def tracks_table(frame: pd.DataFrame) -> View:
         "NEES": ("nees", last),
     }
     rows = tuple(
-        (str(track), tuple(_figure(key, part[part["track"] == track]) for key, part in columns.values()))
+        (
+            str(track),
+            tuple(
+                replace(_figure(k, part[part["track"] == track]), half=None) for k, part in columns.values()
+            ),
+        )
         for track in frame["track"].unique()
     )
     return ("track", *columns), rows

@@ -19,12 +19,15 @@ from pathspace_graph.eval.report import (
     accuracy_table,
     camera_table,
     faults_table,
+    laps_table,
+    metrics_table,
     read_figures,
     render,
     render_pages,
     skidpad_table,
     sources_digest,
     to_json,
+    tracks_table,
 )
 from pathspace_graph.io.files import write_json
 
@@ -68,6 +71,22 @@ def test_the_table_of_accuracy_has_the_laps_and_the_batch() -> None:
     assert label == "rmse [m]"
     assert [figure.value for figure in figures] == pytest.approx([0.6, 0.3, 0.2, 0.1])
     assert rows[1][1][0].text.startswith("1.0")  # in percent
+
+
+def test_the_tables_of_the_results_have_tracks_laps_and_metrics() -> None:
+    both = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 1, 0.3)], ignore_index=True)
+    both = pd.concat([both, both.assign(track="other", rmse=2.0 * both["rmse"])], ignore_index=True)
+    header, rows = tracks_table(both)
+    assert header[1:4] == ("rmse, lap 1 [m]", "rmse, last lap [m]", "rmse, batch [m]")
+    assert [label for label, _ in rows] == ["t", "other"]
+    assert [figure.value for figure in rows[1][1][:3]] == pytest.approx([1.2, 0.4, 0.6])
+    assert rows[0][1][0].half is None
+    header, rows = laps_table(both)
+    assert header == ("rmse after lap [m]", "`fixed-lag`")
+    assert [rows[lap][1][0].value for lap in range(3)] == pytest.approx([0.9, 0.45, 0.3])
+    header, rows = metrics_table(both)
+    assert header == ("last lap", "`fixed-lag`", "`spline`")
+    assert [label for label, _ in rows][:1] == ["missed at 2 m [%]"]
 
 
 def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
