@@ -280,17 +280,23 @@ def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, set
     """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
 
     Boundaries don't cross but at level crossings, the vehicle crosses neither and has driven beside all of
-    both, and the detections lie on them.
+    both, and the detections lie on them. Where cycles are missing the drive is not known, so nothing is asked
+    of the boundaries beside a step so long that a point beside its middle would be too far from both poses.
     """
-    step, driven = SAMPLE, poses[:, :2]
-    if boundaries_cross(splines, step, driven):
+    driven, by_drive = poses[:, :2], KDTree(poses[:, :2])
+    if boundaries_cross(splines, SAMPLE, driven):
         return "its boundaries cross"
-    by_drive = KDTree(driven)
-    for curve in (sampled(spline, step) for spline in splines.values()):
-        if not at_level_crossing(crossings(curve, driven), driven).all():
+    for curve in (sampled(spline, SAMPLE) for spline in splines.values()):
+        distance, beside = map(np.asarray, KDTree(curve).query(driven))
+        aside = float(np.percentile(distance, MOSTLY))
+        missing = np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 2.0 * WIDER * aside)
+        pieces = [piece for piece in np.split(driven, missing + 1) if len(piece) > 1]
+        if any(not at_level_crossing(crossings(curve, piece), driven).all() for piece in pieces):
             return "the vehicle would have crossed a boundary"
-        aside = float(np.percentile(KDTree(curve).query(driven)[0], MOSTLY))
-        wider = float(np.max(by_drive.query(curve)[0])) / aside
+        known = np.ones(len(curve), bool)
+        for first, last in zip(beside[missing], beside[missing + 1], strict=True):
+            known[np.arange(first, last if last >= first else last + len(curve)) % len(curve)] = False
+        wider = float(np.max(by_drive.query(curve[known])[0])) / aside
         if wider > WIDER:
             return f"a boundary would be {wider:.1f} times as far from the drive as it is beside it"
     if found.used < settings.batch.closure.used:

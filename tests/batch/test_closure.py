@@ -157,6 +157,16 @@ def test_a_vehicle_has_driven_beside_all_of_a_boundary() -> None:
     )
 
 
+def test_where_cycles_are_missing_nothing_is_asked_of_the_boundaries() -> None:
+    """The drive's step over a quarter of the circle crosses the inner boundary, but the vehicle did not."""
+    curves = {LEFT: ring(18.0), RIGHT: ring(24.0)}
+    whole = circle(20.0)
+    without = np.delete(whole, np.arange(20, 35), axis=0)
+    assert objection(BELIEVED, curves, without, SETTINGS) == ""
+    narrow = {LEFT: ring(18.0), RIGHT: ring(24.0, 8.0)}
+    assert objection(BELIEVED, narrow, np.delete(circle(15.0), np.arange(20, 35), axis=0), SETTINGS) != ""
+
+
 def test_the_detections_of_a_lap_lie_on_its_boundaries() -> None:
     few = replace(BELIEVED, used=0.62)
     against = objection(few, {LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0), SETTINGS)
