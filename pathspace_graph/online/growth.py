@@ -25,12 +25,12 @@ from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
-AROUND: Final = 2.0
-"""Largest ratio of the path around a hairpin to the length of the curve inside."""
 NEWEST: Final = 3
 """Newest cones that, with the end of a curve, say how far it runs beside the path."""
 RECALL: Final = 25.0
-"""Length at the end of a curve whose cones are checked to be in the order in which they were passed (m)."""
+"""Length of the newest stretches of path and curves (m): in a second round, the first one tells nothing."""
+NEARER: Final = 0.5
+"""A cone that was passed is passed again only where the path comes nearer to it by more than this (m)."""
 LENGTH_FREE: Final = 50.0
 """Length of an open curve that is allowed whatever the path driven (m)."""
 LENGTH_DRIVEN: Final = 2.0
@@ -48,6 +48,7 @@ class Growth:
         """What is said in the cycle in which a boundary stops growing."""
         self._smoother, self._map, self._state = smoother, smoother.map, smoother.map.state
         self._full: set[int] = set()
+        self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
 
     def observe(self, new: slice, t: float) -> None:
         """Add the new detections that no curve uses to the tentative tracks, seen at t (s)."""
@@ -96,7 +97,7 @@ class Growth:
     def _grow(self, label: int, path_ahead: PathAhead) -> bool:
         """Extend a curve, after it is taken back if its cones are out of order; True if it has changed."""
         boundary = self._state.boundaries[label]
-        kept = count_in_order(boundary, path_ahead)
+        kept, self._beside[label] = check_order(boundary, path_ahead, self._beside[label])
         if kept == len(boundary.observed):
             return self._extend(label, path_ahead, END_BEHIND)
         self._take_back(label, kept)
@@ -184,7 +185,8 @@ class Growth:
         points = tracks.points[indices]
         if len(points) == 0:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
-        stations, lateral = path_ahead.locate(points)
+        path = path_ahead if end is None else _newest(path_ahead, end)
+        stations, lateral = path.locate(points)
         found = Candidates(points, indices, stations, SIDES[label] * lateral)
         found = found.where((stations <= path_ahead.stations[-1]) & (found.sides > 0.0))
         if end is None:
@@ -216,7 +218,8 @@ class Growth:
         No boundary crosses the path driven, the other boundary or itself, on their newest stretches: in a
         second lap of an open loop it runs along its own first one.
         """
-        lines = [path_ahead.points[path_ahead.stations <= path_ahead.driven]]
+        path = _newest(path_ahead, end)
+        lines = [path.points[path.stations <= path.driven]]
         for other, boundary in self._state.boundaries.items():
             begin = boundary.confirmed_end - RECALL
             first = int(np.searchsorted(boundary.cone_parameters, begin))
@@ -240,7 +243,9 @@ class Growth:
         station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position)
         side = SIDES[label] * float(lateral[0])
         if len(boundary.observed) >= NEWEST:
-            _, beside = path_ahead.locate(np.array(boundary.observed[-NEWEST:]))
+            _, beside = path_ahead.since(path_ahead.driven - RECALL).locate(
+                np.array(boundary.observed[-NEWEST:])
+            )
             side = float(np.median(np.append(SIDES[label] * beside, side)))
         return End(position[0], float(station[0]), side)
 
@@ -276,23 +281,37 @@ def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> Boo
     return np.asarray(votes >= 0)
 
 
-def count_in_order(boundary: Boundary, path_ahead: PathAhead) -> int:
+def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tuple[int, Array]:
     """Return how many of a curve's cones, from its first on, are in the order in which they were passed.
 
     The order of cones ahead is predicted with an arc. In a hairpin, the row of the way back may be nearer
     than the row of the way there, and only after the vehicle has passed the cones is their order certain.
     Only the last `RECALL` metres of the curve are checked, and the first cone there counts as in order.
+
+    `known` (n, 2) are the station and the distance of the first n cones beside the path, as they were in the
+    cycle before, and the second result (m, 2) as they are now.
     """
     first = int(np.searchsorted(boundary.cone_parameters, boundary.confirmed_end - RECALL))
-    recent = np.array(boundary.observed[first:]).reshape(-1, 2)
-    if len(recent) < 3:
-        return len(boundary.observed)
-    path = path_ahead.since(path_ahead.driven - AROUND * RECALL)
-    station, _ = path.locate(recent)
-    passed = np.where(station <= path_ahead.driven, station, np.inf)
-    later = np.minimum.accumulate(passed[::-1])[::-1]
-    wrong = np.flatnonzero(passed[1:-1] > later[2:] + STATION_MARGIN)
-    return first + 1 + int(wrong[0]) if len(wrong) else len(boundary.observed)
+    now = np.column_stack(
+        path_ahead.since(path_ahead.driven - RECALL).locate(
+            np.array(boundary.observed[first:]).reshape(-1, 2)
+        )
+    )
+    before = known[first : len(boundary.observed)]
+    again = now[: len(before)]
+    passed = before[:, 0] <= path_ahead.driven
+    stays = passed & (np.abs(again[:, 1]) > np.abs(before[:, 1]) - NEARER)
+    again[stays] = before[stays]
+    at = np.where(now[:, 0] <= path_ahead.driven, now[:, 0], np.inf)
+    later = np.minimum.accumulate(at[::-1])[::-1]
+    wrong = np.flatnonzero(at[1:-1] > later[2:] + STATION_MARGIN)
+    kept = first + 1 + int(wrong[0]) if len(wrong) else len(boundary.observed)
+    return kept, np.concatenate([known[:first], now])[:kept]
+
+
+def _newest(path_ahead: PathAhead, end: End) -> PathAhead:
+    """Return the path along which the end of a curve may grow: not that of an earlier round."""
+    return path_ahead.since(min(end.station, path_ahead.driven) - RECALL)
 
 
 def _distances(points: Array) -> Array:

@@ -23,7 +23,7 @@ from pathspace_graph.spline.ahead import CurveAhead
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
 
-from .growth import undisputed
+from .growth import RECALL, undisputed
 
 REACH: Final = 12.5
 """Farthest track from the vehicle that the stretch leads through (m)."""
@@ -278,7 +278,8 @@ def extended_rows(
     """Return the row of each boundary, extended through its tentative tracks, and the indices of these."""
     tracks = {label: _tracks(track, label, tentative[label], t) for label in BOUNDARIES}
     rows = {label: _row(track, label, tentative[label].points[tracks[label]]) for label in BOUNDARIES}
-    extend_rows(rows[LEFT], rows[RIGHT], path.points, track.settings.growth.threshold)
+    newest = path.points[path.stations >= path.length - RECALL]
+    extend_rows(rows[LEFT], rows[RIGHT], newest, track.settings.growth.threshold)
     return {label: (row, tracks[label][row.chosen]) for label, row in rows.items()}
 
 

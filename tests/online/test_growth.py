@@ -15,7 +15,7 @@ from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.path import END_BEHIND, Candidates, End, PathAhead
 from pathspace_graph.online import growth
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.growth import count_in_order, undisputed
+from pathspace_graph.online.growth import check_order, undisputed
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import GrowthSettings
 
@@ -210,10 +210,31 @@ def test_an_end_that_the_vehicle_has_passed_follows_the_path(alone: FixedLagMapp
 def test_cones_that_were_passed_in_another_order_are_counted(alone: FixedLagMapper) -> None:
     """The curve went (0, 2), (4, 2), (12, 2), (8, 2): after 9 m the third has not been passed yet."""
     boundary, _ = boundary_through(np.array([[0.0, 2.0], [4.0, 2.0], [12.0, 2.0], [8.0, 2.0]]))
-    counts = [count_in_order(boundary, along_x(x)) for x in (3.0, 7.0, 9.0, 13.0)]
+    nothing = np.zeros((0, 2))
+    counts = [check_order(boundary, along_x(x), nothing)[0] for x in (3.0, 7.0, 9.0, 13.0)]
     assert counts == [4, 4, 2, 2]
     in_order, _ = boundary_through(np.array([[0.0, 2.0], [4.0, 2.0], [8.0, 2.0], [12.0, 2.0]]))
-    assert count_in_order(in_order, along_x(13.0)) == 4
+    assert check_order(in_order, along_x(13.0), nothing)[0] == 4
+
+
+def test_cones_of_a_second_round_are_not_taken_for_those_of_the_first() -> None:
+    """On a circle of 50 m the path of the first round is nearer to the cones ahead than the arc."""
+    radius, step = 50.0 / (2.0 * np.pi), 2.5
+
+    def on_circle(arc: Array, out: float) -> Array:
+        angle = arc / radius
+        return np.column_stack([np.sin(angle), -np.cos(angle)]) * (radius + out)
+
+    stations = np.arange(0.0, 66.0, 0.5)
+    offset = np.where(stations > 52.0, 0.4, 0.0)  # the arc is predicted too far inside
+    points = np.array([on_circle(s[None], -o)[0] for s, o in zip(stations, offset, strict=True)])
+    beside = np.zeros((0, 2))
+    for driven in np.arange(5.0, 52.0, 2.0):
+        now, cones = stations <= driven + 12.0, on_circle(np.arange(0.0, driven + 10.0, step), 2.0)
+        boundary, _ = boundary_through(cones)
+        kept, beside = check_order(boundary, PathAhead(points[now], stations[now], driven), beside)
+        assert kept == len(cones)
+    np.testing.assert_allclose(beside[:20, 0], step * np.arange(20), atol=0.5)
 
 
 def test_a_curve_that_is_taken_back_goes_through_its_cones_in_the_right_order(alone: FixedLagMapper) -> None:
