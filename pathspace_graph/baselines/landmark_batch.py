@@ -20,7 +20,7 @@ from pathspace_graph.factors.noise import KnownNoise, huber_loss
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.factors.se2 import rotated, to_map
-from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.front_end import is_orange, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph, owners
 from pathspace_graph.graph.rows import Rows
@@ -364,8 +364,10 @@ def solve_landmarks(
 ) -> LandmarkSolution:
     """Minimize all squared Mahalanobis distances over poses, calibration and landmarks; no loss is robust.
 
-    associations (R,) holds the landmark of each detection in file order; negative ones are left out.
+    associations (R,) holds the landmark of each detection in file order; negative ones are left out, and so
+    are orange cones.
     """
+    associations = associations[~np.concatenate([is_orange(cycle) for cycle in log.cycles])]
     settings = settings or MapperSettings()
     settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
     system = LandmarkSystem.of_log(log, settings, KnownNoise(log.odometry_sigma))
