@@ -239,9 +239,7 @@ def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSetting
     """Return the evidence for or against an optimum whose curves are closed."""
     state = at.state
     coloured = np.isin(detections.label, list(state.boundaries))
-    second = np.ones(
-        len(state.poses), bool
-    )  # poses beside a stretch of every boundary that was driven before
+    second = np.ones(len(state.poses), bool)  # beside a stretch of every boundary that was driven before
     for label, boundary in state.boundaries.items():
         second &= state.pose_u[label] - state.pose_u[label][0] >= boundary.length
     again = second[detections.cycle] & coloured

@@ -41,7 +41,7 @@ TOLERANCE_DECREASE: Final = 5e-3
 CURVE_SAMPLES: Final = 2
 """Points in each knot interval at which the movement of a curve is measured."""
 SHARES: Final = (0.3, 0.97)
-"""Shares of the step before between which a step is extended to the sum of those that would follow it."""
+"""Sizes of a step's share of the one before between which it becomes the sum of those that would follow it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,21 +242,22 @@ class Optimizer:
             return None
         before, self._last_step = self._last_step, step[: problem.map.size]
         factor = 1.0 if before is None else extrapolation_factor(self._last_step, before)
-        if factor > 1.0:
-            farther = self.system.evaluate(self.system.retract(state, factor * step))
-            trial = min(trial, farther, key=lambda evaluation: evaluation.cost)
+        if factor != 1.0:
+            other = self.system.evaluate(self.system.retract(state, factor * step))
+            trial = min(trial, other, key=lambda evaluation: evaluation.cost)
         return trial
 
 
 def extrapolation_factor(step: Array, before: Array) -> float:
     """Return `1 / (1 - r)`: how much longer a step (n,) is made, r being its share of the step before.
 
-    Aitken's process for vectors, with r by least squares, and 1 where r isn't between `SHARES`. Robust
-    weights, held sigmas and foot points on a bend let Gauss-Newton converge only linearly.
+    Aitken's process for vectors, with r by least squares, and 1 where |r| isn't between `SHARES`. Robust
+    weights, held sigmas and foot points on a bend let Gauss-Newton converge only linearly: it creeps (r > 0),
+    or goes to and fro (r < 0), where a shorter step ends it.
     """
     square = float(before @ before)
     share = float(step @ before) / square if square > 0.0 else 0.0
-    return 1.0 / (1.0 - share) if SHARES[0] < share < SHARES[1] else 1.0
+    return 1.0 / (1.0 - share) if SHARES[0] < abs(share) < SHARES[1] else 1.0
 
 
 def gradient(groups: Sequence[Rows], layout: Layout) -> Array:

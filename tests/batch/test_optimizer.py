@@ -136,16 +136,16 @@ def test_the_poses_alone_are_aligned_beside_the_map() -> None:
 # --- steps -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("share", [0.4, 0.7, 0.9])
+@pytest.mark.parametrize("share", [0.4, 0.7, 0.9, -0.4, -0.9])
 def test_steps_that_shrink_by_one_share_lead_to_their_limit_at_once(share: float) -> None:
-    """With x_k = x + r^k d, the second step ends at x if it is made longer."""
+    """With x_k = x + r^k d, the second step ends at x if it is made longer, or shorter where r < 0."""
     limit, off = np.array([1.0, -2.0, 3.0]), np.array([0.5, 0.1, -0.3])
     points = [limit + share**k * off for k in range(3)]
     before, step = points[1] - points[0], points[2] - points[1]
     np.testing.assert_allclose(points[1] + extrapolation_factor(step, before) * step, limit, atol=1e-12)
 
 
-@pytest.mark.parametrize("step", [[0.0, 1.0], [-0.5, 0.0], [1.2, 0.0], [0.1, 0.0]])
+@pytest.mark.parametrize("step", [[0.0, 1.0], [-0.1, 0.0], [1.2, 0.0], [-1.2, 0.0], [0.1, 0.0]])
 def test_other_steps_are_left_as_they_are(step: list[float]) -> None:
     assert extrapolation_factor(np.array(step), np.array([1.0, 0.0])) == 1.0
     assert extrapolation_factor(np.array(step), np.zeros(2)) == 1.0
