@@ -46,6 +46,7 @@ from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
+from .association import path_lengths
 from .lap import evidence, is_true_closure
 from .optimizer import LOOSE_GATE, Convergence, Optimizer
 from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplify
@@ -58,6 +59,16 @@ HALVINGS: Final = 6
 """Most halvings of the room while another foot point in it is nearer, as in a bend about a detection."""
 SAME: Final = 1e-3
 """Distance below which two foot points are the same (m along the curve)."""
+STRETCH: Final = 25.0
+"""Length of the stretches of the drive by which a map is judged (m)."""
+FEW: Final = 20
+"""Number of detections below which a stretch says nothing."""
+USUALLY: Final = 80.0
+"""Percentile of the stretches' shares of explained detections that is usual for a log."""
+POOR: Final = 0.6
+"""Share of the usual one below which a stretch is poorly mapped; those of a good map are above 0.9."""
+MOST_POOR: Final = 1.0 / 3.0
+"""Most of the drive that may be so: the way to a track and from it has no boundaries."""
 
 
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
@@ -215,6 +226,8 @@ class BatchResult(BatchRun):
     system: BatchSystem
     """Problem that was solved, on curves with about one knot for each cone."""
     optimum: Evaluation
+    objection: str = ""
+    """What speaks against the map as a whole; empty where nothing does."""
 
     @cached_property
     def pose_covariances(self) -> Array:
@@ -310,7 +323,24 @@ class BatchMapper:
             seconds=watch.laps,
             system=system,
             optimum=at,
+            objection=unmapped(detections, state.poses),
         )
+
+
+def unmapped(detections: DetectionTable, poses: Array) -> str:
+    """Return that the boundaries explain too few detections along too much of a drive; empty if they don't.
+
+    A stretch is judged by the share of its detections that lies on them, over that of the better stretches,
+    since a sensor may see things that are no cones everywhere.
+    """
+    stretch = (path_lengths(poses) // STRETCH).astype(np.intp)[detections.cycle]
+    offered = np.bincount(stretch)
+    used = np.bincount(stretch, detections.used, len(offered))
+    share = used[offered >= FEW] / offered[offered >= FEW]
+    poor = share < POOR * np.percentile(share, USUALLY) if len(share) else np.zeros(1, bool)
+    if poor.mean() <= MOST_POOR:
+        return ""
+    return f"the boundaries lack the cones of {100.0 * poor.mean():.0f} % of the drive"
 
 
 def _vehicle(system: BatchSystem, at: Evaluation) -> VehicleState:

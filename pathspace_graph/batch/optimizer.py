@@ -41,7 +41,7 @@ TOLERANCE_DECREASE: Final = 5e-3
 CURVE_SAMPLES: Final = 2
 """Points in each knot interval at which the movement of a curve is measured."""
 SHARES: Final = (0.3, 0.97)
-"""Sizes of a step's share of the one before between which it becomes the sum of those that would follow it."""
+"""Sizes of a step's share of the one before between which it becomes the sum of all that would follow."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,6 +69,9 @@ class Batch:
             )
             note(f"not converged: {reason}")
             raise SystemExit(NOT_CONVERGED)
+        if isinstance(result, BatchResult) and result.objection:
+            note(f"not a map of the drive: {result.objection}")
+            raise SystemExit(NOT_CONVERGED)
 
 
 def summarize_batch(result: BatchRun, log: Log, start: Start, hints: Sequence[Hint] = ()) -> dict[str, Any]:
@@ -77,6 +80,7 @@ def summarize_batch(result: BatchRun, log: Log, start: Start, hints: Sequence[Hi
     if not isinstance(result, BatchResult):
         return summary
     summary["convergence"] = asdict(result.convergence)
+    summary["objection"] = result.objection
     summary["stages"] = result.seconds
     summary["gap"] = None if result.online is None else asdict(gap(result.online, result))
     return summary

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.mapper import BatchMapper, BatchResult
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult, unmapped
 from pathspace_graph.batch.optimizer import Effort
 from pathspace_graph.cli import main
 from pathspace_graph.commands.batch import NOT_CONVERGED
@@ -20,6 +21,7 @@ from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, write_log
 from pathspace_graph.io.map import SplineBoundary, read_map
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -169,6 +171,34 @@ def test_a_run_that_did_not_converge_is_written_and_reported(
     summary = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert not summary["convergence"]["converged"]
     assert summary["convergence"]["reason"] == "no round left"
+    assert read_map(tmp_path / "map").size > 0
+
+
+def test_a_map_that_lacks_the_cones_of_a_part_of_the_drive_is_objected_to() -> None:
+    result = solved("odometry")
+    detections, poses = deepcopy(result.system.detections), result.optimum.state.poses
+    assert result.objection == "" == unmapped(detections, poses)
+    late = detections.cycle > 0.5 * len(poses)
+    detections.release(np.flatnonzero(late)[::4])
+    assert unmapped(detections, poses) == ""  # false detections are everywhere
+    detections.release(np.flatnonzero(late))
+    share = int(unmapped(detections, poses).removeprefix("the boundaries lack the cones of ").split()[0])
+    assert 40 <= share <= 60
+    assert unmapped(DetectionTable(), poses) == ""
+
+
+def test_a_map_that_is_objected_to_is_written_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("pathspace_graph.batch.mapper.MOST_POOR", -1.0)
+    write_log(bean(), tmp_path / "log")
+    arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == NOT_CONVERGED
+    assert (
+        "not a map of the drive: the boundaries lack the cones of 0 % of the drive" in capsys.readouterr().err
+    )
     assert read_map(tmp_path / "map").size > 0
 
 
