@@ -10,8 +10,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from hashlib import sha256
-from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final, Self
@@ -24,6 +22,8 @@ from pathspace_graph.errors import InputError, check_name
 from pathspace_graph.io.parsing import read_json, read_text
 
 from .benchmark.measurement import measure_drive, metrics
+from .experiment.cells import ESTIMATORS as ESTIMATOR_ROOMS
+from .experiment.cells import code_digest
 from .experiment.faults import kinds, of_middle_strength, only, outcomes, suite
 from .experiment.frame import RUN, RUN_OF, estimate, last_laps
 from .experiment.run import run_study
@@ -48,11 +48,6 @@ PAGES: Final = {
     "faults": "docs/reliability.md",
 }
 """Page of each table, from the root of the project."""
-ROOMS: Final = (
-    *("baselines", "batch", "factors", "front_end", "graph", "loop", "mapping", "online"),
-    *("scale", "settings", "sim", "spline"),
-)
-"""Rooms whose sources the figures depend on."""
 ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
 ONLINE, BATCH = ESTIMATORS[:2]
 STATED: Final = {DEFAULT: "stated"}
@@ -385,14 +380,7 @@ def read_figures(file: Path) -> Tables:
 
 def sources_digest() -> str:
     """Return the digest of the sources that the figures depend on."""
-    digest = sha256()
-    for room in ROOMS:
-        spec = find_spec(f"pathspace_graph.{room}")
-        origin = Path(str(spec.origin if spec else None))
-        inside = [*origin.parent.glob("*.py"), *origin.parent.glob("*.cpp")]
-        for file in sorted(inside) if origin.name == "__init__.py" else [origin]:
-            digest.update(f"{room}/{file.name}".encode() + file.read_bytes())
-    return digest.hexdigest()[:16]
+    return code_digest(ESTIMATOR_ROOMS)
 
 
 def render_pages(root: Path, tables: Tables) -> dict[Path, str]:

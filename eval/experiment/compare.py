@@ -1,6 +1,6 @@
 """Every estimator on the same logs: their frame, the paper's Table 1, all metrics, and paired differences."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import zip_longest
@@ -26,9 +26,9 @@ from pathspace_graph.settings.online import LimitSettings
 
 from .cells import Cell, NamedLog, Outcome, run_cell
 from .frame import add_batch, difference
+from .run import Experiment, OnCell
 from .study import known_estimators
 from .tables import TextTable, group_starts
-from .workers import check_jobs, outcomes, workers
 
 RUN: Final = ("log", "estimator")
 NO_TRUTH: Final = "the log has no true cones, which rmse, missed and most other metrics need"
@@ -166,23 +166,18 @@ def compare(
     reference: str | None = None,
     ghosts: GhostSettings | None = None,
     jobs: int = 1,
-    on_run: Callable[[], None] | None = None,
+    on_run: OnCell | None = None,
 ) -> Comparison:
-    """Run every estimator on every log, `jobs` at a time on one BLAS thread each; call `on_run` after each.
+    """Run every estimator on every log, `jobs` at a time on one BLAS thread each, see `Experiment.run`.
 
     A failure of one does not stop the others.
     """
-    check_jobs(jobs)
     settings, measured = settings or MapperSettings(), {"ghost_settings": ghosts}
     cells = [Cell(log, name, settings, measured=measured) for log in logs for name in estimators]
-    done: dict[Cell[NamedLog], Outcome] = {}
-    with workers(jobs, None):
-        for cell, outcome in outcomes(run_cell, cells):
-            done[cell] = outcome if isinstance(outcome, Outcome) else Outcome.failed(cell, outcome)
-            if on_run is not None:
-                on_run()
+    experiment = Experiment(cells=cells, work=run_cell, died=Outcome.failed)
+    found = experiment.run(jobs, on_cell=on_run)
     chosen = choose_reference(reference, estimators)
-    return Comparison(tuple(logs), tuple(estimators), chosen, tuple(done[cell] for cell in cells))
+    return Comparison(tuple(logs), tuple(estimators), chosen, tuple(found))
 
 
 # --- tables ----------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import pandas as pd
 from tyro.conf import Positional, arg
@@ -19,9 +19,8 @@ from pathspace_graph.eval.benchmark.scaling import measure_scaling
 from pathspace_graph.eval.benchmark.scaling_output import MARKER, scaling_table, stops, write_scaling
 from pathspace_graph.eval.experiment.faults import only, strongest, suite
 from pathspace_graph.eval.experiment.output import write_study, write_suite
-from pathspace_graph.eval.experiment.run import make_plan, run_plan
+from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study
-from pathspace_graph.eval.experiment.workers import check_jobs
 from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figures, render_pages, to_json
 from pathspace_graph.io.files import check_target, write_json, write_manifest, write_text
 from pathspace_graph.settings.mapper import MapperSettings
@@ -59,8 +58,11 @@ class StudyCommand:
         check_jobs(self.jobs)
         study = with_drives(study, self.tracks, self.seeds, self.laps)
         plan = make_plan(study)
+        if stale := plan.stale(self.out):
+            note(f"{stale} runs in {self.out} are of other code, and are not used")
         with progress("runs", lines=LINES) as advance:
-            frame = run_plan(plan, self.out, self.jobs, self.cluster, self.retry_failed, advance)
+            how: dict[str, Any] = {"cluster": self.cluster, "retry_failed": self.retry_failed}
+            frame = run_plan(plan, self.out, jobs=self.jobs, on_cell=advance, **how)
         text = write(study, frame, self.out)
         write_manifest(self.out)
         say(text.rstrip("\n"), f"\nwritten to {self.out}")
