@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from math import isfinite
+from math import isfinite, isnan
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -20,21 +20,30 @@ from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError, check_name
 from pathspace_graph.io.parsing import read_json, read_text
+from pathspace_graph.sim.mistakes import MISTAKES
 
 from .benchmark.measurement import measure_drive, metrics
+from .benchmark.roads import QUICK, ScalingSettings, make_drives
+from .benchmark.scaling import measure_scaling
+from .benchmark.scaling_output import scaling_figures
 from .experiment.cells import ESTIMATORS as ESTIMATOR_ROOMS
 from .experiment.cells import code_digest
 from .experiment.faults import kinds, of_middle_strength, only, outcomes, suite
-from .experiment.frame import RUN, RUN_OF, estimate, last_laps
+from .experiment.frame import COMBINATION, RUN, RUN_OF, TIMES, contrasts, estimate, last_laps
 from .experiment.run import run_study
-from .experiment.study import DEFAULT, Study, find_study, read_study
+from .experiment.study import DEFAULT, Baseline, Study, find_study, read_study
 from .experiment.tables import TextTable
+from .hints import HintStudy
 from .metrics.metric import METRICS
 
 FORMAT: Final = "pathspace-figures/1"
 NOTHING: Final = "pages"
 """Name in place of the experiments where only the pages are written anew."""
 FILE: Final = "figures.json"
+ABLATIONS: Final = ("gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
+"""Studies of parts of the method, driven by one estimator on the generated tracks for two laps."""
+ONE_SEED: Final = ("gauge", "robust")
+"""Those with so many variants that they are driven with one seed."""
 PAGES: Final = {
     "readme-accuracy": "README.md",
     "readme-compared": "README.md",
@@ -43,13 +52,21 @@ PAGES: Final = {
     "results-tracks": "docs/results.md",
     "results-laps": "docs/results.md",
     "results-compared": "docs/results.md",
+    "results-scaling": "docs/results.md",
     "skidpad": "docs/closing.md",
     "camera": "docs/studies.md",
-    "faults": "docs/reliability.md",
+    "closing": "docs/studies.md",
+    "hard": "docs/studies.md",
+    "endurance": "docs/studies.md",
+    "reach": "docs/studies.md",
+    "paper": "docs/studies.md",
+    **dict.fromkeys(("faults", "recovery", "hints"), "docs/reliability.md"),
+    "centerline": "docs/ablations.md",
+    **dict.fromkeys(ABLATIONS, "docs/ablations.md"),
 }
 """Page of each table, from the root of the project."""
 ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
-ONLINE, BATCH = ESTIMATORS[:2]
+ONLINE, BATCH, LANDMARKS = ESTIMATORS[:3]
 STATED: Final = {DEFAULT: "stated"}
 """Name of the default noise, since a simulated log states its own."""
 GENERATED: Final = (0, 1, 2)
@@ -67,11 +84,23 @@ SPEED: Final = {
 """Figures of the benchmark, each with its label."""
 README_SPEED: Final = 6
 """Number of those that the README shows."""
+SCALED: Final = ScalingSettings(cones_max=800.0, laps=10)
+"""How far the time of an update is measured."""
+README: Final = ("rmse", "missed", "reach_median")
 COMPARED: Final = (
     *("missed_2m", "missed_1m", "rmse_capped", "mapped_to_truth", "truth_to_mapped", "ghost_landmarks"),
     *("ghost_metres", "along", "across", "nees", "inside", "closed", "bytes", "bytes_covariance"),
 )
 """Metrics of the wider comparison."""
+CLOSING: Final = ("rmse", "rmse_by_batch", "turn_from_batch", "turn_nees", "inside", "ate", "jump")
+"""Metrics by which a closed map is held against that of the batch."""
+ENDURANCE: Final = ("rmse", "inside", "nees", "ate")
+REACH: Final = ("reach_median", "reach_p10", "reach_short", "reach_error", "rmse")
+PAPER: Final = ("rmse", "missed", "size", "ate", "inside")
+CENTRE_LINE: Final = (
+    *("rmse", "nees", "inside", "centre", "centre_nees", "half_width", "half_width_nees"),
+    "missed",
+)
 FAULTS: Final = {
     "rmse by clean": ("ratio_mean", 2),
     "least": ("ratio_min", 2),
@@ -84,6 +113,11 @@ FAULTS: Final = {
     "said so [%]": ("told", 0),
 }
 """Columns of the table of faults, each with its value and digits."""
+RECOVERY: Final = {
+    "longest time [s]": ("astray_time", 1),
+    "longest way [m]": ("astray_way", 0),
+}
+"""Columns of the table of how long a vehicle is over a metre off, once the loop has closed."""
 BENCHMARK_SEEDS: Final = (0, 1, 2)
 _MARKED: Final = re.compile(r"(<!-- report: ([\w-]+) -->\n)(.*?)(<!-- end report -->)", re.DOTALL)
 
@@ -104,6 +138,11 @@ class Figure:
         mean = estimate(factor * array[np.isfinite(array)])
         value, half = (round(x, 6) if isfinite(x) else None for x in (mean.mean, mean.half))
         return cls(value, half, digits)
+
+    @classmethod
+    def known(cls, value: float, digits: int = 3) -> Self:
+        """Return a value without an interval, or none where it is NaN."""
+        return cls(None if isnan(value) else round(value, 6), None, digits)
 
     @property
     def text(self) -> str:
@@ -149,7 +188,9 @@ class MeasuredTable:
 
 
 Tables = dict[str, MeasuredTable]
-View = tuple[tuple[str, ...], tuple[tuple[str, tuple[Figure, ...]], ...]]
+Rows = tuple[tuple[str, tuple[Figure, ...]], ...]
+"""Label and figures of each row."""
+View = tuple[tuple[str, ...], Rows]
 """Header and rows of a table."""
 Views = dict[str, View]
 
@@ -173,14 +214,19 @@ class Plan:
         """Drive all estimators on all tracks."""
         tracks: tuple[Path | int, ...] = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
         estimators, seeds, laps = (ESTIMATORS[:3], (0, 1), 2) if self.quick else (ESTIMATORS, (0, 1), 5)
-        study = Study(name="accuracy", tracks=tracks, estimators=estimators, seeds=seeds, laps=laps)
-        frame = self._run(study, folder)
+        base = Baseline(estimator=ONLINE)
+        drives: dict[str, Any] = {"tracks": tracks, "estimators": estimators, "seeds": seeds, "laps": laps}
+        study = Study(name="accuracy", baseline=base, metrics=PAPER, **drives)
+        frame, shown = self._run(study, folder), tuple(dict.fromkeys([1, 2, laps]))
         return {
-            "readme-accuracy": accuracy_table(frame, laps),
+            "readme-accuracy": lap_columns(frame, shown, README),
             "readme-compared": compared_table(frame),
             "results-tracks": tracks_table(frame),
             "results-laps": laps_table(frame),
-            "results-compared": metrics_table(frame),
+            "results-compared": metrics_table(frame, COMPARED),
+            "closing": lap_columns(frame, shown, CLOSING),
+            "reach": difference_table(study, frame[frame["lap"] == 1], LANDMARKS, REACH),
+            "paper": study_table(study, frame),
         }
 
     def skidpad(self, folder: Path) -> Views:
@@ -192,16 +238,46 @@ class Plan:
 
     def camera(self, folder: Path) -> Views:
         """Drive the study `camera` with one seed, whose noise is another one on each track."""
-        small: dict[str, Any] = {"tracks": (0,), "laps": 1} if self.quick else {}
-        study = replace(read_study(find_study(Path("camera"))), seeds=(0,), **small)
-        return {"camera": camera_table(self._run(study, folder))}
+        return {"camera": camera_table(self._shipped("camera", folder, seeds=(0,))[1])}
+
+    def hard(self, folder: Path) -> Views:
+        """Drive the study `hard` with one seed."""
+        study, frame = self._shipped("hard", folder, seeds=(0,))
+        return {"hard": lap_columns(frame, tuple(dict.fromkeys([1, 2, study.laps])), CLOSING)}
+
+    def endurance(self, folder: Path) -> Views:
+        """Drive a hundred laps on two tracks."""
+        study, frame = self._shipped("endurance", folder, tracks=GENERATED[:2])
+        shown = [lap for lap in (3, 10, 30, 100) if lap <= study.laps] or [study.laps]
+        return {"endurance": lap_columns(frame, shown, ENDURANCE)}
+
+    def centerline(self, folder: Path) -> Views:
+        """Drive the estimators of a centre line with a width, and those of two boundaries."""
+        study, frame = self._shipped("centerline", folder, tracks=GENERATED, seeds=(0,))
+        return {"centerline": metrics_table(frame, CENTRE_LINE, study.estimators)}
+
+    def ablation(self, name: str, folder: Path) -> Views:
+        """Drive the variants of a shipped study for two laps, under the first and the last of its noises."""
+        noises = list(read_study(find_study(Path(name))).noise.items())
+        small: dict[str, Any] = {"tracks": GENERATED, "laps": 2, "noise": dict([noises[0], noises[-1]])}
+        small["seeds"] = (0,) if name in ONE_SEED else (0, 1)
+        study, frame = self._shipped(name, folder, **small)
+        return {name: study_table(study, frame)}
 
     def faults(self, folder: Path) -> Views:
         """Drive the suite of faults at the middle strengths with one seed."""
         study = replace(of_middle_strength(suite()), seeds=(0,))
         if self.quick:
             study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
-        return {"faults": faults_table(study, self._run(study, folder))}
+        frame = self._run(study, folder)
+        return {"faults": faults_table(study, frame), "recovery": faults_table(study, frame, RECOVERY)}
+
+    def hints(self, folder: Path) -> Views:
+        """Judge good and spoiled logs."""
+        small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
+        tracks = tuple(map(str, GENERATED[: 1 if self.quick else 3]))
+        study = HintStudy(out=folder, tracks=tracks, seeds=(0,), jobs=self.jobs, **small)
+        return {"hints": hints_table(study.measure(self.on_cell))}
 
     def speed(self, _: Path) -> Views:
         """Time the benchmark's drives."""
@@ -215,8 +291,30 @@ class Plan:
         view = ("figure", "measured"), rows
         return {"readme-speed": (view[0], rows[:README_SPEED]), "results-speed": view}
 
+    def scale(self, _: Path) -> Views:
+        """Time updates against the size of the map, the detections and the laps."""
+        settings = QUICK if self.quick else SCALED
+        header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
+        rows = tuple(
+            (f"`{name}`", tuple(Figure.known(value, 2) for value, _ in row)) for name, row in found.items()
+        )
+        return {"results-scaling": (header, rows)}
+
+    def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:
+        """Drive a shipped study, made smaller: with `quick` the first variant for one lap."""
+        study = replace(read_study(find_study(Path(name))), **small)
+        if self.quick:
+            grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
+            variants = dict([*study.variants.items()][:1])
+            study = replace(study, tracks=(0,), seeds=(0,), laps=1, variants=variants, grids=grids)
+        return study, self._run(study, folder)
+
     def _run(self, study: Study, folder: Path) -> pd.DataFrame:
         return run_study(study, folder, jobs=self.jobs, on_cell=self.on_cell)
+
+
+def _ablation(name: str) -> Callable[[Plan, Path], Views]:
+    return lambda plan, folder: plan.ablation(name, folder)
 
 
 EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
@@ -224,22 +322,27 @@ EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "skidpad": Plan.skidpad,
     "camera": Plan.camera,
     "faults": Plan.faults,
+    "hard": Plan.hard,
+    "endurance": Plan.endurance,
+    "centerline": Plan.centerline,
+    **{name: _ablation(name) for name in ABLATIONS},
+    "hints": Plan.hints,
     "speed": Plan.speed,
+    "scale": Plan.scale,
 }
 
 
-def accuracy_table(frame: pd.DataFrame, laps: int) -> View:
-    """Return the online map after laps 1, 2 and the last, and the batch."""
-    shown = dict.fromkeys([1, 2, laps])
+# --- views -----------------------------------------------------------------------------------------------
+
+
+def lap_columns(frame: pd.DataFrame, laps: Sequence[int], keys: Sequence[str]) -> View:
+    """Return metrics of the online map after some laps, and of the batch where it ran."""
     online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
-    drives = len(online[online["lap"] == 1])
-    header = (f"mean over {drives} drives, at the end of", *(f"lap {lap}" for lap in shown), "batch")
-    parts = [*(online[online["lap"] == lap] for lap in shown), last_laps(batch)]
-    rows = tuple(
-        (METRICS[key].heading, tuple(_figure(key, part) for part in parts))
-        for key in ("rmse", "missed", "reach_median")
-    )
-    return header, rows
+    drives = len(online[online["lap"] == online["lap"].min()])
+    columns = {f"lap {lap}": online[online["lap"] == lap] for lap in laps}
+    columns |= {"batch": last_laps(batch)} if len(batch) else {}
+    header = (f"mean over {drives} drives, at the end of", *columns)
+    return header, _by_metric(keys, columns)
 
 
 def compared_table(frame: pd.DataFrame) -> View:
@@ -261,16 +364,12 @@ def tracks_table(frame: pd.DataFrame) -> View:
         "within 2σ [%]": ("inside", last),
         "NEES": ("nees", last),
     }
-    rows = tuple(
-        (
-            str(track),
-            tuple(
-                replace(_figure(k, part[part["track"] == track]), half=None) for k, part in columns.values()
-            ),
-        )
-        for track in frame["track"].unique()
-    )
-    return ("track", *columns), rows
+
+    def row(track: str) -> tuple[Figure, ...]:
+        parts = ((key, part[part["track"] == track]) for key, part in columns.values())
+        return tuple(replace(_figure(key, part), half=None) for key, part in parts)
+
+    return ("track", *columns), tuple((str(track), row(track)) for track in frame["track"].unique())
 
 
 def laps_table(frame: pd.DataFrame) -> View:
@@ -284,16 +383,42 @@ def laps_table(frame: pd.DataFrame) -> View:
     return ("rmse after lap [m]", *(f"`{name}`" for name in names)), rows
 
 
-def metrics_table(frame: pd.DataFrame) -> View:
-    """Return further metrics of every estimator at the end of its last lap."""
+def metrics_table(frame: pd.DataFrame, keys: Sequence[str], names: Sequence[str] = ESTIMATORS) -> View:
+    """Return metrics of every estimator at the end of its last lap."""
     last = last_laps(frame)
-    parts = {
-        name: last[last["estimator"] == name] for name in ESTIMATORS if (last["estimator"] == name).any()
-    }
-    rows = tuple(
-        (METRICS[key].heading, tuple(_figure(key, part) for part in parts.values())) for key in COMPARED
-    )
-    return ("last lap", *(f"`{name}`" for name in parts)), rows
+    parts = {f"`{name}`": last[last["estimator"] == name] for name in names}
+    parts = {name: part for name, part in parts.items() if len(part)}
+    return ("last lap", *parts), _by_metric(keys, parts)
+
+
+def study_table(study: Study, frame: pd.DataFrame) -> View:
+    """Return each combination: the first metric of the study, its paired difference and p, and the others.
+
+    p is corrected over all comparisons of the study.
+    """
+    several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"]
+    first, *others = (key for key in study.metrics if key in frame and key not in TIMES)
+    last, rows = last_laps(frame), []
+    for contrast in contrasts(study, frame, first):
+        names, by = [getattr(contrast, name) for name in several], contrast.difference
+        part = last[(last[several] == names).all(axis=1)]
+        difference = Figure(None) if by is None else _difference(first, contrast.differences)
+        p = Figure.known(contrast.p)
+        rest = (_figure(key, part) for key in others)
+        rows.append((", ".join(names), (_figure(first, part), difference, p, *rest)))
+    headings = [METRICS[key].heading for key in (first, *others)]
+    return (", ".join(several), headings[0], "difference", "p", *headings[1:]), tuple(rows)
+
+
+def difference_table(study: Study, frame: pd.DataFrame, other: str, keys: Sequence[str]) -> View:
+    """Return metrics of the baseline and of another estimator, and what the other has more, paired."""
+    parts = {name: frame[frame["estimator"] == name] for name in (str(study.baseline.estimator), other)}
+    rows = []
+    for key in keys:
+        by = (c.differences for c in contrasts(study, frame, key) if c.estimator == other)
+        figures = (_figure(key, part) for part in parts.values())
+        rows.append((METRICS[key].heading, (*figures, _difference(key, next(by, ())))))
+    return ("lap 1", *(f"`{name}`" for name in parts), "difference"), tuple(rows)
 
 
 def skidpad_table(frame: pd.DataFrame) -> View:
@@ -316,7 +441,18 @@ def camera_table(frame: pd.DataFrame) -> View:
     return ("estimator, noise", *keys.values()), (*rows, ("landmarks, told all", oracle))
 
 
-def faults_table(study: Study, frame: pd.DataFrame) -> View:
+def hints_table(rows: pd.DataFrame) -> View:
+    """Return the share of the logs that are told by their cause, for each mistake, or accused."""
+    spoiled, good = rows[rows["kind"] == "spoiled"], rows[rows["kind"] == "good"]
+    groups = {str(name): of["told"] for name, of in spoiled.groupby("name", sort=False)}
+    groups |= {"**all mistakes**": spoiled["told"], "**good logs, accused of any**": good["said"]}
+    shares = {name: (float(np.sum(told)), float(len(told))) for name, told in groups.items()}
+    return ("mistake", "told", "logs"), tuple(
+        (name, tuple(Figure.known(count, 0) for count in counts)) for name, counts in shares.items()
+    )
+
+
+def faults_table(study: Study, frame: pd.DataFrame, columns: Mapping[str, tuple[str, int]] = FAULTS) -> View:
     """Return what each fault costs by the clean run on the same track, and whether anything was said."""
     rows = []
     for outcome in outcomes(study, frame):
@@ -324,13 +460,13 @@ def faults_table(study: Study, frame: pd.DataFrame) -> View:
         values |= {name: values[name] / runs for name in ("closed", "lost", "told")}
         figures = tuple(
             Figure.of([values[key]], digits, 100.0 if "%" in title else 1.0)
-            for title, (key, digits) in FAULTS.items()
+            for title, (key, digits) in columns.items()
         )
         rows.append((f"{outcome.fault.kind}: {outcome.fault.strength}".removesuffix(": "), figures))
-    return ("fault", *FAULTS), tuple(rows)
+    return ("fault", *columns), tuple(rows)
 
 
-def _by_estimator(frame: pd.DataFrame, keys: Sequence[str]) -> tuple[tuple[str, tuple[Figure, ...]], ...]:
+def _by_estimator(frame: pd.DataFrame, keys: Sequence[str]) -> Rows:
     last = last_laps(frame)
     parts = {name: last[last["estimator"] == name] for name in ESTIMATORS}
     return tuple(
@@ -338,9 +474,19 @@ def _by_estimator(frame: pd.DataFrame, keys: Sequence[str]) -> tuple[tuple[str, 
     )
 
 
+def _by_metric(keys: Sequence[str], parts: Mapping[str, pd.DataFrame]) -> Rows:
+    return tuple((METRICS[key].heading, tuple(_figure(key, part) for part in parts.values())) for key in keys)
+
+
 def _figure(key: str, part: pd.DataFrame) -> Figure:
     metric, values = METRICS[key], part[key] if key in part else pd.Series(dtype=float)
+    if metric.average == "rms":
+        return Figure.known(metric.factor * metric.over(values.astype(float)), metric.digits)
     return Figure.of(values, metric.digits, metric.factor)
+
+
+def _difference(key: str, differences: Sequence[float]) -> Figure:
+    return Figure.of(differences, METRICS[key].digits, METRICS[key].factor)
 
 
 # --- files -----------------------------------------------------------------------------------------------
@@ -399,6 +545,7 @@ def render(page: Path, text: str, tables: Tables, sources: str) -> str:
 
 def _rendered(page: Path, tables: Tables, sources: str, found: re.Match[str]) -> str:
     begin, name, _, end = found.groups()
-    if name not in tables:
+    if name not in tables and name not in PAGES:
         raise InputError(page, f"expected a table of the report, found {name}")
-    return f"{begin}{tables[name].markdown(sources)}{end}"
+    shown = tables[name].markdown(sources) if name in tables else "\n*Not measured yet.*\n\n"
+    return f"{begin}{shown}{end}"
