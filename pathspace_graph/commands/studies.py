@@ -171,8 +171,8 @@ class Report:
     """Measure the figures of the pages, or what remains of them, and write them and the pages' tables.
 
     The experiments are `accuracy`, `skidpad`, `camera`, `faults`, `hard`, `endurance`, `centerline`, the
-    ablations `gauge`, `robust`, `density`, `lag`, `relinearize`, `degree` and `covariance`, and `hints`, `speed`
-    and `scale`. Each study keeps its runs in a folder of its own, from which a second call goes on.
+    ablations `gauge`, `robust`, `density`, `lag`, `relinearize`, `degree` and `covariance`, and `hints`,
+    `speed` and `scale`. Each study keeps its runs in a folder of its own, from which a second call goes on.
     """
 
     out: Path
