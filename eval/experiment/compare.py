@@ -63,19 +63,17 @@ class Comparison:
     @cached_property
     def frame(self) -> pd.DataFrame:
         """Tidy row per run and lap, and one per run for the whole log, with the gaps to the batch."""
-        rows = [row for outcome in self.outcomes for row in self._rows(outcome)]
+        results = {tuple(outcome.names.values()): outcome.result for outcome in self.outcomes}
+        rows: list[dict[str, Any]] = []
+        for outcome in self.outcomes:
+            for row in outcome.rows:
+                about = {"scope": "lap" if row.lap else "log", "lap": row.lap or outcome.laps}
+                rows.append({**outcome.names, **about, **row.values})
+            batch = results.get((outcome.names["log"], registry.DEFAULT_BATCH))
+            if outcome.result is not None and batch is not None and outcome.result is not batch:
+                rows[-1] |= gap_columns(outcome.result, batch)
         add_batch(rows, ("log",))
         return pd.DataFrame(rows, columns=None if rows else [*RUN, "scope", "lap"])
-
-    def _rows(self, outcome: Outcome) -> list[dict[str, Any]]:
-        rows: list[dict[str, Any]] = []
-        for row in outcome.rows:
-            about = {"scope": "lap" if row.lap else "log", "lap": row.lap or outcome.laps}
-            rows.append({**outcome.names, **about, **row.values})
-        batch = self.result(outcome.names["log"], registry.DEFAULT_BATCH)
-        if outcome.result is not None and batch is not None and outcome.result is not batch:
-            rows[-1] |= gap_columns(outcome.result, batch)
-        return rows
 
     @property
     def final(self) -> pd.DataFrame:
@@ -88,10 +86,6 @@ class Comparison:
 
     def of(self, log: str) -> list[Outcome]:
         return [outcome for outcome in self.outcomes if outcome.names["log"] == log]
-
-    def result(self, log: str, estimator: str) -> RunResult | None:
-        """Return the result of an estimator on a log, if it ran there and did not fail."""
-        return next((o.result for o in self.of(log) if o.names["estimator"] == estimator), None)
 
     @property
     def has_truth(self) -> bool:
@@ -109,8 +103,7 @@ class Comparison:
     @property
     def unsettled(self) -> list[Outcome]:
         """Outcomes of batches that did not converge."""
-        runs = ((outcome, outcome.result) for outcome in self.outcomes)
-        return [outcome for outcome, run in runs if isinstance(run, BatchRun) and not run.converged]
+        return [o for o in self.outcomes if isinstance(o.result, BatchRun) and not o.result.converged]
 
 
 def gap_columns(result: RunResult, batch: RunResult) -> dict[str, float]:
@@ -142,8 +135,7 @@ def choose(names: Sequence[str]) -> tuple[str, ...]:
     """Return estimators by name, or all that are known if none is named; SettingsError if one is unknown."""
     known = known_estimators()
     for name in names:
-        if name not in known:
-            raise SettingsError(f"--estimators: expected known ones ({', '.join(known)}), found '{name}'")
+        _check(name, known, "--estimators: expected known ones")
     return tuple(dict.fromkeys(names or known))
 
 
@@ -151,11 +143,13 @@ def choose_reference(name: str | None, estimators: Sequence[str]) -> str:
     """Return the named one, or the default estimator if it is compared, or else the first."""
     if name is None:
         return registry.DEFAULT if registry.DEFAULT in estimators else estimators[0]
-    if name not in estimators:
-        raise SettingsError(
-            f"--reference: expected one that is compared ({', '.join(estimators)}), found '{name}'"
-        )
+    _check(name, estimators, "--reference: expected one that is compared")
     return name
+
+
+def _check(name: str, known: Sequence[str], expected: str) -> None:
+    if name not in known:
+        raise SettingsError(f"{expected} ({', '.join(known)}), found '{name}'")
 
 
 def compare(
