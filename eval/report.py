@@ -19,6 +19,7 @@ from pathspace_graph.errors import InputError, check_name
 from pathspace_graph.io.parsing import read_json, read_text
 from pathspace_graph.sim.mistakes import MISTAKES
 
+from . import views
 from .benchmark.measurement import measure_drive, metrics
 from .benchmark.roads import QUICK, ScalingSettings, make_drives
 from .benchmark.scaling import measure_scaling
@@ -30,26 +31,7 @@ from .experiment.run import run_study
 from .experiment.study import Baseline, Study, find_study, read_study
 from .experiment.tables import TextTable
 from .hints import HintStudy
-from .views import (
-    ESTIMATORS,
-    LANDMARKS,
-    ONLINE,
-    RECOVERY,
-    Figure,
-    Rows,
-    View,
-    camera_table,
-    compared_table,
-    difference_table,
-    faults_table,
-    hints_table,
-    lap_columns,
-    laps_table,
-    metrics_table,
-    skidpad_table,
-    study_table,
-    tracks_table,
-)
+from .views import ESTIMATORS, LANDMARKS, ONLINE, Figure, Rows, View
 
 FORMAT: Final = "pathspace-figures/1"
 NOTHING: Final = "pages"
@@ -103,7 +85,7 @@ COMPARED: Final = (
     *("ghost_metres", "along", "across", "nees", "inside", "closed", "bytes", "bytes_covariance"),
 )
 """Metrics of the wider comparison."""
-CLOSING: Final = ("rmse", "rmse_by_batch", "turn_from_batch", "turn_nees", "inside", "ate", "jump")
+CLOSING: Final = ("rmse", "rmse_by_batch", "turn_from_batch", "turn_nees", "inside", "ate")
 """Metrics by which a closed map is held against that of the batch."""
 ENDURANCE: Final = ("rmse", "inside", "nees", "ate")
 REACH: Final = ("reach_median", "reach_p10", "reach_short", "reach_error", "rmse")
@@ -176,14 +158,14 @@ class Plan:
         study = Study(name="accuracy", baseline=base, metrics=PAPER, **drives)
         frame, shown = self._run(study, folder), tuple(dict.fromkeys([1, 2, laps]))
         return {
-            "readme-accuracy": lap_columns(frame, shown, README),
-            "readme-compared": compared_table(frame),
-            "results-tracks": tracks_table(frame),
-            "results-laps": laps_table(frame),
-            "results-compared": metrics_table(frame, COMPARED),
-            "closing": lap_columns(frame, shown, CLOSING),
-            "reach": difference_table(study, frame[frame["lap"] == 1], LANDMARKS, REACH),
-            "paper": study_table(study, frame),
+            "readme-accuracy": views.lap_columns(frame, shown, README),
+            "readme-compared": views.compared_table(frame),
+            "results-tracks": views.tracks_table(frame),
+            "results-laps": views.laps_table(frame),
+            "results-compared": views.metrics_table(frame, COMPARED),
+            "closing": views.lap_columns(frame, shown, CLOSING),
+            "reach": views.difference_table(study, frame[frame["lap"] == 1], LANDMARKS, REACH),
+            "paper": views.study_table(study, frame),
         }
 
     def skidpad(self, folder: Path) -> Views:
@@ -191,27 +173,27 @@ class Plan:
         seeds, estimators = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
         tracks = (Path("skidpad"),)
         study = Study(name="skidpad", tracks=tracks, estimators=estimators, seeds=seeds, laps=1)
-        return {"skidpad": skidpad_table(self._run(study, folder))}
+        return {"skidpad": views.skidpad_table(self._run(study, folder))}
 
     def camera(self, folder: Path) -> Views:
         """Drive the study `camera` with one seed, whose noise is another one on each track."""
-        return {"camera": camera_table(self._shipped("camera", folder, seeds=(0,))[1])}
+        return {"camera": views.camera_table(self._shipped("camera", folder, seeds=(0,))[1])}
 
     def hard(self, folder: Path) -> Views:
         """Drive the study `hard` with one seed."""
         study, frame = self._shipped("hard", folder, seeds=(0,))
-        return {"hard": lap_columns(frame, tuple(dict.fromkeys([1, 2, study.laps])), CLOSING)}
+        return {"hard": views.lap_columns(frame, tuple(dict.fromkeys([1, 2, study.laps])), CLOSING)}
 
     def endurance(self, folder: Path) -> Views:
         """Drive a hundred laps on two tracks."""
         study, frame = self._shipped("endurance", folder, tracks=GENERATED[:2])
         shown = [lap for lap in (3, 10, 30, 100) if lap <= study.laps] or [study.laps]
-        return {"endurance": lap_columns(frame, shown, ENDURANCE)}
+        return {"endurance": views.lap_columns(frame, shown, ENDURANCE)}
 
     def centerline(self, folder: Path) -> Views:
         """Drive the estimators of a centre line with a width, and those of two boundaries."""
         study, frame = self._shipped("centerline", folder, tracks=GENERATED, seeds=(0,))
-        return {"centerline": metrics_table(frame, CENTRE_LINE, study.estimators)}
+        return {"centerline": views.metrics_table(frame, CENTRE_LINE, study.estimators)}
 
     def ablation(self, name: str, folder: Path) -> Views:
         """Drive the variants of a shipped study for two laps, under the first and the last of its noises."""
@@ -219,7 +201,7 @@ class Plan:
         small: dict[str, Any] = {"tracks": GENERATED, "laps": 2, "noise": dict([noises[0], noises[-1]])}
         small["seeds"] = (0,) if name in ONE_SEED else (0, 1)
         study, frame = self._shipped(name, folder, **small)
-        return {name: study_table(study, frame)}
+        return {name: views.study_table(study, frame)}
 
     def faults(self, folder: Path) -> Views:
         """Drive the suite of faults at the middle strengths with one seed."""
@@ -227,14 +209,17 @@ class Plan:
         if self.quick:
             study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
         frame = self._run(study, folder)
-        return {"faults": faults_table(study, frame), "recovery": faults_table(study, frame, RECOVERY)}
+        return {
+            "faults": views.faults_table(study, frame),
+            "recovery": views.faults_table(study, frame, views.RECOVERY),
+        }
 
     def hints(self, folder: Path) -> Views:
         """Judge good and spoiled logs."""
         small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
         tracks = tuple(map(str, GENERATED[: 1 if self.quick else 3]))
         study = HintStudy(out=folder, tracks=tracks, seeds=(0,), jobs=self.jobs, **small)
-        return {"hints": hints_table(study.measure(self.on_cell))}
+        return {"hints": views.hints_table(study.measure(self.on_cell))}
 
     def speed(self, _: Path) -> Views:
         """Time the benchmark's drives."""
@@ -287,6 +272,8 @@ EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "speed": Plan.speed,
     "scale": Plan.scale,
 }
+QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "hints", "speed", "scale")
+"""Experiments of a quick report: the others have no view of their own."""
 
 
 # --- files -----------------------------------------------------------------------------------------------
@@ -302,7 +289,7 @@ def measure_figures(
     tables, sources = dict(known), sources_digest()
     for name in only:
         check_name(name, (*EXPERIMENTS, NOTHING), "--only: expected an experiment")
-    for name in (name for name in only or EXPERIMENTS if name != NOTHING):
+    for name in (name for name in only or (QUICKEST if plan.quick else EXPERIMENTS) if name != NOTHING):
         for table, (header, rows) in EXPERIMENTS[name](plan, folder / name).items():
             tables[table] = MeasuredTable(**about, sources=sources, header=header, rows=rows)
     return tables

@@ -58,7 +58,7 @@ def main() -> None:
     """Run the script; the exit code is 1 where a figure is worse than the baseline, 2 on bad files."""
     benchmark = tyro.cli(Benchmark)
     try:
-        worse = _run(benchmark)
+        worse = _is_worse(benchmark)
     except PathspaceError as error:
         note(f"benchmark: {error}")
         raise SystemExit(BAD_INPUT) from error
@@ -66,7 +66,7 @@ def main() -> None:
         raise SystemExit(WORSE)
 
 
-def _run(benchmark: Benchmark) -> bool:
+def _is_worse(benchmark: Benchmark) -> bool:
     """Measure, write and report; return whether anything is worse than the baseline."""
     benchmark.check()
     measurement = benchmark.measure()

@@ -29,9 +29,8 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
-from .gtsam_window import linear_window, time_gtsam
-from .isam2 import ToldLandmarks
 from .ratios import Metric
+from .rivals import ToldLandmarks, linear_window, time_gtsam
 
 AHEAD: Final = 20.0
 """Distance ahead (m) at which the track is looked at after every cycle, as a controller does."""
@@ -108,28 +107,29 @@ class _Sampler:
     def __init__(self, mapper: FixedLagMapper, log: Log, every: int, advance: Callable[[], None]) -> None:
         self._mapper, self._every, self._advance = mapper, every, advance
         self._cycles, self._rival = split_odometry(log), make_online(RIVAL, mapper.settings, log)
-        self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
         self._told = ToldLandmarks(log)
+        self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
+        self._interval = log.cycles[-1].t / len(log.cycles)
+        self._closed_at = np.inf
         self.cycles: list[CycleRecord] = []
         self.rival: list[float] = []
         self.isam2: list[float] = []
         self.ahead: list[float] = []
-        self.closing: ObservedCycle | None = None
-        self.swap: ObservedCycle | None = None
-        self._interval = log.cycles[-1].t / len(log.cycles)
+        self.closing: int | None = None
+        self.swap: int | None = None
 
     def __call__(self, cycle: ObservedCycle) -> None:
         share = cycle.processor / cycle.seconds
         stages = {name: share * seconds for name, seconds in cycle.record.stages.items()}
         self.cycles.append(replace(cycle.record, seconds=cycle.processor, stages=stages))
         if cycle.result.closed and self.closing is None:
-            self.closing = cycle
+            self.closing, self._closed_at = cycle.number, cycle.result.t
         if cycle.result.jump is not None:
-            self.swap = cycle
-        sampled = cycle.number >= WARM_UP and cycle.number % self._every == 0
-        if self._solves(cycle):
+            self.swap = cycle.number
+        # a batch of the lap, which is always shorter than the lag, may be under way in its own process
+        if self.swap is None and 0.0 <= cycle.result.t - self._closed_at < self._mapper.settings.lag:
             time.sleep(self._interval)
-        elif sampled and self._mapper.boundaries:
+        elif cycle.number >= WARM_UP and cycle.number % self._every == 0 and self._mapper.boundaries:
             for ordering, times in time_gtsam(linear_window(self._mapper)).items():
                 self._timings[ordering].append(times)
         begin = time.thread_time()
@@ -139,11 +139,6 @@ class _Sampler:
         self.rival.append(seconds)
         self.isam2.append(self._told.advance())
         self._advance()
-
-    def _solves(self, cycle: ObservedCycle) -> bool:
-        """Return whether a batch of the lap may be under way, which is always shorter than the lag."""
-        since = np.inf if self.closing is None else cycle.result.t - self.closing.result.t
-        return self.swap is None and since < self._mapper.settings.lag
 
     def fastest(self) -> Gtsam:
         """Return GTSAM's times in the ordering with the least mean."""
@@ -166,17 +161,16 @@ def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Me
     with progress("benchmark", len(log.cycles)) as advance:
         sampler = _Sampler(mapper, log, every, advance)
         result = run_online(log, mapper, observers=[sampler])
-    closing, swap = (None if at is None else at.number for at in (sampler.closing, sampler.swap))
     return Measurement(
-        tuple(sampler.cycles),
-        result.laps,
-        closing,
-        sampler.fastest(),
-        tuple(sampler.rival),
-        tuple(sampler.isam2),
-        swap,
-        mapper.lap_seconds,
-        tuple(sampler.ahead),
+        cycles=tuple(sampler.cycles),
+        laps=result.laps,
+        closing=sampler.closing,
+        gtsam=sampler.fastest(),
+        rival=tuple(sampler.rival),
+        isam2=tuple(sampler.isam2),
+        swap=sampler.swap,
+        solve=mapper.lap_seconds,
+        ahead=tuple(sampler.ahead),
     )
 
 

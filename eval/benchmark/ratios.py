@@ -55,7 +55,6 @@ class Compared:
     """A figure of this run beside that of the baseline."""
 
     metric: Metric
-    """Figure of this run, NaN where the run has none."""
     baseline: float | None
 
     @property
