@@ -15,11 +15,11 @@ from typing import Any, Final, Self
 
 import pandas as pd
 
-from pathspace_graph.errors import InputError, check_name
+from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.parsing import read_json, read_text
 from pathspace_graph.sim.mistakes import MISTAKES
 
-from . import views
+from . import real, views
 from .benchmark.measurement import measure_drive, metrics
 from .benchmark.roads import QUICK, ScalingSettings, make_drives
 from .benchmark.scaling import measure_scaling
@@ -50,6 +50,8 @@ PAGES: Final = {
     "results-laps": "docs/results.md",
     "results-compared": "docs/results.md",
     "results-scaling": "docs/results.md",
+    "readme-real": "README.md",
+    **dict.fromkeys(("real-runs", "real-maps", "real-measured"), "docs/real.md"),
     "skidpad": "docs/closing.md",
     "camera": "docs/studies.md",
     "closing": "docs/studies.md",
@@ -145,6 +147,8 @@ class Plan:
     """Drive little, to see that everything works."""
     tracks: tuple[Path, ...] = ()
     """Folders of track files that are driven beside the generated tracks."""
+    real: tuple[Path, ...] = ()
+    """Folders of logs of a real car."""
     jobs: int = 1
     on_cell: Callable[[int, int], None] | None = None
     """Observer of the progress of a study."""
@@ -233,6 +237,18 @@ class Plan:
         view = ("figure", "measured"), rows
         return {"readme-speed": (view[0], rows[:README_SPEED]), "results-speed": view}
 
+    def real_logs(self, folder: Path) -> Views:
+        """Map the logs of a real car."""
+        if not self.real:
+            raise SettingsError("--only real: expected logs in --real, found none")
+        drives = [real.map_real_log(log, folder) for log in self.real]
+        return {
+            "readme-real": real.ends_table(drives),
+            "real-runs": real.runs_table(drives),
+            "real-maps": real.maps_table(drives),
+            "real-measured": real.measured_table(drives),
+        }
+
     def scale(self, _: Path) -> Views:
         """Time updates against the size of the map, the detections and the laps."""
         settings = QUICK if self.quick else SCALED
@@ -271,6 +287,7 @@ EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "hints": Plan.hints,
     "speed": Plan.speed,
     "scale": Plan.scale,
+    "real": Plan.real_logs,
 }
 QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "hints", "speed", "scale")
 """Experiments of a quick report: the others have no view of their own."""
@@ -289,7 +306,9 @@ def measure_figures(
     tables, sources = dict(known), sources_digest()
     for name in only:
         check_name(name, (*EXPERIMENTS, NOTHING), "--only: expected an experiment")
-    for name in (name for name in only or (QUICKEST if plan.quick else EXPERIMENTS) if name != NOTHING):
+    every = [name for name in QUICKEST if plan.quick] or [*EXPERIMENTS]
+    chosen = only or [name for name in every if name != "real" or plan.real]
+    for name in (name for name in chosen if name != NOTHING):
         for table, (header, rows) in EXPERIMENTS[name](plan, folder / name).items():
             tables[table] = MeasuredTable(**about, sources=sources, header=header, rows=rows)
     return tables

@@ -102,9 +102,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-# --- tables ----------------------------------------------------------------------------------------------
-
-
 def metrics_table(figures: Iterable[Metric]) -> Table:
     """Return a table for a terminal: each figure beside its bound."""
     table = _table("figure", "value", "unit", "bound")

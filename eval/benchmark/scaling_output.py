@@ -141,9 +141,6 @@ def _process_megabytes() -> float | None:
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-# --- figures ---------------------------------------------------------------------------------------------
-
-
 def plot_scaling(scaling: Scaling) -> Figure:
     """Draw two sweeps on logarithmic axes, with fitted lines, and a cross where an estimator was stopped."""
     with style.figure_context():

@@ -175,9 +175,6 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     return last.assign(told=(last["said"] != "") | (last["told_lost"] > 0.0))
 
 
-# --- table -----------------------------------------------------------------------------------------------
-
-
 def fault_table(study: Study, found: Sequence[FaultOutcome]) -> TextTable:
     """Return a row for each fault and strength, without columns that no run knows anything of."""
     values = [outcome.values() for outcome in found]

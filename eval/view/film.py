@@ -60,9 +60,6 @@ def film(file: Path | str, frames_per_second: float) -> Iterator[Film]:
             raise OutputError(f"{temporary.name}: ffmpeg could not write the film: {error}") from error
 
 
-# --- gif -------------------------------------------------------------------------------------------------
-
-
 class GifFilm:
     """Collects the frames of a .gif, each in colours of its own, for Pillow's writer."""
 
@@ -94,9 +91,6 @@ def pixels_of(figure: Figure) -> Pixels:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.array(canvas.buffer_rgba(), np.uint8)[:, :, :3]
-
-
-# --- mp4 -------------------------------------------------------------------------------------------------
 
 
 class _FfmpegFilm:

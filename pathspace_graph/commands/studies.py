@@ -85,9 +85,6 @@ def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], l
     return replace(study, **own)  # type: ignore[arg-type]
 
 
-# --- ablate ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class Ablate(StudyCommand):
     """Run a study, or what remains of it, and write its results, its summary and its figures."""
@@ -97,9 +94,6 @@ class Ablate(StudyCommand):
 
     def run(self) -> None:
         self.execute(read_study(find_study(self.study)), write_study)
-
-
-# --- faults ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,9 +114,6 @@ class FaultSuite(StudyCommand):
     def run(self) -> None:
         chosen = replace(only(suite(), self.only), estimators=(self.estimator,))
         self.execute(strongest(chosen) if self.quick else chosen, write_suite)
-
-
-# --- scale -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,16 +154,14 @@ class Scale:
         say(*stops(scaling), f"written to {self.out}")
 
 
-# --- report ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class Report:
     """Measure the figures of the pages, or what remains of them, and write them and the pages' tables.
 
     The experiments are `accuracy`, `skidpad`, `camera`, `faults`, `hard`, `endurance`, `centerline`, the
     ablations `gauge`, `robust`, `density`, `lag`, `relinearize`, `degree` and `covariance`, and `hints`,
-    `speed` and `scale`. Each study keeps its runs in a folder of its own, from which a second call goes on.
+    `speed`, `scale` and, with logs, `real`. Each study keeps its runs in a folder of its own, from which a
+    second call goes on.
     """
 
     out: Path
@@ -183,6 +172,8 @@ class Report:
     """Names of the experiments to run, or `pages` for none; the other figures stay as they are."""
     tracks: tuple[Path, ...] = ()
     """Track files, or folders of them, that `accuracy` drives beside the generated tracks."""
+    real: tuple[Path, ...] = ()
+    """Folders of logs of a real car, which are mapped as well."""
     pages: Path | None = None
     """Root of the project whose `docs/figures.json` and pages are written."""
     quick: bool = False
@@ -199,7 +190,8 @@ class Report:
             "date": date.today().isoformat(),
         }
         with progress("runs", lines=LINES) as advance:
-            plan = Plan(quick=self.quick, tracks=self.tracks, jobs=self.jobs, on_cell=advance)
+            drives: dict[str, Any] = {"tracks": self.tracks, "real": self.real, "quick": self.quick}
+            plan = Plan(jobs=self.jobs, on_cell=advance, **drives)
             tables = measure_figures(plan, self.out, self.only, about, known)
         self.out.mkdir(parents=True, exist_ok=True)
         written = [self.out / FILE]
