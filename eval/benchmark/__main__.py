@@ -15,8 +15,17 @@ from pathspace_graph.console import note, output, say
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import atomic_file, check_file_target, write_json
 
-from .measurement import Measurement, measure_drive, metrics
-from .ratios import BASELINE, baseline_table, compare, metrics_table, read_baseline, write_baseline
+from .measurement import (
+    BASELINE,
+    Measurement,
+    baseline_table,
+    compare,
+    measure_drive,
+    metrics,
+    metrics_table,
+    read_baseline,
+    write_baseline,
+)
 
 WORSE: Final = 1
 """Exit code where a figure is worse than the baseline."""

@@ -22,7 +22,7 @@ from pathspace_graph.eval.experiment.compare import (
     read_logs,
     side_by_side,
 )
-from pathspace_graph.eval.experiment.map_panels import find_blind_spot, plot_maps
+from pathspace_graph.eval.experiment.plots import find_blind_spot, plot_maps
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.io.log import Log, Truth, read_log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
