@@ -4,11 +4,12 @@ Good logs of all kinds are judged: what is unusual about them is no mistake, and
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Never
 
 import numpy as np
 import pandas as pd
@@ -18,9 +19,10 @@ from threadpoolctl import threadpool_limits
 from tyro.conf import arg
 
 from pathspace_graph.console import note, progress, say
-from pathspace_graph.errors import PathspaceError, check_name
+from pathspace_graph.errors import PathspaceError, SolveError, check_name
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment.cells import NamedTrack, load_tracks
+from pathspace_graph.eval.experiment.run import Experiment, OnCell, WorkerDiedError
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.io.files import atomic_folder, check_target
@@ -194,60 +196,77 @@ GOOD: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class HintStudy:
-    """Spoils simulated logs by each mistake, and varies good ones; says how many are told and accused."""
+    """Spoil simulated logs by each mistake, and vary good ones; say how many are told and accused."""
 
     out: Path
-    """The results are written to this folder; earlier ones there are kept as a numbered backup."""
+    """Folder for the results; earlier ones there are kept as a numbered backup."""
     tracks: Annotated[tuple[str, ...], arg(metavar="TRACK...")] = ("0", "1")
-    """The drives are on these tracks: files, folders of files, or seeds of generated tracks."""
+    """Track files, folders of them, or seeds of generated tracks."""
     seeds: tuple[int, ...] = (0, 1)
-    """Each track is driven with these seeds."""
+    """Seeds of the drives on each track."""
     laps: int = 1
-    """Each drive has this number of laps."""
+    """Laps of each drive."""
     good: bool = True
-    """Good logs of all kinds are judged as well."""
+    """Judge good logs of all kinds as well."""
     mistakes: tuple[str, ...] = tuple(MISTAKES)
-    """Logs are spoiled by these mistakes."""
+    """Mistakes by which logs are spoiled."""
     kinds: tuple[str, ...] = (AS_SIMULATED,)
-    """Good logs of these kinds are spoiled."""
+    """Kinds of good logs that are spoiled."""
     maps: bool = False
-    """What becomes of the map of each spoiled log is measured, too, which takes long."""
+    """Measure what becomes of the map of each spoiled log, too, which takes long."""
+    jobs: int = 1
+    """Number of processes at a time, -1 for one on each core."""
 
-    def run(self) -> TextTable:
-        """Judge every log, write the results and return the table."""
+    def measure(self, on_cell: OnCell | None = None) -> pd.DataFrame:
+        """Judge every log, and return a row for each."""
         for name in self.mistakes:
             check_name(name, MISTAKES, "--mistakes: expected a known mistake")
         for name in self.kinds:
             check_name(name, GOOD, "--kinds: expected a known kind of good log")
-        check_target(self.out, MARKER)
+        kinds = tuple(kind for kind in GOOD if self.good or kind in self.kinds)
         tracks = load_tracks([int(one) if one.isdigit() else Path(one) for one in self.tracks])
-        rows: list[Row] = []
-        with progress("judging", len(tracks) * len(self.seeds)) as advance:
-            for track in tracks:
-                for seed in self.seeds:
-                    drive = {"track": track.name, "seed": seed}
-                    rows += [drive | row for row in self._judge(track, seed)]
-                    advance()
-        frame = pd.DataFrame(rows)
+        cells = [HintCell(self, *cell) for cell in product(tracks, self.seeds, kinds)]
+        rows = Experiment(cells=cells, work=judge, died=lost).run(self.jobs, on_cell=on_cell)
+        return pd.DataFrame([row for of in rows for row in of])
+
+    def run(self) -> TextTable:
+        """Judge every log, write the results and return the table."""
+        check_target(self.out, MARKER)
+        with progress("judging") as advance:
+            frame = self.measure(advance)
         table = summary(frame)
         with atomic_folder(self.out, MARKER) as folder:
             frame.to_csv(folder / MARKER, index=False, lineterminator="\n")
             (folder / "hints.md").write_text(table.markdown(), encoding="utf-8")
         return table
 
-    def _judge(self, track: NamedTrack, seed: int) -> Iterator[Row]:
-        """Yield a row for each log of a drive: the good ones, and each of those that are spoiled."""
-        for of, kind in GOOD.items():
-            if not self.good and of not in self.kinds:
-                continue
-            log = kind.log(track, seed, self.laps)
-            if self.good:
-                yield {"kind": "good", "name": of, "of": of, **judged(log)}
-            clean = mapped(log) if self.maps and of in self.kinds else {}
-            for name in self.mistakes if of in self.kinds else ():
-                spoiled = MISTAKES[name](log)
-                row = {"of": of, "kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))}
-                yield row | (outcome(mapped(spoiled), clean) if self.maps else {})
+
+@dataclass(frozen=True, eq=False)
+class HintCell:
+    """Logs of one kind of one drive."""
+
+    study: HintStudy
+    track: NamedTrack
+    seed: int
+    kind: str
+
+
+def judge(cell: HintCell) -> list[Row]:
+    """Return a row for the good log of a cell, and for each of those that are spoiled."""
+    study, spoil = cell.study, cell.kind in cell.study.kinds
+    log = GOOD[cell.kind].log(cell.track, cell.seed, study.laps)
+    good: Row = {"kind": "good", "name": cell.kind, "of": cell.kind}
+    rows = [good | judged(log)] if study.good else []
+    clean = mapped(log) if study.maps and spoil else {}
+    for name in study.mistakes if spoil else ():
+        spoiled = MISTAKES[name](log)
+        row = {"of": cell.kind, "kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))}
+        rows.append(row | (outcome(mapped(spoiled), clean) if study.maps else {}))
+    return [{"track": cell.track.name, "seed": cell.seed} | row for row in rows]
+
+
+def lost(cell: HintCell, error: WorkerDiedError) -> Never:
+    raise SolveError(f"{cell.kind} on {cell.track.name}: {error}")
 
 
 def causes_of(mistake: str) -> tuple[str, ...]:

@@ -10,31 +10,37 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from hashlib import sha256
-from importlib.util import find_spec
-from math import isfinite
 from pathlib import Path
 from typing import Any, Final, Self
 
-import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 
-from pathspace_graph.errors import InputError, check_name
+from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.parsing import read_json, read_text
+from pathspace_graph.sim.mistakes import MISTAKES
 
+from . import real, views
 from .benchmark.measurement import measure_drive, metrics
-from .experiment.faults import kinds, of_middle_strength, only, outcomes, suite
-from .experiment.frame import RUN, RUN_OF, estimate, last_laps
+from .benchmark.roads import QUICK, ScalingSettings, make_drives
+from .benchmark.scaling import measure_scaling
+from .benchmark.scaling_output import scaling_figures
+from .experiment.cells import ESTIMATORS as ESTIMATOR_ROOMS
+from .experiment.cells import code_digest
+from .experiment.faults import kinds, of_middle_strength, only, suite
 from .experiment.run import run_study
-from .experiment.study import DEFAULT, Study, find_study, read_study
+from .experiment.study import Baseline, Study, find_study, read_study
 from .experiment.tables import TextTable
-from .metrics.metric import METRICS
+from .hints import HintStudy
+from .views import ESTIMATORS, LANDMARKS, ONLINE, Figure, Rows, View
 
 FORMAT: Final = "pathspace-figures/1"
 NOTHING: Final = "pages"
 """Name in place of the experiments where only the pages are written anew."""
 FILE: Final = "figures.json"
+ABLATIONS: Final = ("gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
+"""Studies of parts of the method, driven by one estimator on the generated tracks for two laps."""
+ONE_SEED: Final = ("gauge", "robust")
+"""Those with so many variants that they are driven with one seed."""
 PAGES: Final = {
     "readme-accuracy": "README.md",
     "readme-compared": "README.md",
@@ -43,20 +49,21 @@ PAGES: Final = {
     "results-tracks": "docs/results.md",
     "results-laps": "docs/results.md",
     "results-compared": "docs/results.md",
+    "results-scaling": "docs/results.md",
+    "readme-real": "README.md",
+    **dict.fromkeys(("real-runs", "real-maps", "real-measured"), "docs/real.md"),
     "skidpad": "docs/closing.md",
     "camera": "docs/studies.md",
-    "faults": "docs/reliability.md",
+    "closing": "docs/studies.md",
+    "hard": "docs/studies.md",
+    "endurance": "docs/studies.md",
+    "reach": "docs/studies.md",
+    "paper": "docs/studies.md",
+    **dict.fromkeys(("faults", "recovery", "hints"), "docs/reliability.md"),
+    "centerline": "docs/ablations.md",
+    **dict.fromkeys(ABLATIONS, "docs/ablations.md"),
 }
 """Page of each table, from the root of the project."""
-ROOMS: Final = (
-    *("baselines", "batch", "factors", "front_end", "graph", "loop", "mapping", "online"),
-    *("scale", "settings", "sim", "spline"),
-)
-"""Rooms whose sources the figures depend on."""
-ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
-ONLINE, BATCH = ESTIMATORS[:2]
-STATED: Final = {DEFAULT: "stated"}
-"""Name of the default noise, since a simulated log states its own."""
 GENERATED: Final = (0, 1, 2)
 """Seeds of the generated tracks."""
 SPEED: Final = {
@@ -72,51 +79,24 @@ SPEED: Final = {
 """Figures of the benchmark, each with its label."""
 README_SPEED: Final = 6
 """Number of those that the README shows."""
+SCALED: Final = ScalingSettings(cones_max=800.0, laps=10)
+"""How far the time of an update is measured."""
+README: Final = ("rmse", "missed", "reach_median")
 COMPARED: Final = (
     *("missed_2m", "missed_1m", "rmse_capped", "mapped_to_truth", "truth_to_mapped", "ghost_landmarks"),
     *("ghost_metres", "along", "across", "nees", "inside", "closed", "bytes", "bytes_covariance"),
 )
 """Metrics of the wider comparison."""
-FAULTS: Final = {
-    "rmse by clean": ("ratio_mean", 2),
-    "least": ("ratio_min", 2),
-    "most": ("ratio_max", 2),
-    "missed [%]": ("missed", 1),
-    "closed [%]": ("closed", 0),
-    "lost at the end [%]": ("lost", 0),
-    "largest error [m]": ("error_max", 1),
-    "called degraded [%]": ("told_degraded", 1),
-    "said so [%]": ("told", 0),
-}
-"""Columns of the table of faults, each with its value and digits."""
+CLOSING: Final = ("rmse", "rmse_by_batch", "turn_from_batch", "turn_nees", "inside", "ate")
+"""Metrics by which a closed map is held against that of the batch."""
+ENDURANCE: Final = ("rmse", "inside", "nees", "ate")
+REACH: Final = ("reach_median", "reach_p10", "reach_short", "reach_error", "rmse")
+PAPER: Final = ("rmse", "missed", "size", "ate", "inside")
+CENTRE_LINE: Final = (
+    *("rmse", "missed", "nees", "inside", "centre", "centre_nees", "half_width", "half_width_nees"),
+)
 BENCHMARK_SEEDS: Final = (0, 1, 2)
 _MARKED: Final = re.compile(r"(<!-- report: ([\w-]+) -->\n)(.*?)(<!-- end report -->)", re.DOTALL)
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A measured value, with half the width of its 95 % interval over drives or runs."""
-
-    value: float | None
-    """Value in the table's unit; None where there is none."""
-    half: float | None = None
-    digits: int = 3
-
-    @classmethod
-    def of(cls, values: ArrayLike, digits: int = 3, factor: float = 1.0) -> Self:
-        """Return the mean of the known values (n,), times a factor."""
-        array = np.asarray(values, float)
-        mean = estimate(factor * array[np.isfinite(array)])
-        value, half = (round(x, 6) if isfinite(x) else None for x in (mean.mean, mean.half))
-        return cls(value, half, digits)
-
-    @property
-    def text(self) -> str:
-        """Return the figure as a table shows it."""
-        if self.value is None:
-            return ""
-        half = "" if self.half is None else f" ± {self.half:.{self.digits}f}"
-        return f"{self.value:.{self.digits}f}{half}"
 
 
 @dataclass(frozen=True)
@@ -132,8 +112,7 @@ class MeasuredTable:
     """Digest of the sources of the estimators."""
     header: tuple[str, ...]
     """Headings of the labels and of each column."""
-    rows: tuple[tuple[str, tuple[Figure, ...]], ...]
-    """Label and figures of each row."""
+    rows: Rows
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
@@ -154,8 +133,6 @@ class MeasuredTable:
 
 
 Tables = dict[str, MeasuredTable]
-View = tuple[tuple[str, ...], tuple[tuple[str, tuple[Figure, ...]], ...]]
-"""Header and rows of a table."""
 Views = dict[str, View]
 
 
@@ -170,6 +147,8 @@ class Plan:
     """Drive little, to see that everything works."""
     tracks: tuple[Path, ...] = ()
     """Folders of track files that are driven beside the generated tracks."""
+    real: tuple[Path, ...] = ()
+    """Folders of logs of a real car."""
     jobs: int = 1
     on_cell: Callable[[int, int], None] | None = None
     """Observer of the progress of a study."""
@@ -178,14 +157,19 @@ class Plan:
         """Drive all estimators on all tracks."""
         tracks: tuple[Path | int, ...] = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
         estimators, seeds, laps = (ESTIMATORS[:3], (0, 1), 2) if self.quick else (ESTIMATORS, (0, 1), 5)
-        study = Study(name="accuracy", tracks=tracks, estimators=estimators, seeds=seeds, laps=laps)
-        frame = self._run(study, folder)
+        base = Baseline(estimator=ONLINE)
+        drives: dict[str, Any] = {"tracks": tracks, "estimators": estimators, "seeds": seeds, "laps": laps}
+        study = Study(name="accuracy", baseline=base, metrics=PAPER, **drives)
+        frame, shown = self._run(study, folder), tuple(dict.fromkeys([1, 2, laps]))
         return {
-            "readme-accuracy": accuracy_table(frame, laps),
-            "readme-compared": compared_table(frame),
-            "results-tracks": tracks_table(frame),
-            "results-laps": laps_table(frame),
-            "results-compared": metrics_table(frame),
+            "readme-accuracy": views.lap_columns(frame, shown, README),
+            "readme-compared": views.compared_table(frame),
+            "results-tracks": views.tracks_table(frame),
+            "results-laps": views.laps_table(frame),
+            "results-compared": views.metrics_table(frame, COMPARED),
+            "closing": views.lap_columns(frame, shown, CLOSING),
+            "reach": views.difference_table(study, frame[frame["lap"] == 1], LANDMARKS, REACH),
+            "paper": views.study_table(study, frame),
         }
 
     def skidpad(self, folder: Path) -> Views:
@@ -193,20 +177,53 @@ class Plan:
         seeds, estimators = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
         tracks = (Path("skidpad"),)
         study = Study(name="skidpad", tracks=tracks, estimators=estimators, seeds=seeds, laps=1)
-        return {"skidpad": skidpad_table(self._run(study, folder))}
+        return {"skidpad": views.skidpad_table(self._run(study, folder))}
 
     def camera(self, folder: Path) -> Views:
         """Drive the study `camera` with one seed, whose noise is another one on each track."""
-        small: dict[str, Any] = {"tracks": (0,), "laps": 1} if self.quick else {}
-        study = replace(read_study(find_study(Path("camera"))), seeds=(0,), **small)
-        return {"camera": camera_table(self._run(study, folder))}
+        return {"camera": views.camera_table(self._shipped("camera", folder, seeds=(0,))[1])}
+
+    def hard(self, folder: Path) -> Views:
+        """Drive the study `hard` with one seed."""
+        study, frame = self._shipped("hard", folder, seeds=(0,))
+        return {"hard": views.lap_columns(frame, tuple(dict.fromkeys([1, 2, study.laps])), CLOSING)}
+
+    def endurance(self, folder: Path) -> Views:
+        """Drive a hundred laps on two tracks."""
+        study, frame = self._shipped("endurance", folder, tracks=GENERATED[:2])
+        shown = [lap for lap in (3, 10, 30, 100) if lap <= study.laps] or [study.laps]
+        return {"endurance": views.lap_columns(frame, shown, ENDURANCE)}
+
+    def centerline(self, folder: Path) -> Views:
+        """Drive the estimators of a centre line with a width, and those of two boundaries."""
+        study, frame = self._shipped("centerline", folder, tracks=GENERATED, seeds=(0,))
+        return {"centerline": views.metrics_table(frame, CENTRE_LINE, study.estimators)}
+
+    def ablation(self, name: str, folder: Path) -> Views:
+        """Drive the variants of a shipped study for two laps, under the first and the last of its noises."""
+        noises = list(read_study(find_study(Path(name))).noise.items())
+        small: dict[str, Any] = {"tracks": GENERATED, "laps": 2, "noise": dict([noises[0], noises[-1]])}
+        small["seeds"] = (0,) if name in ONE_SEED else (0, 1)
+        study, frame = self._shipped(name, folder, **small)
+        return {name: views.study_table(study, frame)}
 
     def faults(self, folder: Path) -> Views:
         """Drive the suite of faults at the middle strengths with one seed."""
         study = replace(of_middle_strength(suite()), seeds=(0,))
         if self.quick:
             study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
-        return {"faults": faults_table(study, self._run(study, folder))}
+        frame = self._run(study, folder)
+        return {
+            "faults": views.faults_table(study, frame),
+            "recovery": views.faults_table(study, frame, views.RECOVERY),
+        }
+
+    def hints(self, folder: Path) -> Views:
+        """Judge good and spoiled logs."""
+        small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
+        tracks = tuple(map(str, GENERATED[: 1 if self.quick else 3]))
+        study = HintStudy(out=folder, tracks=tracks, seeds=(0,), jobs=self.jobs, **small)
+        return {"hints": views.hints_table(study.measure(self.on_cell))}
 
     def speed(self, _: Path) -> Views:
         """Time the benchmark's drives."""
@@ -220,8 +237,42 @@ class Plan:
         view = ("figure", "measured"), rows
         return {"readme-speed": (view[0], rows[:README_SPEED]), "results-speed": view}
 
+    def real_logs(self, folder: Path) -> Views:
+        """Map the logs of a real car."""
+        if not self.real:
+            raise SettingsError("--only real: expected logs in --real, found none")
+        drives = [real.map_real_log(log, folder) for log in self.real]
+        return {
+            "readme-real": real.ends_table(drives),
+            "real-runs": real.runs_table(drives),
+            "real-maps": real.maps_table(drives),
+            "real-measured": real.measured_table(drives),
+        }
+
+    def scale(self, _: Path) -> Views:
+        """Time updates against the size of the map, the detections and the laps."""
+        settings = QUICK if self.quick else SCALED
+        header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
+        rows = tuple(
+            (f"`{name}`", tuple(Figure.known(value, 2) for value, _ in row)) for name, row in found.items()
+        )
+        return {"results-scaling": (header, rows)}
+
+    def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:
+        """Drive a shipped study, made smaller: with `quick` the first variant for one lap."""
+        study = replace(read_study(find_study(Path(name))), **small)
+        if self.quick:
+            grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
+            variants = dict([*study.variants.items()][:1])
+            study = replace(study, tracks=(0,), seeds=(0,), laps=1, variants=variants, grids=grids)
+        return study, self._run(study, folder)
+
     def _run(self, study: Study, folder: Path) -> pd.DataFrame:
         return run_study(study, folder, jobs=self.jobs, on_cell=self.on_cell)
+
+
+def _ablation(name: str) -> Callable[[Plan, Path], Views]:
+    return lambda plan, folder: plan.ablation(name, folder)
 
 
 EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
@@ -229,123 +280,17 @@ EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "skidpad": Plan.skidpad,
     "camera": Plan.camera,
     "faults": Plan.faults,
+    "hard": Plan.hard,
+    "endurance": Plan.endurance,
+    "centerline": Plan.centerline,
+    **{name: _ablation(name) for name in ABLATIONS},
+    "hints": Plan.hints,
     "speed": Plan.speed,
+    "scale": Plan.scale,
+    "real": Plan.real_logs,
 }
-
-
-def accuracy_table(frame: pd.DataFrame, laps: int) -> View:
-    """Return the online map after laps 1, 2 and the last, and the batch."""
-    shown = dict.fromkeys([1, 2, laps])
-    online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
-    drives = len(online[online["lap"] == 1])
-    header = (f"mean over {drives} drives, at the end of", *(f"lap {lap}" for lap in shown), "batch")
-    parts = [*(online[online["lap"] == lap] for lap in shown), last_laps(batch)]
-    rows = tuple(
-        (METRICS[key].heading, tuple(_figure(key, part) for part in parts))
-        for key in ("rmse", "missed", "reach_median")
-    )
-    return header, rows
-
-
-def compared_table(frame: pd.DataFrame) -> View:
-    """Return every estimator at the end of its last lap."""
-    keys = {"rmse": "rmse [m]", "missed": "missed [%]", "size": "size", "ate": "trajectory error [m]"}
-    return ("estimator, last lap", *keys.values()), _by_estimator(frame, tuple(keys))
-
-
-def tracks_table(frame: pd.DataFrame) -> View:
-    """Return the online map and that of the batch, track by track: too few drives for an interval."""
-    online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
-    first, last = online[online["lap"] == 1], last_laps(online)
-    columns = {
-        "rmse, lap 1 [m]": ("rmse", first),
-        "rmse, last lap [m]": ("rmse", last),
-        "rmse, batch [m]": ("rmse", last_laps(batch)),
-        "missed, lap 1 [%]": ("missed", first),
-        "size [% of cones]": ("size_share", last),
-        "within 2σ [%]": ("inside", last),
-        "NEES": ("nees", last),
-    }
-    rows = tuple(
-        (
-            str(track),
-            tuple(
-                replace(_figure(k, part[part["track"] == track]), half=None) for k, part in columns.values()
-            ),
-        )
-        for track in frame["track"].unique()
-    )
-    return ("track", *columns), rows
-
-
-def laps_table(frame: pd.DataFrame) -> View:
-    """Return the rmse of every online estimator after each lap."""
-    online = frame[frame["lap"] > 0]
-    names = [name for name in ESTIMATORS if online[online["estimator"] == name]["lap"].nunique() > 1]
-    rows = tuple(
-        (str(lap), tuple(_figure("rmse", part[part["estimator"] == name]) for name in names))
-        for lap, part in online.groupby("lap")
-    )
-    return ("rmse after lap [m]", *(f"`{name}`" for name in names)), rows
-
-
-def metrics_table(frame: pd.DataFrame) -> View:
-    """Return further metrics of every estimator at the end of its last lap."""
-    last = last_laps(frame)
-    parts = {
-        name: last[last["estimator"] == name] for name in ESTIMATORS if (last["estimator"] == name).any()
-    }
-    rows = tuple(
-        (METRICS[key].heading, tuple(_figure(key, part) for part in parts.values())) for key in COMPARED
-    )
-    return ("last lap", *(f"`{name}`" for name in parts)), rows
-
-
-def skidpad_table(frame: pd.DataFrame) -> View:
-    """Return every estimator: its trajectory error over the whole drive, and its map at the end."""
-    keys = {"ate": "trajectory error [m]", "rmse": "rmse [m]", "missed": "missed [%]"}
-    square = (frame["ate"] ** 2).groupby([frame[name] for name in RUN_OF]).transform("mean")
-    return ("estimator", *keys.values()), _by_estimator(frame.assign(ate=square**0.5), tuple(keys))
-
-
-def camera_table(frame: pd.DataFrame) -> View:
-    """Return the map of each estimator at stated and at measured noise, and the limit of its landmarks."""
-    keys = {"rmse": "rmse [m]", "missed": "missed [%]", "nees": "NEES of the map"}
-    keys |= {"turn_nees": "NEES of the turn", "told_degraded": "degraded [%]"}
-    last = last_laps(frame)
-    rows = [
-        (f"`{estimator}`, {STATED.get(variant, variant)}", tuple(_figure(key, part) for key in keys))
-        for (estimator, variant), part in last.groupby(["estimator", "variant"], sort=False)
-    ]
-    oracle = (_figure("l", last.drop_duplicates([*RUN])), *[Figure(None)] * (len(keys) - 1))  # one a drive
-    return ("estimator, noise", *keys.values()), (*rows, ("landmarks, told all", oracle))
-
-
-def faults_table(study: Study, frame: pd.DataFrame) -> View:
-    """Return what each fault costs by the clean run on the same track, and whether anything was said."""
-    rows = []
-    for outcome in outcomes(study, frame):
-        values, runs = outcome.values(), max(len(outcome.runs), 1)
-        values |= {name: values[name] / runs for name in ("closed", "lost", "told")}
-        figures = tuple(
-            Figure.of([values[key]], digits, 100.0 if "%" in title else 1.0)
-            for title, (key, digits) in FAULTS.items()
-        )
-        rows.append((f"{outcome.fault.kind}: {outcome.fault.strength}".removesuffix(": "), figures))
-    return ("fault", *FAULTS), tuple(rows)
-
-
-def _by_estimator(frame: pd.DataFrame, keys: Sequence[str]) -> tuple[tuple[str, tuple[Figure, ...]], ...]:
-    last = last_laps(frame)
-    parts = {name: last[last["estimator"] == name] for name in ESTIMATORS}
-    return tuple(
-        (f"`{name}`", tuple(_figure(key, part) for key in keys)) for name, part in parts.items() if len(part)
-    )
-
-
-def _figure(key: str, part: pd.DataFrame) -> Figure:
-    metric, values = METRICS[key], part[key] if key in part else pd.Series(dtype=float)
-    return Figure.of(values, metric.digits, metric.factor)
+QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "hints", "speed", "scale")
+"""Experiments of a quick report: the others have no view of their own."""
 
 
 # --- files -----------------------------------------------------------------------------------------------
@@ -361,7 +306,9 @@ def measure_figures(
     tables, sources = dict(known), sources_digest()
     for name in only:
         check_name(name, (*EXPERIMENTS, NOTHING), "--only: expected an experiment")
-    for name in (name for name in only or EXPERIMENTS if name != NOTHING):
+    every = [name for name in QUICKEST if plan.quick] or [*EXPERIMENTS]
+    chosen = only or [name for name in every if name != "real" or plan.real]
+    for name in (name for name in chosen if name != NOTHING):
         for table, (header, rows) in EXPERIMENTS[name](plan, folder / name).items():
             tables[table] = MeasuredTable(**about, sources=sources, header=header, rows=rows)
     return tables
@@ -385,14 +332,7 @@ def read_figures(file: Path) -> Tables:
 
 def sources_digest() -> str:
     """Return the digest of the sources that the figures depend on."""
-    digest = sha256()
-    for room in ROOMS:
-        spec = find_spec(f"pathspace_graph.{room}")
-        origin = Path(str(spec.origin if spec else None))
-        inside = [*origin.parent.glob("*.py"), *origin.parent.glob("*.cpp")]
-        for file in sorted(inside) if origin.name == "__init__.py" else [origin]:
-            digest.update(f"{room}/{file.name}".encode() + file.read_bytes())
-    return digest.hexdigest()[:16]
+    return code_digest(ESTIMATOR_ROOMS)
 
 
 def render_pages(root: Path, tables: Tables) -> dict[Path, str]:
@@ -411,6 +351,7 @@ def render(page: Path, text: str, tables: Tables, sources: str) -> str:
 
 def _rendered(page: Path, tables: Tables, sources: str, found: re.Match[str]) -> str:
     begin, name, _, end = found.groups()
-    if name not in tables:
+    if name not in tables and name not in PAGES:
         raise InputError(page, f"expected a table of the report, found {name}")
-    return f"{begin}{tables[name].markdown(sources)}{end}"
+    shown = tables[name].markdown(sources) if name in tables else "\n*Not measured yet.*\n\n"
+    return f"{begin}{shown}{end}"

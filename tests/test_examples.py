@@ -10,7 +10,6 @@ from types import ModuleType
 import gtsam
 import pytest
 
-from .convert.recorded import camera_drive, write_recorded
 from .scenes.paths import ROOT
 
 EXAMPLES = ROOT / "examples"
@@ -27,7 +26,7 @@ def example(name: str) -> ModuleType:
 
 
 def test_every_example_has_a_test() -> None:
-    tested = {"gnss", "surveyed_point", "look_at_graph", "real_logs"}
+    tested = {"gnss", "surveyed_point", "look_at_graph"}
     tested |= {"ros2_node", "write_bag"}  # in tests/convert, and by the tutorial
     assert {file.stem for file in EXAMPLES.glob("*.py")} == tested
 
@@ -60,24 +59,6 @@ def test_kinds_are_told_by_class_and_keys() -> None:
     assert example("look_at_graph").kind(prior) == "anchor"
 
 
-def test_real_logs_are_mapped_and_held_against_each_other(tmp_path: Path) -> None:
-    folders = [write_recorded(camera_drive(), tmp_path / name) for name in ("first", "second")]
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- real:begin -->\nold\n<!-- real:end -->\nafter\n")
-    text = example("real_logs").main(folders, tmp_path / "out", page)
-    assert text == (tmp_path / "out" / "real.md").read_text()
-    written = page.read_text()
-    assert written.startswith("before\n<!-- real:begin -->\n")
-    assert written.endswith("<!-- real:end -->\nafter\n")
-    assert text in written
-    assert "old" not in written
-    assert "| first, second | 0.00 | 0.00 |" in text
-    online = next(line for line in text.splitlines() if line.startswith("| first | online | yes |"))
-    assert float(online.split("|")[4].split(" m,")[0]) < 1.0
-    assert (tmp_path / "out" / "logs" / "first" / "log.toml").exists()
-    assert (tmp_path / "out" / "batch" / "second" / "map.json").exists()
-
-
-@pytest.mark.parametrize("name", ["gnss", "surveyed_point", "look_at_graph", "real_logs"])
+@pytest.mark.parametrize("name", ["gnss", "surveyed_point", "look_at_graph"])
 def test_an_example_says_how_to_run_it(name: str) -> None:
     assert f"python examples/{name}.py" in (EXAMPLES / f"{name}.py").read_text()

@@ -159,7 +159,7 @@ ASSIGNED = {
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "commands.online": {"column.justify"},  # of rich
-    "eval.view.film": {"self.writer.fig"},  # of matplotlib
+    "eval.view.animation": {"self.writer.fig"},  # of matplotlib
     "front_end.motion": {"self._rest.sigma"},
     "front_end.sides": {"near.judged"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},

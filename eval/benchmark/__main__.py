@@ -15,8 +15,17 @@ from pathspace_graph.console import note, output, say
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import atomic_file, check_file_target, write_json
 
-from .measurement import Measurement, measure_drive, metrics
-from .ratios import BASELINE, baseline_table, compare, metrics_table, read_baseline, write_baseline
+from .measurement import (
+    BASELINE,
+    Measurement,
+    baseline_table,
+    compare,
+    measure_drive,
+    metrics,
+    metrics_table,
+    read_baseline,
+    write_baseline,
+)
 
 WORSE: Final = 1
 """Exit code where a figure is worse than the baseline."""
@@ -58,7 +67,7 @@ def main() -> None:
     """Run the script; the exit code is 1 where a figure is worse than the baseline, 2 on bad files."""
     benchmark = tyro.cli(Benchmark)
     try:
-        worse = _run(benchmark)
+        worse = _is_worse(benchmark)
     except PathspaceError as error:
         note(f"benchmark: {error}")
         raise SystemExit(BAD_INPUT) from error
@@ -66,7 +75,7 @@ def main() -> None:
         raise SystemExit(WORSE)
 
 
-def _run(benchmark: Benchmark) -> bool:
+def _is_worse(benchmark: Benchmark) -> bool:
     """Measure, write and report; return whether anything is worse than the baseline."""
     benchmark.check()
     measurement = benchmark.measure()

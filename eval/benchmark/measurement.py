@@ -7,21 +7,30 @@ that other work on the machine hardly changes them.
 
 From closing until the map is replaced by one that was solved as a batch, the cycles come as they do in a car,
 since another process solves meanwhile.
+
+Only ratios are in the committed baseline, since times depend on the machine.
 """
 
+import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
+from rich.table import Table
 
 from pathspace_graph.console import progress
+from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.measures import stage_times
+from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.files import atomic_file, write_json
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.parsing import read_json
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed_update
@@ -29,9 +38,131 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
-from .gtsam_window import linear_window, time_gtsam
-from .isam2 import ToldLandmarks
-from .ratios import Metric
+from .rivals import ToldLandmarks, linear_window, time_gtsam
+
+FORMAT: Final = "pathspace-benchmark-baseline/1"
+BASELINE: Final = Path(__file__).with_name("baseline.json")
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One figure of a run."""
+
+    key: str
+    """Name of the figure, also in a baseline."""
+    value: float
+    """Value; NaN where the run was too short for the figure."""
+    unit: str
+    """Unit of the value; empty for a ratio."""
+    direction: Literal["lower", "higher"] = "lower"
+    bound: float | None = None
+    """Worst value allowed, if any value is not."""
+    tolerance: float | None = None
+    """Share by which the figure may be worse than its baseline, if there is one."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the bound is kept; an unknown value keeps none."""
+        return self.bound is None or self._reaches(self.bound)
+
+    def worse_than(self, baseline: float) -> bool:
+        """Return whether the figure is worse than the baseline by more than its tolerance, or unknown."""
+        spare = (self.tolerance or 0.0) * abs(baseline)
+        return not self._reaches(baseline + (spare if self.direction == "lower" else -spare))
+
+    def _reaches(self, value: float) -> bool:
+        return self.value <= value if self.direction == "lower" else self.value >= value
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A figure of this run beside that of the baseline."""
+
+    metric: Metric
+    baseline: float | None
+
+    @property
+    def worse(self) -> bool:
+        """Whether the figure is worse by more than its tolerance, or missing in this run."""
+        return self.baseline is not None and self.metric.worse_than(self.baseline)
+
+
+def ratios(figures: Iterable[Metric]) -> list[Metric]:
+    """Return the figures that have a baseline: ratios with a tolerance."""
+    return [metric for metric in figures if not metric.unit and metric.tolerance is not None]
+
+
+def compare(figures: Iterable[Metric], baseline: Mapping[str, float]) -> list[Compared]:
+    """Compare every figure that has a baseline or should; one that the run lacks is worse."""
+    known = {metric.key: metric for metric in ratios(figures)}
+    return [
+        Compared(known.get(key, Metric(key, math.nan, "", tolerance=0.0)), baseline.get(key))
+        for key in dict.fromkeys([*known, *baseline])
+    ]
+
+
+def write_baseline(file: Path, figures: Iterable[Metric]) -> None:
+    """Write this run's ratios; raise SettingsError where one isn't known because the run is too short."""
+    chosen = {metric.key: round(metric.value, 4) for metric in ratios(figures)}
+    for key, value in chosen.items():
+        if not math.isfinite(value):
+            raise SettingsError(f"--write-baseline: expected a figure for {key}, found none")
+    with atomic_file(file) as temporary:
+        write_json(temporary, {"format": FORMAT, "versions": versions(), "ratios": chosen})
+
+
+def read_baseline(file: Path) -> dict[str, float]:
+    """Return the ratios by name; raise InputError where the file isn't a baseline."""
+    content = read_json(file, "a baseline (--write-baseline makes one)")
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(file, f'expected "format": "{FORMAT}"')
+    entries = content.get("ratios")
+    if not isinstance(entries, dict) or not all(_is_number(value) for value in entries.values()):
+        raise InputError(file, 'expected "ratios": an object of finite numbers')
+    return {key: float(value) for key, value in entries.items()}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def metrics_table(figures: Iterable[Metric]) -> Table:
+    """Return a table for a terminal: each figure beside its bound."""
+    table = _table("figure", "value", "unit", "bound")
+    for metric in figures:
+        sign = "<=" if metric.direction == "lower" else ">="
+        bound = "" if metric.bound is None else f"{sign} {metric.bound:g}"
+        style = None if metric.holds else "red"
+        table.add_row(metric.key, f"{metric.value:.3g}", metric.unit, bound, style=style)
+    return table
+
+
+def baseline_table(compared: Sequence[Compared]) -> Table:
+    """Return a table for a terminal, where figures that are worse are marked in words and in red."""
+    table = _table("ratio", "baseline", "now", "change", "tolerance", "", title="against the baseline")
+    for found in compared:
+        value, before = found.metric.value, found.baseline
+        table.add_row(
+            found.metric.key,
+            "-" if before is None else f"{before:.3g}",
+            f"{value:.3g}",
+            f"{100 * (value / before - 1.0):+.0f} %" if before and math.isfinite(value) else "-",
+            f"{100 * (found.metric.tolerance or 0.0):.0f} %",
+            "WORSE" if found.worse else ("new" if before is None else "ok"),
+            style="red" if found.worse else None,
+        )
+    return table
+
+
+def _table(name: str, *numbers: str, title: str | None = None) -> Table:
+    table = Table(name, title=title, title_justify="left")
+    for number in numbers:
+        table.add_column(number, justify="right")
+    return table
+
+
+# --- a run ---------------------------------------------------------------------------------------------
+
 
 AHEAD: Final = 20.0
 """Distance ahead (m) at which the track is looked at after every cycle, as a controller does."""
@@ -108,28 +239,29 @@ class _Sampler:
     def __init__(self, mapper: FixedLagMapper, log: Log, every: int, advance: Callable[[], None]) -> None:
         self._mapper, self._every, self._advance = mapper, every, advance
         self._cycles, self._rival = split_odometry(log), make_online(RIVAL, mapper.settings, log)
-        self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
         self._told = ToldLandmarks(log)
+        self._timings: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
+        self._interval = log.cycles[-1].t / len(log.cycles)
+        self._closed_at = np.inf
         self.cycles: list[CycleRecord] = []
         self.rival: list[float] = []
         self.isam2: list[float] = []
         self.ahead: list[float] = []
-        self.closing: ObservedCycle | None = None
-        self.swap: ObservedCycle | None = None
-        self._interval = log.cycles[-1].t / len(log.cycles)
+        self.closing: int | None = None
+        self.swap: int | None = None
 
     def __call__(self, cycle: ObservedCycle) -> None:
         share = cycle.processor / cycle.seconds
         stages = {name: share * seconds for name, seconds in cycle.record.stages.items()}
         self.cycles.append(replace(cycle.record, seconds=cycle.processor, stages=stages))
         if cycle.result.closed and self.closing is None:
-            self.closing = cycle
+            self.closing, self._closed_at = cycle.number, cycle.result.t
         if cycle.result.jump is not None:
-            self.swap = cycle
-        sampled = cycle.number >= WARM_UP and cycle.number % self._every == 0
-        if self._solves(cycle):
+            self.swap = cycle.number
+        # a batch of the lap, which is always shorter than the lag, may be under way in its own process
+        if self.swap is None and 0.0 <= cycle.result.t - self._closed_at < self._mapper.settings.lag:
             time.sleep(self._interval)
-        elif sampled and self._mapper.boundaries:
+        elif cycle.number >= WARM_UP and cycle.number % self._every == 0 and self._mapper.boundaries:
             for ordering, times in time_gtsam(linear_window(self._mapper)).items():
                 self._timings[ordering].append(times)
         begin = time.thread_time()
@@ -139,11 +271,6 @@ class _Sampler:
         self.rival.append(seconds)
         self.isam2.append(self._told.advance())
         self._advance()
-
-    def _solves(self, cycle: ObservedCycle) -> bool:
-        """Return whether a batch of the lap may be under way, which is always shorter than the lag."""
-        since = np.inf if self.closing is None else cycle.result.t - self.closing.result.t
-        return self.swap is None and since < self._mapper.settings.lag
 
     def fastest(self) -> Gtsam:
         """Return GTSAM's times in the ordering with the least mean."""
@@ -166,17 +293,16 @@ def measure(log: Log, settings: MapperSettings, every: int = SAMPLE_EVERY) -> Me
     with progress("benchmark", len(log.cycles)) as advance:
         sampler = _Sampler(mapper, log, every, advance)
         result = run_online(log, mapper, observers=[sampler])
-    closing, swap = (None if at is None else at.number for at in (sampler.closing, sampler.swap))
     return Measurement(
-        tuple(sampler.cycles),
-        result.laps,
-        closing,
-        sampler.fastest(),
-        tuple(sampler.rival),
-        tuple(sampler.isam2),
-        swap,
-        mapper.lap_seconds,
-        tuple(sampler.ahead),
+        cycles=tuple(sampler.cycles),
+        laps=result.laps,
+        closing=sampler.closing,
+        gtsam=sampler.fastest(),
+        rival=tuple(sampler.rival),
+        isam2=tuple(sampler.isam2),
+        swap=sampler.swap,
+        solve=mapper.lap_seconds,
+        ahead=tuple(sampler.ahead),
     )
 
 

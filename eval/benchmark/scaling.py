@@ -7,7 +7,7 @@ slows all alike.
 import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Never
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,7 @@ from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.estimators import make_online
+from pathspace_graph.eval.experiment.run import Experiment, WorkerDiedError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry, timed_update, timed_wait
@@ -132,17 +133,13 @@ class Scaling:
     """Most memory (MB) that Python and numpy held while each estimator mapped the first lap."""
 
     def of(self, sweep: Sweep, estimator: str) -> pd.DataFrame:
-        """Return the points of a sweep of an estimator."""
         return self.points[(self.points["sweep"] == sweep) & (self.points["estimator"] == estimator)]
 
     def slope(self, sweep: Sweep, estimator: str) -> pd.Series:
-        """Return the slope of a sweep of an estimator."""
-        own = (self.slopes["sweep"] == sweep) & (self.slopes["estimator"] == estimator)
-        return self.slopes[own].iloc[0]
+        return self.slopes.set_index(["sweep", "estimator"]).loc[(sweep, estimator)]
 
     @property
     def estimators(self) -> tuple[str, ...]:
-        """Name of the estimators, in order."""
         return tuple(self.memory)
 
     def seconds_at(self, cones: float, estimator: str) -> float:
@@ -185,6 +182,36 @@ def fit_slope(
 # --- the measurement -------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class SweepCell:
+    """A sweep of all estimators, one cell of the experiment."""
+
+    sweep: Sweep
+    logs: tuple[tuple[Log, int, Array], ...]
+    """Log, number of detections where that is varied, and the abscissa of each cycle; NaN doesn't count."""
+    edges: Array
+    """Edges of the intervals of the abscissa that are points."""
+    fit_from: float = 0.0
+
+
+def sweeps(drives: Drives, settings: ScalingSettings) -> tuple[SweepCell, ...]:
+    """Return the three sweeps over the drives."""
+    low, high = np.log(settings.cones_min), np.log(settings.cones_max + 1.0)
+    cones = np.exp(np.linspace(low, high, settings.bins + 1))
+    lap = 1.0 + np.searchsorted(drives.lap_ends, [cycle.t for cycle in drives.laps.cycles])
+    dense = []
+    for wanted, log in drives.readings.items():
+        counts = np.array([len(cycle.labels) for cycle in log.cycles])
+        counts[: settings.warm_up] = -1
+        dense.append((log, wanted, np.where(counts == wanted, float(wanted), np.nan)))
+    ends = np.arange(1.0, len(drives.lap_ends) + 2.0)
+    return (
+        SweepCell(CONES, ((drives.cones, 0, drives.seen),), cones, settings.fit_from),
+        SweepCell(READINGS, tuple(dense), np.append(np.sort(settings.readings), np.inf)),
+        SweepCell(LAPS, ((drives.laps, 0, lap.astype(float)),), ends, 2.0),
+    )
+
+
 def measure_scaling(
     estimators: Sequence[str],
     drives: Drives,
@@ -195,41 +222,29 @@ def measure_scaling(
     """Measure all three sweeps, and the memory; `on_cycle` is called after each cycle of a sweep."""
     mapper = mapper or MapperSettings()
 
-    def run(lanes: Sequence[Lane]) -> list[LaneTimes]:
-        return run_lanes(lanes, mapper, settings.budget, on_cycle)
+    def work(cell: SweepCell) -> tuple[pd.DataFrame, list[dict[str, Any]]]:
+        lanes = {Lane(name, log, k): at for name in estimators for log, k, at in cell.logs}
+        times = run_lanes(list(lanes), mapper, settings.budget, on_cycle)
+        points, slopes = [], []
+        for name in estimators:
+            own = [lane for lane in times if lane.lane.estimator == name]
+            points.append(_joined([binned(cell.sweep, lane, lanes[lane.lane], cell.edges) for lane in own]))
+            stops = [(lane.lane.readings, lane.stopped) for lane in own if lane.stopped]
+            stopped = "; ".join(f"{k} readings: {why}" if k else why for k, why in stops)
+            slopes.append(fit_slope(cell.sweep, name, points[-1], cell.fit_from, stopped))
+        return _joined(points), slopes
 
-    ends, laps = drives.lap_ends, drives.laps
-    edges = np.exp(
-        np.linspace(np.log(settings.cones_min), np.log(settings.cones_max + 1.0), settings.bins + 1)
-    )
-    lap = 1.0 + np.searchsorted(ends, [cycle.t for cycle in laps.cycles]).astype(np.float64)
-    points: list[pd.DataFrame] = []
-    slopes: list[dict[str, Any]] = []
-    for times in run([Lane(name, drives.cones) for name in estimators]):
-        points.append(binned(CONES, times, drives.seen, edges))
-        slopes.append(fit_slope(CONES, times.lane.estimator, points[-1], settings.fit_from, times.stopped))
-    dense = run([Lane(name, log, k) for name in estimators for k, log in drives.readings.items()])
-    for name in estimators:
-        own = [times for times in dense if times.lane.estimator == name]
-        points.append(_joined([_at_readings(times, settings.warm_up) for times in own]))
-        stopped = "; ".join(f"{t.lane.readings} readings: {t.stopped}" for t in own if t.stopped)
-        slopes.append(fit_slope(READINGS, name, points[-1], stopped=stopped))
-    for times in run([Lane(name, laps) for name in estimators]):
-        points.append(binned(LAPS, times, lap, np.arange(1.0, len(ends) + 2.0)))
-        slopes.append(fit_slope(LAPS, times.lane.estimator, points[-1], 2.0, times.stopped))
-    first_lap = first_cycles(laps, int(np.searchsorted([cycle.t for cycle in laps.cycles], ends[0])))
+    def died(cell: SweepCell, error: WorkerDiedError) -> Never:
+        raise error
+
+    # in this process, where estimators take turns
+    found = Experiment(cells=sweeps(drives, settings), work=work, died=died).run(jobs=1)
+    end = int(np.searchsorted([cycle.t for cycle in drives.laps.cycles], drives.lap_ends[0]))
+    first_lap = first_cycles(drives.laps, end)
     memory = {name: peak_memory(Lane(name, first_lap), mapper) for name in estimators}
-    return Scaling(settings, asdict(mapper), _joined(points), pd.DataFrame(slopes), memory)
+    slopes = pd.DataFrame([slope for _, of in found for slope in of])
+    return Scaling(settings, asdict(mapper), _joined([points for points, _ in found]), slopes, memory)
 
 
 def _joined(points: Sequence[pd.DataFrame]) -> pd.DataFrame:
     return pd.concat([of for of in points if len(of)] or points[:1], ignore_index=True)
-
-
-def _at_readings(times: LaneTimes, warm_up: int) -> pd.DataFrame:
-    """Return the mean of the cycles after the warm-up that had as many detections as were asked for."""
-    wanted = float(times.lane.readings)
-    cycles = times.lane.log.cycles[: len(times.seconds)]
-    detections = np.array([len(cycle.labels) for cycle in cycles], dtype=float)
-    detections[:warm_up] = np.nan
-    return binned(READINGS, times, detections, np.array([wanted, np.nextafter(wanted, np.inf)]))

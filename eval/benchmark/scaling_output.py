@@ -43,43 +43,58 @@ _TITLES: Final[dict[Sweep, tuple[str, str]]] = {
 """Axis title and title of each panel."""
 
 
+_DIGITS: Final = (2, 2, 1, 2, 0, 1, 1, 1)
+"""Digits of the columns of the table."""
+
+
 # --- table and files -------------------------------------------------------------------------------------
+
+
+def scaling_figures(scaling: Scaling) -> tuple[tuple[str, ...], dict[str, list[tuple[float, float]]]]:
+    """Return the header, and the figures of each estimator with their standard errors, NaN where none."""
+    settings, first = scaling.settings, scaling.estimators[0]
+    header = (
+        "estimator",
+        f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})",
+        "slope, readings",
+        f"ms at {COMPARED_AT:g} cones",
+        f"{first} / this",
+        "most cones",
+        "ms, lap 2",
+        f"ms, lap {settings.laps}",
+        "peak MB",
+    )
+    rows = {}
+    for name in scaling.estimators:
+        slopes = (scaling.slope(sweep, name) for sweep in (CONES, READINGS))
+        at = scaling.seconds_at(COMPARED_AT, name)
+        laps = scaling.of(LAPS, name).set_index("at")["seconds"]
+        alone = [
+            1e3 * at,
+            scaling.seconds_at(COMPARED_AT, first) / at,
+            scaling.of(CONES, name)["at"].max(),
+            *(1e3 * laps.get(float(lap), math.nan) for lap in (2, settings.laps)),
+            scaling.memory[name],
+        ]
+        both = [(float(slope["slope"]), float(slope["error"])) for slope in slopes]
+        rows[name] = [*both, *((float(value), math.nan) for value in alone)]
+    return header, rows
 
 
 def scaling_table(scaling: Scaling) -> TextTable:
     """Return a row for each estimator: slopes, times, the ratio to the first, laps and memory."""
-    settings = scaling.settings
-    slopes = f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})", "slope, readings"
-    at = f"ms at {COMPARED_AT:g} cones", f"{scaling.estimators[0]} / this", "most cones"
-    header = ("estimator", *slopes, *at, f"ms, lap 2 and {settings.laps}", "peak MB")
-    rows = tuple(_row(scaling, name) for name in scaling.estimators)
-    return TextTable("Time per update: slopes of the logarithms, +- standard error", header, rows)
+    header, found = scaling_figures(scaling)
+    header, rows = (*header[:6], f"ms, lap 2 and {scaling.settings.laps}", header[8]), []
+    for name, row in found.items():
+        *cells, second, last, peak = (_number(*of, digits) for of, digits in zip(row, _DIGITS, strict=True))
+        rows.append((name, *cells, f"{second}, {last}", peak))
+    return TextTable("Time per update: slopes of the logarithms, +- standard error", header, tuple(rows))
 
 
-def _row(scaling: Scaling, name: str) -> tuple[str, ...]:
-    here, first = (scaling.seconds_at(COMPARED_AT, one) for one in (name, scaling.estimators[0]))
-    cones, laps = scaling.of(CONES, name)["at"], scaling.of(LAPS, name).set_index("at")["seconds"]
-    ends = (laps.get(float(lap), math.nan) for lap in (2, scaling.settings.laps))
-    return (
-        name,
-        *(_slope(scaling, sweep, name) for sweep in (CONES, READINGS)),
-        _number(1e3 * here, ".1f"),
-        _number(first / here, ".2f"),
-        f"{cones.iloc[-1]:.0f}" if len(cones) else "none",
-        ", ".join(_number(1e3 * seconds, ".1f") for seconds in ends),
-        f"{scaling.memory[name]:.1f}",
-    )
-
-
-def _slope(scaling: Scaling, sweep: Sweep, name: str) -> str:
-    fitted = scaling.slope(sweep, name)
-    if not math.isfinite(fitted["slope"]):
-        return f"too few points ({fitted['points']})"
-    return f"{fitted['slope']:.2f} +- {fitted['error']:.2f}"
-
-
-def _number(value: float, form: str) -> str:
-    return format(value, form) if math.isfinite(value) else "-"
+def _number(value: float, error: float, digits: int) -> str:
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.{digits}f}" + (f" +- {error:.{digits}f}" if math.isfinite(error) else "")
 
 
 def stops(scaling: Scaling) -> list[str]:
@@ -124,9 +139,6 @@ def _process_megabytes() -> float | None:
         return None
     unit = 1e-6 if platform.system() == "Darwin" else 1.024e-3
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-# --- figures ---------------------------------------------------------------------------------------------
 
 
 def plot_scaling(scaling: Scaling) -> Figure:

@@ -6,7 +6,8 @@ import time
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Generic, Self, TypeVar
 
@@ -33,10 +34,17 @@ from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import generate_track
 
 TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
-_IDENTITY_DIGITS: Final = 20
-"""Number of hexadecimal digits of an identity, which are 80 bits."""
-_SEED_DIGITS: Final = 8
-"""Number of hexadecimal digits of a seed."""
+ESTIMATORS: Final = (
+    *("baselines", "batch", "factors", "front_end", "graph", "loop", "mapping", "online"),
+    *("scale", "settings", "sim", "spline"),
+)
+"""Rooms whose sources an estimate on a simulated log depends on."""
+MEASURED: Final = (*ESTIMATORS, "health", "laps", "run", "plausibility", "eval.metrics")
+"""Rooms whose sources the metrics of a run depend on."""
+CELLS: Final = "cells"
+"""Folder of the kept cells."""
+_IDENTITY_DIGITS, _SEED_DIGITS, _CODE_DIGITS = 20, 8, 16
+"""Numbers of hexadecimal digits of an identity, of a seed and of a digest of sources."""
 _latest: dict[str, Log] = {}
 """The log that was simulated last, by its drive."""
 
@@ -96,6 +104,19 @@ def identity(**parts: Any) -> str:
     """Return a text that is the same for the same values, which are JSON's types only."""
     text = json.dumps(parts, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:_IDENTITY_DIGITS]
+
+
+@cache
+def code_digest(rooms: tuple[str, ...]) -> str:
+    """Return the digest of the sources of rooms of this package."""
+    digest = hashlib.sha256()
+    for room in rooms:
+        spec = find_spec(f"pathspace_graph.{room}")
+        origin = Path(str(spec.origin if spec else None))
+        inside = [*origin.parent.glob("*.py"), *origin.parent.glob("*.cpp")]
+        for file in sorted(inside) if origin.name == "__init__.py" else [origin]:
+            digest.update(f"{room}/{file.name}".encode() + file.read_bytes())
+    return digest.hexdigest()[:_CODE_DIGITS]
 
 
 def load_tracks(tracks: Iterable[Path | int]) -> list[NamedTrack]:
@@ -185,10 +206,13 @@ class Cell(Generic[D]):
 
     @cached_property
     def id(self) -> str:
-        """Identity of everything that the result depends on, except the code."""
-        yardsticks, settings = self.measured.get("yardsticks", False), asdict(self.settings)
+        """Identity of everything that the result depends on, also the code."""
         return identity(
-            drive=self.drive.id, estimator=self.estimator, settings=settings, yardsticks=yardsticks
+            drive=self.drive.id,
+            estimator=self.estimator,
+            settings=asdict(self.settings),
+            yardsticks=self.measured.get("yardsticks", False),
+            code=code_digest(MEASURED),
         )
 
     @property
@@ -264,16 +288,19 @@ def record_cell(cell: Cell[Drive]) -> Record:
 
 
 def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
-    return {
-        "format": FORMAT,
-        "id": cell.id,
-        "cell": cell.names,
-        "versions": versions(),
-        "failure": outcome.failure,
-        "traceback": outcome.trace,
-        "said": _said(outcome.result),
-        "laps": lap_rows(outcome.rows),
-    }
+    record: Record = to_plain(
+        {
+            "format": FORMAT,
+            "id": cell.id,
+            "cell": cell.names,
+            "versions": versions(),
+            "failure": outcome.failure,
+            "traceback": outcome.trace,
+            "said": _said(outcome.result),
+            "laps": lap_rows(outcome.rows),
+        }
+    )
+    return record
 
 
 def _said(run: RunResult | None) -> str:
@@ -316,8 +343,8 @@ def write_record(folder: Path, cell: Cell[Drive], record: Record) -> None:
 
 
 def _file(folder: Path, cell: Cell[Drive]) -> Path:
-    return folder / "cells" / f"{cell.id}.json"
+    return folder / CELLS / f"{cell.id}.json"
 
 
 def _digest(record: Record) -> str:
-    return identity(record=to_plain(record))
+    return identity(record=record)

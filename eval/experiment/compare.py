@@ -1,6 +1,6 @@
 """Every estimator on the same logs: their frame, the paper's Table 1, all metrics, and paired differences."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import zip_longest
@@ -26,9 +26,9 @@ from pathspace_graph.settings.online import LimitSettings
 
 from .cells import Cell, NamedLog, Outcome, run_cell
 from .frame import add_batch, difference
+from .run import Experiment, OnCell
 from .study import known_estimators
 from .tables import TextTable, group_starts
-from .workers import check_jobs, outcomes, workers
 
 RUN: Final = ("log", "estimator")
 NO_TRUTH: Final = "the log has no true cones, which rmse, missed and most other metrics need"
@@ -63,19 +63,17 @@ class Comparison:
     @cached_property
     def frame(self) -> pd.DataFrame:
         """Tidy row per run and lap, and one per run for the whole log, with the gaps to the batch."""
-        rows = [row for outcome in self.outcomes for row in self._rows(outcome)]
+        results = {tuple(outcome.names.values()): outcome.result for outcome in self.outcomes}
+        rows: list[dict[str, Any]] = []
+        for outcome in self.outcomes:
+            for row in outcome.rows:
+                about = {"scope": "lap" if row.lap else "log", "lap": row.lap or outcome.laps}
+                rows.append({**outcome.names, **about, **row.values})
+            batch = results.get((outcome.names["log"], registry.DEFAULT_BATCH))
+            if outcome.result is not None and batch is not None and outcome.result is not batch:
+                rows[-1] |= gap_columns(outcome.result, batch)
         add_batch(rows, ("log",))
         return pd.DataFrame(rows, columns=None if rows else [*RUN, "scope", "lap"])
-
-    def _rows(self, outcome: Outcome) -> list[dict[str, Any]]:
-        rows: list[dict[str, Any]] = []
-        for row in outcome.rows:
-            about = {"scope": "lap" if row.lap else "log", "lap": row.lap or outcome.laps}
-            rows.append({**outcome.names, **about, **row.values})
-        batch = self.result(outcome.names["log"], registry.DEFAULT_BATCH)
-        if outcome.result is not None and batch is not None and outcome.result is not batch:
-            rows[-1] |= gap_columns(outcome.result, batch)
-        return rows
 
     @property
     def final(self) -> pd.DataFrame:
@@ -88,10 +86,6 @@ class Comparison:
 
     def of(self, log: str) -> list[Outcome]:
         return [outcome for outcome in self.outcomes if outcome.names["log"] == log]
-
-    def result(self, log: str, estimator: str) -> RunResult | None:
-        """Return the result of an estimator on a log, if it ran there and did not fail."""
-        return next((o.result for o in self.of(log) if o.names["estimator"] == estimator), None)
 
     @property
     def has_truth(self) -> bool:
@@ -109,8 +103,7 @@ class Comparison:
     @property
     def unsettled(self) -> list[Outcome]:
         """Outcomes of batches that did not converge."""
-        runs = ((outcome, outcome.result) for outcome in self.outcomes)
-        return [outcome for outcome, run in runs if isinstance(run, BatchRun) and not run.converged]
+        return [o for o in self.outcomes if isinstance(o.result, BatchRun) and not o.result.converged]
 
 
 def gap_columns(result: RunResult, batch: RunResult) -> dict[str, float]:
@@ -142,8 +135,7 @@ def choose(names: Sequence[str]) -> tuple[str, ...]:
     """Return estimators by name, or all that are known if none is named; SettingsError if one is unknown."""
     known = known_estimators()
     for name in names:
-        if name not in known:
-            raise SettingsError(f"--estimators: expected known ones ({', '.join(known)}), found '{name}'")
+        _check(name, known, "--estimators: expected known ones")
     return tuple(dict.fromkeys(names or known))
 
 
@@ -151,11 +143,13 @@ def choose_reference(name: str | None, estimators: Sequence[str]) -> str:
     """Return the named one, or the default estimator if it is compared, or else the first."""
     if name is None:
         return registry.DEFAULT if registry.DEFAULT in estimators else estimators[0]
-    if name not in estimators:
-        raise SettingsError(
-            f"--reference: expected one that is compared ({', '.join(estimators)}), found '{name}'"
-        )
+    _check(name, estimators, "--reference: expected one that is compared")
     return name
+
+
+def _check(name: str, known: Sequence[str], expected: str) -> None:
+    if name not in known:
+        raise SettingsError(f"{expected} ({', '.join(known)}), found '{name}'")
 
 
 def compare(
@@ -166,23 +160,18 @@ def compare(
     reference: str | None = None,
     ghosts: GhostSettings | None = None,
     jobs: int = 1,
-    on_run: Callable[[], None] | None = None,
+    on_run: OnCell | None = None,
 ) -> Comparison:
-    """Run every estimator on every log, `jobs` at a time on one BLAS thread each; call `on_run` after each.
+    """Run every estimator on every log, `jobs` at a time on one BLAS thread each, see `Experiment.run`.
 
     A failure of one does not stop the others.
     """
-    check_jobs(jobs)
     settings, measured = settings or MapperSettings(), {"ghost_settings": ghosts}
     cells = [Cell(log, name, settings, measured=measured) for log in logs for name in estimators]
-    done: dict[Cell[NamedLog], Outcome] = {}
-    with workers(jobs, None):
-        for cell, outcome in outcomes(run_cell, cells):
-            done[cell] = outcome if isinstance(outcome, Outcome) else Outcome.failed(cell, outcome)
-            if on_run is not None:
-                on_run()
+    experiment = Experiment(cells=cells, work=run_cell, died=Outcome.failed)
+    found = experiment.run(jobs, on_cell=on_run)
     chosen = choose_reference(reference, estimators)
-    return Comparison(tuple(logs), tuple(estimators), chosen, tuple(done[cell] for cell in cells))
+    return Comparison(tuple(logs), tuple(estimators), chosen, tuple(found))
 
 
 # --- tables ----------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -26,21 +26,9 @@ CLEAN: Final = "clean"
 BY_PRIOR: Final = "_by_prior"
 """Suffix of metrics that are estimates of a calibration by the sigma of its prior."""
 TITLE_BY_PRIOR: Final = " by its prior's sigma"
-HEADER: Final = (
-    "fault",
-    "strength",
-    "rmse by clean",
-    "range",
-    "size by clean",
-    "missed [%]",
-    "closed",
-    "lost at the end",
-    "largest error [m]",
-    "over 1 m off after closing [s, m]",
-    "calibration by its prior's sigma",
-    "called degraded, lost [% of cycles]",
-    "said",
-)
+Values = Mapping[str, Any]
+"""Values of an outcome by name."""
+PAIR: Final = "{:.1f}, {:.1f}"
 NOTHING: Final = "nothing"
 """Text where no run said anything."""
 _SAID_LENGTH: Final = 60
@@ -187,48 +175,67 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     return last.assign(told=(last["said"] != "") | (last["told_lost"] > 0.0))
 
 
-# --- table -----------------------------------------------------------------------------------------------
-
-
 def fault_table(study: Study, found: Sequence[FaultOutcome]) -> TextTable:
     """Return a row for each fault and strength, without columns that no run knows anything of."""
-    rows = [_row(outcome) for outcome in found]
-    kept = [k for k in range(len(HEADER)) if any(row[k] not in ("", UNKNOWN) for row in rows)]
+    values = [outcome.values() for outcome in found]
+    columns = {title: tuple(map(text, values)) for title, text in COLUMNS.items()}
+    kept = {title: texts for title, texts in columns.items() if not {"", UNKNOWN}.issuperset(texts)}
     title = (
         f"{study.name}: {study.question} {len(study.tracks)} tracks, {len(study.seeds)} seeds, "
         f"{study.laps} laps, {', '.join(study.estimators)}. The rmse is the map's at the end by that "
         "of the clean run on the same track and with the same seed, as its mean and its range. "
         "Lost means more than 5 m off in the last second."
     )
-    shown = tuple(tuple(row[k] for k in kept) for row in rows)
-    return TextTable(title, tuple(HEADER[k] for k in kept), shown, group_starts(rows), names=2)
+    names = tuple((outcome.fault.kind, outcome.fault.strength) for outcome in found)
+    rows = tuple((*name, *texts) for name, *texts in zip(names, *kept.values(), strict=True))
+    return TextTable(title, ("fault", "strength", *kept), rows, group_starts(rows), names=2)
 
 
-def _row(outcome: FaultOutcome) -> tuple[str, ...]:
-    values, runs = outcome.values(), len(outcome.runs)
-    ratio, with_map = values["ratio_mean"], values["with_map"]
+def _ratio(values: Values) -> str:
+    ratio, with_map, runs = values["ratio_mean"], values["with_map"], values["runs"]
     partly = "" if with_map == runs else f" ({with_map} of {runs})"
-    failed = f", {outcome.failed} failed" if outcome.failed else ""
-    return (
-        outcome.fault.kind,
-        outcome.fault.strength,
-        "no map" if np.isnan(ratio) else f"{ratio:.2f}{partly}",
-        _text("{:.1f} to {:.1f}", values["ratio_min"], values["ratio_max"]),
-        _text("{:.2f}", values["size_ratio"]),
-        _text("{:.1f}", 100.0 * values["missed"]),
-        f"{values['closed']} of {runs}{failed}",
-        f"{values['lost']} of {runs}",
-        _text("{:.1f}", values["error_max"]),
-        _text("{:.1f}, {:.1f}", values["astray_time"], values["astray_way"]),
-        ", ".join(f"{name} {value:+.1f}" for name, value in values["calibration"].items()),
-        _text("{:.1f}, {:.1f}", 100.0 * values["told_degraded"], 100.0 * values["told_lost"]),
-        "; ".join(f"{n} of {runs}: {_short(text)}" for text, n in values["said"].items()) or NOTHING,
-    )
+    return "no map" if np.isnan(ratio) else f"{ratio:.2f}{partly}"
 
 
-def _text(form: str, *values: float) -> str:
-    return UNKNOWN if np.isnan(values[0]) else form.format(*values)
+def _closed(values: Values) -> str:
+    failed = f", {values['failed']} failed" if values["failed"] else ""
+    return f"{values['closed']} of {values['runs']}{failed}"
+
+
+def _said(values: Values) -> str:
+    said = (f"{n} of {values['runs']}: {_short(text)}" for text, n in values["said"].items())
+    return "; ".join(said) or NOTHING
+
+
+def _form(form: str, *names: str, factor: float = 1.0) -> Callable[[Values], str]:
+    """Return a function that formats some of the values."""
+
+    def text(values: Values) -> str:
+        shown = [factor * values[name] for name in names]
+        return UNKNOWN if np.isnan(shown[0]) else form.format(*shown)
+
+    return text
 
 
 def _short(text: str) -> str:
     return text if len(text) <= _SAID_LENGTH else f"{text[:_SAID_LENGTH].rstrip()} …"
+
+
+COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
+    "rmse by clean": _ratio,
+    "range": _form("{:.1f} to {:.1f}", "ratio_min", "ratio_max"),
+    "size by clean": _form("{:.2f}", "size_ratio"),
+    "missed [%]": _form("{:.1f}", "missed", factor=100.0),
+    "closed": _closed,
+    "lost at the end": lambda values: f"{values['lost']} of {values['runs']}",
+    "largest error [m]": _form("{:.1f}", "error_max"),
+    "over 1 m off after closing [s, m]": _form(PAIR, "astray_time", "astray_way"),
+    "calibration by its prior's sigma": lambda values: ", ".join(
+        f"{name} {value:+.1f}" for name, value in values["calibration"].items()
+    ),
+    "called degraded, lost [% of cycles]": _form(
+        "{:.1f}, {:.1f}", "told_degraded", "told_lost", factor=100.0
+    ),
+    "said": _said,
+}
+"""Columns of the table after the fault and its strength, each made of the values of an outcome."""

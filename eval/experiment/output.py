@@ -21,8 +21,7 @@ from .compare import Comparison, paired_frame, paper_frame
 from .compare import tables as comparison_tables
 from .faults import fault_table, outcomes
 from .frame import times_of, without_times
-from .map_panels import find_blind_spot, plot_blind_spot, plot_maps
-from .plots import figures, plot_faults
+from .plots import figures, find_blind_spot, plot_blind_spot, plot_faults, plot_maps
 from .study import Study
 from .tables import as_latex, as_markdown, as_text, caption, summary_tables, track_tables
 

@@ -1,6 +1,7 @@
-"""Figures of a study, differences from the baseline and accuracy against size and time, and of the faults."""
+"""Figures: differences from the baseline, accuracy against size and time, faults, and maps side by side."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Final
 
@@ -8,11 +9,19 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.spatial import KDTree
 
-from pathspace_graph.eval.figures import style
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, MARKERS, ORANGE, PALETTE, WIDTH
-from pathspace_graph.eval.metrics.metric import METRICS
+from pathspace_graph.eval.figures import map_plot, style
+from pathspace_graph.eval.figures.map_plot import MARGIN, WHOLE_TRACK, MapStyle
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, MARKERS, ORANGE, PALETTE, RED, WIDTH
+from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
+from pathspace_graph.eval.metrics.metric import METRICS, PAPER
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.map import Map
+from pathspace_graph.labels import BOUNDARIES
 
+from .cells import Outcome
 from .faults import CLEAN, FaultOutcome
 from .frame import COMBINATION, Contrast, contrasts
 from .study import Study
@@ -220,3 +229,158 @@ def _broken(title: str) -> str:
         return title
     cut = title.rfind(" ", 0, _TITLE_LENGTH)
     return f"{title[:cut]}\n{title[cut + 1 :]}" if cut > 0 else title
+
+
+# --- maps side by side ---------------------------------------------------------------------------------
+
+
+DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)
+"""Distances (m) within which nothing is mapped at a missed cone, in the order in which they are tried."""
+_MIN_CONES: Final = 2
+"""Least number of cones missed on a stretch that is a good example."""
+_MAX_WEIGHT: Final = 10.0
+"""Cones farther than this (m) from any landmark all have the same weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlindSpot:
+    """Stretch of the track, and the true cones in it that maps miss."""
+
+    centre: Array
+    """Centre (2,) of the stretch in m, map frame."""
+    half_size: tuple[float, float]
+    """Half width and half height of the stretch (m)."""
+    distance: float
+    """Distance (m) within which nothing is mapped at a missed cone."""
+    cones: int
+    missed: tuple[Array, ...]
+    """Positions (k, 2) of the cones that each map misses in the stretch."""
+
+
+def find_blind_spot(
+    truth: Truth, spline_map: Map, landmark_map: Map, half_size: tuple[float, float] = (17.0, 13.0)
+) -> BlindSpot | None:
+    """Return the stretch where the landmark map misses the most cones that the spline map doesn't.
+
+    The cones are missed at the largest of `DISTANCES` at which a stretch misses several cones, else at the
+    largest at which any cone is missed. It is None where none is missed at any. Among equal stretches the one
+    is chosen whose cones have the largest total distance from their nearest landmarks.
+    """
+    cones = truth.cones[np.isin(truth.cone_labels, BOUNDARIES)]
+    distances = [cone_distances(track, truth) for track in (spline_map, landmark_map)]
+    best: BlindSpot | None = None
+    for distance in DISTANCES:
+        bridged = (distances[0] <= distance) & (distances[1] > distance)
+        if bridged.any():
+            centre = _densest(cones[bridged], np.minimum(distances[1][bridged], _MAX_WEIGHT), half_size)
+            inside = (np.abs(cones - centre) <= half_size).all(axis=1)
+            missed = tuple(cones[inside & (d > distance)] for d in distances)
+            spot = BlindSpot(centre, half_size, distance, int(inside.sum()), missed)
+            if len(spot.missed[1]) >= _MIN_CONES:
+                return spot
+            best = best or spot
+    return best
+
+
+def _densest(points: Array, weights: Array, half_size: tuple[float, float]) -> Array:
+    """Return the centre (2,) of the points (k, 2) around the one with most neighbours, then most weight."""
+    scaled = points / np.array(half_size)
+    neighbours = KDTree(scaled).query_ball_point(scaled, 1.0, p=np.inf)
+    best = max(neighbours, key=lambda members: (len(members), float(weights[members].sum())))
+    chosen: Array = points[best]
+    return np.asarray(0.5 * (chosen.min(axis=0) + chosen.max(axis=0)))
+
+
+COLUMNS: Final = (2, 3, 4)
+"""Numbers of panels side by side; the first with which the figure fits a page is taken."""
+MAX_HEIGHT: Final = 10.0
+"""Height of a page (in)."""
+CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
+"""Style of a panel that shows a short stretch of a track."""
+
+# heights (in): a panel's title, the outer tick labels with axis titles, more than any legend, gaps
+_TITLE_HEIGHT, _TICK_LABELS, _LEGEND_ROOM, _GAP = 0.6, 0.48, 2.0, 0.12
+_RING_SIZE: Final = 8.0
+
+
+def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:
+    """Draw a panel for each map over the truth, all of the same area; failures have no panel."""
+    drawn = [(outcome, outcome.result.map) for outcome in outcomes if outcome.result is not None]
+    low, high = _extent([track for _, track in drawn], log.truth)
+    with style.figure_context():
+        figure, panels, columns = _panels(len(drawn), (high - low) / 2.0)
+        for axes, (outcome, track) in zip(panels, drawn, strict=False):
+            _draw_map(axes, track, log.truth, WHOLE_TRACK)
+            map_plot.draw_start(axes, WHOLE_TRACK)
+            axes.set_title(_caption(outcome))
+            style.set_frame(axes, low, high)
+        _finish(figure, panels, len(drawn), columns)
+    return figure
+
+
+def plot_blind_spot(spot: BlindSpot, maps: Sequence[tuple[str, Map]], truth: Truth) -> Figure:
+    """Draw the same area of several maps side by side, with rings around the cones that a map misses."""
+    half_size = np.array(spot.half_size)
+    shows_start = bool((np.abs(spot.centre) < half_size).all())
+    with style.figure_context():
+        figure, panels, columns = _panels(len(maps), half_size)
+        for axes, (name, track), missed in zip(panels, maps, spot.missed, strict=False):
+            _draw_map(axes, track, truth, CLOSE_UP)
+            if shows_start:
+                map_plot.draw_start(axes, CLOSE_UP)
+            ring = {"markersize": _RING_SIZE, "markerfacecolor": "none", "markeredgewidth": 1.0, "zorder": 8}
+            text = f"missed: nothing within {spot.distance:g} m"
+            style.draw_points(axes, missed, "o", RED, text, **ring)
+            axes.set_title(f"{name}\n{len(missed)} of {spot.cones} true cones missed here")
+            style.set_frame(axes, spot.centre - half_size, spot.centre + half_size)
+        _finish(figure, panels, len(maps), columns)
+    return figure
+
+
+def _panels(count: int, half_size: Array) -> tuple[Figure, list[Axes], int]:
+    """Return a figure, its panels and columns: `count` panels of that shape, as large as a page allows."""
+    half_width, half_height = half_size
+    for columns in COLUMNS:
+        rows = -(-max(count, 1) // columns)
+        width = (WIDTH - _TICK_LABELS) / columns - _GAP
+        height = rows * (width * half_height / half_width + _TITLE_HEIGHT) + _TICK_LABELS
+        if height <= MAX_HEIGHT:
+            break
+    figure = Figure((WIDTH, float(height) + _LEGEND_ROOM), layout="compressed")
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    return figure, list(panels.flat), columns
+
+
+def _finish(figure: Figure, panels: list[Axes], used: int, columns: int) -> None:
+    """Add axis titles to the outer panels and a legend, hides unused panels, and cuts the figure."""
+    for number, axes in enumerate(panels):
+        axes.set_visible(number < used)
+        if number % columns == 0:
+            axes.set_ylabel("y [m]")
+        if number + columns >= used:
+            axes.set_xlabel("x [m]")
+            axes.tick_params(labelbottom=True)
+    style.grouped_legend(figure)
+    style.fit_height(figure)
+
+
+def _draw_map(axes: Axes, track: Map, truth: Truth | None, look: MapStyle) -> None:
+    for label, boundary in sorted(track.boundaries.items()):
+        map_plot.draw_boundary(axes, boundary, label, look)
+    if truth is not None:
+        map_plot.draw_truth(axes, truth, look)
+
+
+def _caption(outcome: Outcome) -> str:
+    row = outcome.rows[-1].values
+    *words, size = (f"{m.title} {m.text(float(row[m.key]))} {m.unit}".strip() for m in PAPER if m.key in row)
+    return "\n".join([outcome.names["estimator"], ", ".join(words), size])
+
+
+def _extent(maps: Sequence[Map], truth: Truth | None) -> tuple[Array, Array]:
+    """Return two corners (2,) around the true cones and a margin, or around all maps without true cones."""
+    points = [truth.cones] if truth is not None and len(truth.cones) else []
+    if not points:
+        points = [mapped_points(boundary) for track in maps for boundary in track.boundaries.values()]
+    together = np.concatenate([np.zeros((1, 2)), *points])
+    return together.min(axis=0) - MARGIN, together.max(axis=0) + MARGIN

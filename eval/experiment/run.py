@@ -1,22 +1,27 @@
-"""Studies run in parallel; every finished cell is kept at once, so that one that was killed goes on."""
+"""Experiments: cells that run in parallel, each kept at once, so that one that was killed goes on."""
 
+import os
 import tempfile
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 import pandas as pd
+from joblib import Parallel, delayed, parallel_config
 
-from pathspace_graph.errors import InputError, OutputError
+from pathspace_graph.errors import InputError, OutputError, SettingsError
 from pathspace_graph.io.files import check_target, remove_manifest, to_plain, write_json
 from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.overrides import flatten
 from pathspace_graph.io.parsing import read_json
+from pathspace_graph.loop.drive_record import end_with
 
 from .cells import (
+    CELLS,
     Cell,
     Drive,
     NamedTrack,
@@ -30,15 +35,58 @@ from .cells import (
 )
 from .frame import frame_of
 from .study import Study
-from .workers import WorkerDiedError, check_jobs, outcomes, workers
+
+C = TypeVar("C")
+R = TypeVar("R")
 
 FORMAT: Final = "pathspace-study/1"
 STUDY_FILE: Final = "study.json"
+CONNECT_SECONDS: Final = 20.0
+"""Time (s) within which a cluster has to answer."""
 _PRESENTATION: Final = ("question", "metrics", "columns")
 """Keys that may change without making another study, since no cell depends on them."""
 
 OnCell = Callable[[int, int], None]
 """Called with the number of cells that are done, and with the number of all cells."""
+
+
+class WorkerDiedError(RuntimeError):
+    """The process that did the work was killed, ran out of memory or crashed."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Experiment(Generic[C, R]):
+    """Cells, the work on each, and where its result is kept."""
+
+    cells: Sequence[C]
+    work: Callable[[C], R]
+    """Function of a module that runs a cell in any process, and does not raise."""
+    died: Callable[[C, WorkerDiedError], R]
+    """Result of a cell whose process died."""
+    begin: Callable[[], None] = lambda: None
+    """Called once there are workers, before the first cell."""
+    read: Callable[[C], R | None] = lambda _: None
+    """Kept result of a cell, or None where it is to be run."""
+    write: Callable[[C, R], None] = lambda *_: None
+
+    def run(self, jobs: int = 1, cluster: str | None = None, on_cell: OnCell | None = None) -> list[R]:
+        """Run the cells that are missing, in `jobs` processes or on a Dask cluster; return all results."""
+        check_jobs(jobs)
+        known = {cell: self.read(cell) for cell in self.cells}
+        results = {cell: result for cell, result in known.items() if result is not None}
+        remaining = [cell for cell in self.cells if cell not in results]
+        told = on_cell or (lambda done, total: None)
+        with workers(jobs, cluster) if remaining else nullcontext():
+            self.begin()
+            told(0, len(remaining))
+            for done, (cell, result) in enumerate(outcomes(self.work, remaining), start=1):
+                results[cell] = self.died(cell, result) if isinstance(result, WorkerDiedError) else result
+                self.write(cell, results[cell])
+                told(done, len(remaining))
+        return [results[cell] for cell in self.cells]
+
+
+# --- studies ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,22 +101,21 @@ class Plan:
     def resolved(self) -> dict[str, Any]:
         """Return the content of `study.json`: the study with every default written out."""
         study = self.study
+        same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics", "columns")
         return {
             "format": FORMAT,
-            "name": study.name,
-            "question": study.question,
+            **{name: getattr(study, name) for name in same},
             "tracks": [{"name": track.name, "digest": track.digest} for track in self.tracks],
-            "seeds": study.seeds,
-            "laps": study.laps,
             "noise": {name: asdict(study.simulation(name)) for name in study.noise},
-            "estimators": study.estimators,
-            "varied": study.varied,
             "variants": {name: asdict(settings) for name, settings in study.points.items()},
             "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
-            "metrics": study.metrics,
-            "columns": study.columns,
             "yardsticks": study.yardsticks,
         }
+
+    def stale(self, out: Path) -> int:
+        """Return the number of kept cells that are of other code, and so are not used."""
+        known = {cell.id for cell in self.cells}
+        return sum(file.stem not in known for file in (out / CELLS).glob("[!.]*.json"))
 
 
 def make_plan(study: Study) -> Plan:
@@ -84,51 +131,49 @@ def make_plan(study: Study) -> Plan:
     return Plan(study, tracks, cells)
 
 
-def run_study(
-    study: Study,
-    out: Path | str | None = None,
+def run_study(study: Study, out: Path | str | None = None, **how: Any) -> pd.DataFrame:
+    """Run the cells of a study that are missing, and return all of its results, a row per run and lap.
+
+    Finished cells are kept in the folder `out`, if there is one. `how` is that of `run_plan`.
+    """
+    check_jobs(how.get("jobs", 1))
+    plan = make_plan(study)
+    if out is not None:
+        return run_plan(plan, Path(out), **how)
+    with tempfile.TemporaryDirectory() as folder:
+        return run_plan(plan, Path(folder), **how)
+
+
+def run_plan(
+    plan: Plan,
+    out: Path,
     *,
     jobs: int = 1,
     cluster: str | None = None,
     retry_failed: bool = False,
     on_cell: OnCell | None = None,
 ) -> pd.DataFrame:
-    """Run the cells of a study that are missing, and return all of its results, a row per run and lap.
+    """Run a study in `jobs` processes (-1: one for each core), or on a Dask scheduler's workers.
 
-    Finished cells are kept in the folder `out`, if there is one. The cells run in `jobs` processes (-1:
-    one for each core), or on the workers of the Dask scheduler at the address `cluster`. OutputError if
-    the folder belongs to another study.
+    OutputError if the folder belongs to another study.
     """
-    check_jobs(jobs)
-    plan = make_plan(study)
-    if out is None:
-        with tempfile.TemporaryDirectory() as folder:
-            return run_plan(plan, Path(folder), jobs, cluster, retry_failed, on_cell)
-    return run_plan(plan, Path(out), jobs, cluster, retry_failed, on_cell)
-
-
-def run_plan(
-    plan: Plan, out: Path, jobs: int, cluster: str | None, retry_failed: bool, on_cell: OnCell | None = None
-) -> pd.DataFrame:
-    """Do the same for a plan."""
     check_folder(out, plan)
     remove_manifest(out)  # of a study that goes on; the last step writes it again
-    remaining = [cell for cell in plan.cells if _is_missing(read_record(out, cell), retry_failed)]
-    with workers(jobs, cluster) if remaining else nullcontext():
-        write_json(out / STUDY_FILE, plan.resolved(), indent=1)
-        on_cell = on_cell or (lambda done, total: None)
-        on_cell(0, len(remaining))
-        for done, (cell, result) in enumerate(outcomes(record_cell, remaining), start=1):
-            if isinstance(result, WorkerDiedError):
-                write_record(out, cell, record_of(cell, Outcome.failed(cell, result)))
-            else:
-                write_record(out, cell, result)
-            on_cell(done, len(remaining))
-    return frame_of(plan.study, [(cell, read_record(out, cell)) for cell in plan.cells])
 
+    def kept(cell: Cell[Drive]) -> Record | None:
+        record = read_record(out, cell)
+        return None if record is not None and retry_failed and record["failure"] else record
 
-def _is_missing(record: Record | None, retry_failed: bool) -> bool:
-    return record is None or (retry_failed and bool(record["failure"]))
+    experiment = Experiment(
+        cells=plan.cells,
+        work=record_cell,
+        died=lambda cell, error: record_of(cell, Outcome.failed(cell, error)),
+        begin=lambda: write_json(out / STUDY_FILE, plan.resolved(), indent=1),
+        read=kept,
+        write=lambda cell, record: write_record(out, cell, record),
+    )
+    records = experiment.run(jobs, cluster, on_cell)
+    return frame_of(plan.study, list(zip(plan.cells, records, strict=True)))
 
 
 def check_folder(out: Path, plan: Plan) -> None:
@@ -154,3 +199,81 @@ def check_folder(out: Path, plan: Plan) -> None:
                 f"{file}: expected the study that is to be run, with {name} = {expected.get(name)}, "
                 f"found another, with {other.get(name)}"
             )
+
+
+# --- workers ---------------------------------------------------------------------------------------------
+
+
+def check_jobs(jobs: int) -> None:
+    """Raise SettingsError unless the number of processes is at least 1, or -1."""
+    if jobs < 1 and jobs != -1:
+        raise SettingsError(f"jobs: expected at least 1, or -1 for every core, found {jobs}")
+
+
+@contextmanager
+def workers(jobs: int, cluster: str | None) -> Iterator[None]:
+    """Start processes on this machine with one BLAS thread each, or connect to a Dask cluster's workers."""
+    if cluster is None:
+        leave = {"initializer": end_with, "initargs": (os.getpid(),)}
+        with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1, **leave):
+            yield
+        return
+    try:
+        from distributed import Client  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise SettingsError("--cluster: expected the extra pathspace-graph[cluster], found none") from error
+    try:
+        client = Client(cluster, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"--cluster: expected a Dask scheduler, found none at {cluster}") from error
+    with client, parallel_config(backend="dask", wait_for_workers_timeout=CONNECT_SECONDS):
+        yield
+
+
+def outcomes(work: Callable[[C], R], items: Sequence[C]) -> Iterator[tuple[C, R | WorkerDiedError]]:
+    """Yield (item, work(item)) in the order in which they finish; `work` must not raise.
+
+    When a worker dies, nobody knows which item it had, so each item under way is tried again alone.
+    """
+    remaining = dict(enumerate(items))
+    while remaining:
+        sent: list[int] = []
+        try:
+            for index, result in _run(work, _noted(remaining, sent)):
+                yield remaining.pop(index), result
+        except _deaths():
+            for index in sent:
+                if index in remaining:
+                    item = remaining.pop(index)
+                    yield item, _alone(work, item)
+
+
+def _noted(remaining: dict[int, C], sent: list[int]) -> Iterator[tuple[int, C]]:
+    for index, item in list(remaining.items()):
+        sent.append(index)
+        yield index, item
+
+
+def _run(work: Callable[[C], R], tasks: Iterable[tuple[int, C]], **options: Any) -> Iterator[tuple[int, R]]:
+    parallel = Parallel(return_as="generator_unordered", batch_size=1, **options)
+    yield from parallel(delayed(_numbered)(work, index, item) for index, item in tasks)
+
+
+def _numbered(work: Callable[[C], R], index: int, item: C) -> tuple[int, R]:
+    return index, work(item)
+
+
+def _alone(work: Callable[[C], R], item: C) -> R | WorkerDiedError:
+    try:
+        ((_, result),) = _run(work, [(0, item)], n_jobs=2)  # one job would be done by this very process
+    except _deaths() as error:
+        return WorkerDiedError(f"the process that ran it died ({type(error).__name__})")
+    return result
+
+
+def _deaths() -> tuple[type[Exception], ...]:
+    try:
+        from distributed import KilledWorker  # noqa: PLC0415 - an extra
+    except ImportError:
+        return (BrokenProcessPool,)
+    return (BrokenProcessPool, KilledWorker)

@@ -98,8 +98,6 @@ def group_starts(rows: Sequence[Sequence[str]]) -> tuple[int, ...]:
     return tuple(k for k in range(1, len(rows)) if rows[k][0] != rows[k - 1][0])
 
 
-# --- a study ---------------------------------------------------------------------------------------------
-
 SMALLEST_P: Final = 0.001
 """A p below this is shown as smaller than it."""
 FIGURES: Final = ("runs", "mean", "95 %", "difference", "95 %", "p", "")

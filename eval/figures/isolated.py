@@ -1,6 +1,6 @@
 """The paper's isolated tests as figures: expansion and fit, and all of them with captions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -294,15 +294,6 @@ MARKER: Final = "captions.md"
 _SEED: Final = 0
 
 
-@dataclass(frozen=True)
-class IsolatedFigure:
-    """Figure with a name and a caption."""
-
-    name: str
-    make: Callable[[], tuple[Figure, str]]
-    """Function that computes and draws the figure, and returns its caption with its numbers."""
-
-
 def _uncertainty() -> tuple[Figure, str]:
     data = uncertainty(np.random.default_rng(_SEED))
     off = np.abs(data.marginals / data.joint - 1.0)
@@ -344,21 +335,22 @@ def _simplification() -> tuple[Figure, str]:
     )
 
 
-FIGURES: Final = (
-    IsolatedFigure("uncertainty", _uncertainty),
-    IsolatedFigure("expansion", _expansion),
-    IsolatedFigure("fit", _fit),
-    IsolatedFigure("simplification", _simplification),
-)
+FIGURES: Final[Mapping[str, Callable[[], tuple[Figure, str]]]] = {
+    "uncertainty": _uncertainty,
+    "expansion": _expansion,
+    "fit": _fit,
+    "simplification": _simplification,
+}
+"""Functions that compute and draw a figure, and return it with a caption with its numbers."""
 
 
 def write_figures(out: Path, on_figure: Callable[[], None] = lambda: None) -> None:
     """Write every figure and the captions, or nothing; `on_figure` is called after each figure."""
     captions = []
     with atomic_folder(out, MARKER) as folder:
-        for isolated in FIGURES:
-            figure, caption = isolated.make()
-            style.save_figures(folder, {isolated.name: figure})
-            captions.append(f"![{isolated.name}]({isolated.name}.png)\n\n{caption}\n")
+        for name, make in FIGURES.items():
+            figure, caption = make()
+            style.save_figures(folder, {name: figure})
+            captions.append(f"![{name}]({name}.png)\n\n{caption}\n")
             on_figure()
         (folder / MARKER).write_text("\n".join(captions), encoding="utf-8")

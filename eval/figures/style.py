@@ -246,8 +246,6 @@ def draw_ellipses(
     axes.add_collection(EllipseCollection(widths, heights, angles, units="xy", **place, **look))
 
 
-# --- files -----------------------------------------------------------------------------------------------
-
 FORMATS: Final = (".png", ".pdf", ".svg")
 """Suffixes under which a figure can be saved."""
 SUFFIXES: Final = (".png", ".pdf")

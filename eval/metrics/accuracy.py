@@ -48,7 +48,7 @@ def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
 
 def missed_share(distances: Array, threshold: float = MISSED_DISTANCE) -> float:
     """Return the share of the distances (K,) with d > threshold (m); NaN without any."""
-    return float(np.mean(distances > threshold)) if len(distances) else float("nan")
+    return mean_of(distances > threshold)
 
 
 def capped_rmse(distances: Array, cap: float = MISSED_DISTANCE) -> float:
@@ -90,6 +90,10 @@ def closest_points(spline: BSpline, points_map: Array) -> FootPoints:
     return foot_points(spline.tables, spline.control_points, points_map, lows, highs, step)
 
 
+def mean_of(values: Array | BoolArray) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
 def root_mean_square(values: Array) -> float:
     """Return sqrt(mean v^2); NaN without values."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
@@ -105,8 +109,6 @@ CENTRE_STEP: Final = 1.0
 """Distance of the points at which the centre line is compared with the true one (m)."""
 CHORD: Final = 0.25
 """Length of the chords whose crossings are counted (m)."""
-FARTHEST: Final = 3.0
-"""Distance from the mapped boundary beyond which a true one is missed (m), as in the paper's table."""
 ROUND_OFF: Final = 1e-9
 """Share of a step by which a length may exceed whole steps without a further one."""
 _OVERLAP: Final = 3
@@ -216,17 +218,14 @@ def curve_distance(track: Map, truth: Truth) -> CurveDistance:
         else:
             forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
             back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
-    return CurveDistance(_mean(np.concatenate(forth)), _mean(np.concatenate(back)))
+    return CurveDistance(mean_of(np.concatenate(forth)), mean_of(np.concatenate(back)))
 
 
 def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
     """Return the same two-way distance (m) between two mapped boundaries."""
     forth = boundary_distances(second, mapped_points(first))
     back = boundary_distances(first, mapped_points(second))
-    return 0.5 * (_mean(forth) + _mean(back))
-
-
-# --- crossings -------------------------------------------------------------------------------------------
+    return 0.5 * (mean_of(forth) + mean_of(back))
 
 
 def crossings(track: Map) -> tuple[int, int]:
@@ -253,9 +252,6 @@ def _apart(begin: Array, end: Array, a: Array, b: Array) -> BoolArray:
     sides = way[..., 0] * first[..., 1] - way[..., 1] * first[..., 0]
     others = way[..., 0] * second[..., 1] - way[..., 1] * second[..., 0]
     return np.asarray(sides * others < 0.0)
-
-
-# --- the centre line -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +295,7 @@ def centre_line_errors(track: Map, truth: Truth, step: float = CENTRE_STEP) -> C
 def _crossings(points: Array, normals: Array, expected: Array, curve: Array) -> Array:
     """Return the offsets (n,) at which normals through points (n, 2) cross a curve (k, 2), by its chords.
 
-    Of several crossings it is the one nearest to the expected offset; none as far off as `FARTHEST` counts.
+    Of several crossings it is the one nearest to the expected offset, if not as far off as a missed cone.
     """
     tangents = np.column_stack([normals[:, 1], -normals[:, 0]])
     offsets = np.full(len(points), np.nan)
@@ -312,13 +308,9 @@ def _crossings(points: Array, normals: Array, expected: Array, curve: Array) -> 
             share = np.divide(ahead[at], run, out=np.zeros(len(at)), where=run != 0.0)
             across = (relative[at] + share[:, None] * (relative[at + 1] - relative[at])) @ normal
             nearest = across[np.abs(across - expected[i]).argmin()]
-            if abs(nearest - expected[i]) < FARTHEST:
+            if abs(nearest - expected[i]) < MISSED_DISTANCE:
                 offsets[i] = nearest
     return offsets
-
-
-def _mean(distances: Array) -> float:
-    return float(np.mean(distances)) if len(distances) else float("nan")
 
 
 @dataclass(frozen=True)
@@ -362,7 +354,7 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> G
         else:
             landmarks += int(is_ghost.sum())
             duplicates += _duplicates(boundary, truth.cones[truth.cone_labels == label], settings.distance)
-    return Ghosts(landmarks, metres, _mean(np.concatenate(all_ghosts)), duplicates)
+    return Ghosts(landmarks, metres, mean_of(np.concatenate(all_ghosts)), duplicates)
 
 
 def _duplicates(boundary: PointBoundary, cones: Array, distance: float) -> int:

@@ -18,7 +18,7 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 
-from .accuracy import MISSED_DISTANCE, closest_points, true_curve
+from .accuracy import MISSED_DISTANCE, closest_points, mean_of, true_curve
 
 LEVEL: Final = 0.95
 """Probability with which an honest map's NEES lies in the interval."""
@@ -141,16 +141,14 @@ class NormalErrors:
 
     def share_inside(self, factor: float = 2.0) -> float:
         """Return the share of the cones with |error| <= factor * sigma; NaN without cones."""
-        inside = np.abs(self.errors) <= factor * self.sigmas
-        return float(np.mean(inside)) if len(inside) else float("nan")
+        return mean_of(np.abs(self.errors) <= factor * self.sigmas)
 
     def mean_squared(self) -> float:
         """Return mean (error / sigma)^2, which is 1 where the band is honest; NaN without cones.
 
         In contrast to NEES, correlations between the cones don't count.
         """
-        squares = (self.errors / self.sigmas) ** 2
-        return float(np.mean(squares)) if len(squares) else float("nan")
+        return mean_of((self.errors / self.sigmas) ** 2)
 
 
 def normal_errors(track: Map, truth: Truth) -> NormalErrors:

@@ -15,28 +15,11 @@ from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import by_prior
 
-from .accuracy import (
-    GhostSettings,
-    capped_rmse,
-    centre_line_errors,
-    cone_distances,
-    curve_distance,
-    ghosts,
-    lap_metrics,
-    missed_share,
-    root_mean_square,
-)
+from . import accuracy, trajectory
+from .accuracy import GhostSettings
 from .consistency import joint_cone_error, map_nees, normal_errors, turn_from_truth, with_marginals
 from .reference import limit
 from .summary import has_cones, lap_times
-from .trajectory import (
-    end_of_trajectory,
-    longest_astray,
-    position_rms,
-    reach_values,
-    trajectory_errors,
-    vehicle_errors,
-)
 
 WHOLE: Final = "whole"
 """Name of the whole cycle among its stages."""
@@ -57,17 +40,16 @@ class StageTime:
 
 def stage_times(cycles: Sequence[CycleRecord]) -> list[StageTime]:
     """Return the whole cycle and then its stages; a stage that a cycle lacks took no time in it."""
+    if not cycles:
+        return [StageTime(WHOLE, *[float("nan")] * 4)]
     names = dict.fromkeys(name for record in cycles for name in record.stages)
     columns = {WHOLE: [record.seconds for record in cycles]}
     columns |= {name: [record.stages.get(name, 0.0) for record in cycles] for name in names}
-    if not cycles:
-        return [StageTime(WHOLE, *[float("nan")] * 4)]
     total = float(np.mean(columns[WHOLE]))
     times = []
     for name, seconds in columns.items():
-        mean, median, p99 = np.mean(seconds), np.median(seconds), np.quantile(seconds, 0.99)
-        share = float(mean) / total if total > 0.0 else float("nan")
-        times.append(StageTime(name, float(mean), float(median), float(p99), share))
+        mean, (median, p99) = float(np.mean(seconds)), np.quantile(seconds, [0.5, 0.99]).tolist()
+        times.append(StageTime(name, mean, median, p99, mean / total if total > 0.0 else float("nan")))
     return times
 
 
@@ -188,22 +170,25 @@ def _map_values(
 
 
 def _cone_values(track: Map, truth: Truth) -> dict[str, float]:
-    paper, distances = lap_metrics(track, truth, 0), cone_distances(track, truth)
+    paper, distances = accuracy.lap_metrics(track, truth, 0), accuracy.cone_distances(track, truth)
     return {
         "rmse": paper.rmse,
         "missed": paper.missed,
         "cones": len(distances),
         "size_share": track.size / len(distances),
-        "missed_2m": missed_share(distances, 2.0),
-        "missed_1m": missed_share(distances, 1.0),
-        "rmse_capped": capped_rmse(distances),
+        "missed_2m": accuracy.missed_share(distances, 2.0),
+        "missed_1m": accuracy.missed_share(distances, 1.0),
+        "rmse_capped": accuracy.capped_rmse(distances),
     }
 
 
 def _curve_values(track: Map, truth: Truth, ghost_settings: GhostSettings | None) -> dict[str, float]:
-    curve, ghost = curve_distance(track, truth), ghosts(track, truth, ghost_settings)
-    counted = {"ghost_landmarks": ghost.landmarks, "ghost_metres": ghost.metres, "ghost_share": ghost.share}
-    return {**asdict(curve), "two_way": curve.two_way, **counted, "duplicates": ghost.duplicates}
+    curve, ghost = (
+        accuracy.curve_distance(track, truth),
+        asdict(accuracy.ghosts(track, truth, ghost_settings)),
+    )
+    counted = {name if name == "duplicates" else f"ghost_{name}": value for name, value in ghost.items()}
+    return {**asdict(curve), "two_way": curve.two_way, **counted}
 
 
 def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
@@ -222,7 +207,7 @@ def _turn_values(track: Map, truth: Truth) -> dict[str, float]:
 
 def _centre_values(track: Map, truth: Truth) -> dict[str, float]:
     """Return the rms errors (m) of the centre line and of its widths, and mean e^2 / sigma^2 of each."""
-    errors = centre_line_errors(track, truth)
+    errors = accuracy.centre_line_errors(track, truth)
     if errors is None:
         return {}
     values = {}
@@ -232,7 +217,7 @@ def _centre_values(track: Map, truth: Truth) -> dict[str, float]:
     ):
         known = ~np.isnan(error)
         if known.any():
-            values[name] = root_mean_square(error[known])
+            values[name] = accuracy.root_mean_square(error[known])
             if (sigma[known] > 0.0).all():
                 values[f"{name}_nees"] = float(np.mean((error[known] / sigma[known]) ** 2))
     return values
@@ -246,11 +231,11 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
         return values
     state = run.vehicle
     if state is not None:
-        values |= vehicle_errors(state, float(run.trajectory_t[-1]), truth)
+        values |= trajectory.vehicle_errors(state, float(run.trajectory_t[-1]), truth)
     if len(truth.poses):
         values["false_closing"] = closes_falsely(run, truth)
-        values |= end_of_trajectory(run.trajectory_t, run.trajectory, truth)
-        values |= longest_astray(run.trajectory_t, run.trajectory, truth, closing_stamp(run))
+        values |= trajectory.end_of_trajectory(run.trajectory_t, run.trajectory, truth)
+        values |= trajectory.longest_astray(run.trajectory_t, run.trajectory, truth, closing_stamp(run))
     jumps = [np.hypot(*record.jump[:2]) for record in run.cycles if record.jump is not None]
     return values | ({"jump": float(max(jumps))} if jumps else {})
 
@@ -280,11 +265,11 @@ def _drive_values(run: RunResult, truth: Truth | None, begin: float, end: float)
     values: dict[str, float] = {}
     if truth is not None and len(truth.poses):
         inside = (run.trajectory_t > begin) & (run.trajectory_t <= end)
-        errors = trajectory_errors(run.trajectory_t[inside], run.trajectory[inside], truth)
-        values["ate"] = position_rms(errors)
-        values["along"], values["across"] = (root_mean_square(column) for column in errors[:, :2].T)
+        errors = trajectory.trajectory_errors(run.trajectory_t[inside], run.trajectory[inside], truth)
+        values["ate"] = trajectory.position_rms(errors)
+        values["along"], values["across"] = (accuracy.root_mean_square(column) for column in errors[:, :2].T)
         if run.reach is not None:
-            values |= reach_values(run.reach[inside])
+            values |= trajectory.reach_values(run.reach[inside])
     cycles = online_cycles(run, begin, end)
     if cycles:
         whole = stage_times(cycles)[0]

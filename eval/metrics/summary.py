@@ -27,6 +27,8 @@ from .accuracy import LapMetrics, lap_metrics, root_mean_square
 from .consistency import normal_errors
 from .trajectory import position_rms, trajectory_errors
 
+GATE: Final = ("dropped", "late", "refused")
+"""Counts of the gate in each cycle."""
 LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
 
 
@@ -47,10 +49,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "not_mapped": not_mapped(result.map, log),
         "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
         "seconds": _timing(result),
-        "gate": {
-            name: sum(getattr(record, name) for record in result.cycles)
-            for name in ("dropped", "late", "refused")
-        },
+        "gate": {name: sum(getattr(record, name) for record in result.cycles) for name in GATE},
     }
     if result.batches is not None:
         summary["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
@@ -104,11 +103,8 @@ def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
     measured = noise.measured
     if measured is None:
         return sources
-    values: dict[str, Any] = {
-        "odometry": measured.odometry.tolist(),
-        "drift": measured.drift.tolist(),
-        "seconds": measured.seconds,
-    }
+    values: dict[str, Any] = {"odometry": measured.odometry.tolist(), "drift": measured.drift.tolist()}
+    values["seconds"] = measured.seconds
     for name, ray in (("along", measured.along), ("across", measured.across)):
         if ray is not None:
             begin, growth = ray.sigma.tolist()
@@ -186,11 +182,8 @@ def _timing(result: RunResult) -> dict[str, float] | None:
     if not result.cycles:
         return None
     seconds = np.array([record.seconds for record in result.cycles])
-    return {
-        "mean": float(np.mean(seconds)),
-        "p99": float(np.quantile(seconds, 0.99)),
-        "max": float(np.max(seconds)),
-    }
+    mean, p99, most = np.mean(seconds), np.quantile(seconds, 0.99), np.max(seconds)
+    return {"mean": float(mean), "p99": float(p99), "max": float(most)}
 
 
 def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:

@@ -203,9 +203,6 @@ def _passes(path: Array, driven: Array, cones: Array, ends: Array) -> tuple[Arra
     return np.concatenate(laps), np.tile(np.arange(len(cones)), len(laps))
 
 
-# --- one cycle -------------------------------------------------------------------------------------------
-
-
 class CycleReach(NamedTuple):
     """Reach of the map in one cycle, a row of `RunResult.reach`."""
 
@@ -243,9 +240,6 @@ def _distances(boundary: MapBoundary, points: Array) -> Array:
     if isinstance(boundary, SplineBoundary):
         return np.asarray(np.linalg.norm(points - boundary.spline.foot_points(points).position, axis=1))
     return boundary_distances(boundary, points)
-
-
-# --- a run -----------------------------------------------------------------------------------------------
 
 
 class ReachObserver:

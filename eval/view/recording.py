@@ -14,8 +14,7 @@ from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.run import Observer
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 
-from .animation import Animation, lap_seconds
-from .film import check_film_file, film
+from .animation import Animation, check_film_file, film, lap_seconds
 from .recorder import Recorder, blueprint
 
 APPLICATION: Final = "pathspace_graph"

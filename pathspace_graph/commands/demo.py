@@ -11,7 +11,7 @@ from pathspace_graph.console import output, progress, say
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import side_by_side
-from pathspace_graph.eval.experiment.workers import workers
+from pathspace_graph.eval.experiment.run import workers
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import save_plot
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize

@@ -56,9 +56,6 @@ class Plot:
         save_plot(plot_map(track, log=log, trajectory=trajectory, smoothed=smoothed, **look), self.out)
 
 
-# --- the paper's isolated tests --------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class Figures:
     """Draw the paper's isolated tests: uncertainty, expansion, the fit of S_z and simplification."""
@@ -70,10 +67,7 @@ class Figures:
         check_target(self.out, MARKER)
         with progress("drawing", len(FIGURES)) as advance, threadpool_limits(limits=1):
             write_figures(self.out, advance)
-        say(f"{', '.join(figure.name for figure in FIGURES)}: {self.out}")
-
-
-# --- files as they were written --------------------------------------------------------------------------
+        say(f"{', '.join(FIGURES)}: {self.out}")
 
 
 @dataclass(frozen=True, kw_only=True)

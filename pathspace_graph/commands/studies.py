@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import pandas as pd
 from tyro.conf import Positional, arg
@@ -19,9 +19,8 @@ from pathspace_graph.eval.benchmark.scaling import measure_scaling
 from pathspace_graph.eval.benchmark.scaling_output import MARKER, scaling_table, stops, write_scaling
 from pathspace_graph.eval.experiment.faults import only, strongest, suite
 from pathspace_graph.eval.experiment.output import write_study, write_suite
-from pathspace_graph.eval.experiment.run import make_plan, run_plan
+from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study
-from pathspace_graph.eval.experiment.workers import check_jobs
 from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figures, render_pages, to_json
 from pathspace_graph.io.files import check_target, write_json, write_manifest, write_text
 from pathspace_graph.settings.mapper import MapperSettings
@@ -59,8 +58,11 @@ class StudyCommand:
         check_jobs(self.jobs)
         study = with_drives(study, self.tracks, self.seeds, self.laps)
         plan = make_plan(study)
+        if stale := plan.stale(self.out):
+            note(f"{stale} runs in {self.out} are of other code, and are not used")
         with progress("runs", lines=LINES) as advance:
-            frame = run_plan(plan, self.out, self.jobs, self.cluster, self.retry_failed, advance)
+            how: dict[str, Any] = {"cluster": self.cluster, "retry_failed": self.retry_failed}
+            frame = run_plan(plan, self.out, jobs=self.jobs, on_cell=advance, **how)
         text = write(study, frame, self.out)
         write_manifest(self.out)
         say(text.rstrip("\n"), f"\nwritten to {self.out}")
@@ -83,9 +85,6 @@ def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], l
     return replace(study, **own)  # type: ignore[arg-type]
 
 
-# --- ablate ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class Ablate(StudyCommand):
     """Run a study, or what remains of it, and write its results, its summary and its figures."""
@@ -95,9 +94,6 @@ class Ablate(StudyCommand):
 
     def run(self) -> None:
         self.execute(read_study(find_study(self.study)), write_study)
-
-
-# --- faults ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,9 +114,6 @@ class FaultSuite(StudyCommand):
     def run(self) -> None:
         chosen = replace(only(suite(), self.only), estimators=(self.estimator,))
         self.execute(strongest(chosen) if self.quick else chosen, write_suite)
-
-
-# --- scale -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,15 +154,14 @@ class Scale:
         say(*stops(scaling), f"written to {self.out}")
 
 
-# --- report ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class Report:
     """Measure the figures of the pages, or what remains of them, and write them and the pages' tables.
 
-    The experiments are `accuracy`, `skidpad`, `camera`, `faults` and `speed`. Each keeps its runs in a folder
-    of its own, from which a second call goes on.
+    The experiments are `accuracy`, `skidpad`, `camera`, `faults`, `hard`, `endurance`, `centerline`, the
+    ablations `gauge`, `robust`, `density`, `lag`, `relinearize`, `degree` and `covariance`, and `hints`,
+    `speed`, `scale` and, with logs, `real`. Each study keeps its runs in a folder of its own, from which a
+    second call goes on.
     """
 
     out: Path
@@ -180,6 +172,8 @@ class Report:
     """Names of the experiments to run, or `pages` for none; the other figures stay as they are."""
     tracks: tuple[Path, ...] = ()
     """Track files, or folders of them, that `accuracy` drives beside the generated tracks."""
+    real: tuple[Path, ...] = ()
+    """Folders of logs of a real car, which are mapped as well."""
     pages: Path | None = None
     """Root of the project whose `docs/figures.json` and pages are written."""
     quick: bool = False
@@ -196,7 +190,8 @@ class Report:
             "date": date.today().isoformat(),
         }
         with progress("runs", lines=LINES) as advance:
-            plan = Plan(quick=self.quick, tracks=self.tracks, jobs=self.jobs, on_cell=advance)
+            drives: dict[str, Any] = {"tracks": self.tracks, "real": self.real, "quick": self.quick}
+            plan = Plan(jobs=self.jobs, on_cell=advance, **drives)
             tables = measure_figures(plan, self.out, self.only, about, known)
         self.out.mkdir(parents=True, exist_ok=True)
         written = [self.out / FILE]

@@ -21,7 +21,6 @@ from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, READINGS, Scalin
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import Comparison, compare, read_logs
 from pathspace_graph.eval.experiment.tables import TextTable
-from pathspace_graph.eval.figures.isolated import IsolatedFigure
 from pathspace_graph.io.log import Log, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.results import RunResult, write_result
@@ -83,7 +82,7 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
     monkeypatch.setattr("os.fsync", lambda _: None)  # the killer loses what was not flushed
     picture = Figure()
     monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).write_bytes(b"picture"))
-    figures = tuple(IsolatedFigure(name, lambda: (picture, "It shows.")) for name in ("fit", "expansion"))
+    figures = dict.fromkeys(("fit", "expansion"), lambda: (picture, "It shows."))
     answers = {
         "commands.simulate.simulate": recorded.log,
         "commands.demo.simulate": recorded.log,

@@ -12,21 +12,28 @@ import pytest
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
 from pathspace_graph.eval.experiment.faults import of_middle_strength, suite
+from pathspace_graph.eval.experiment.study import Baseline, Study
 from pathspace_graph.eval.report import (
+    COMPARED,
     PAGES,
-    Figure,
+    README,
     MeasuredTable,
-    accuracy_table,
-    camera_table,
-    faults_table,
-    laps_table,
-    metrics_table,
     read_figures,
     render,
     render_pages,
-    skidpad_table,
     sources_digest,
     to_json,
+)
+from pathspace_graph.eval.views import (
+    Figure,
+    camera_table,
+    difference_table,
+    faults_table,
+    lap_columns,
+    laps_table,
+    metrics_table,
+    skidpad_table,
+    study_table,
     tracks_table,
 )
 from pathspace_graph.io.files import write_json
@@ -65,7 +72,7 @@ def frame(estimator: str, laps: int, rmse: float) -> pd.DataFrame:
 
 def test_the_table_of_accuracy_has_the_laps_and_the_batch() -> None:
     both = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 3, 0.3)], ignore_index=True)
-    header, rows = accuracy_table(both, 3)
+    header, rows = lap_columns(both, (1, 2, 3), README)
     assert header == ("mean over 2 drives, at the end of", "lap 1", "lap 2", "lap 3", "batch")
     label, figures = rows[0]
     assert label == "rmse [m]"
@@ -84,9 +91,34 @@ def test_the_tables_of_the_results_have_tracks_laps_and_metrics() -> None:
     header, rows = laps_table(both)
     assert header == ("rmse after lap [m]", "`fixed-lag`")
     assert [rows[lap][1][0].value for lap in range(3)] == pytest.approx([0.9, 0.45, 0.3])
-    header, rows = metrics_table(both)
+    header, rows = metrics_table(both, COMPARED)
     assert header == ("last lap", "`fixed-lag`", "`spline`")
     assert [label for label, _ in rows][:1] == ["missed at 2 m [%]"]
+
+
+def test_a_study_s_table_has_paired_differences_from_its_baseline() -> None:
+    """On seeds 0 and 1 the variant is worse by 0.1 and 0.2: 0.15 ± 12.706 x 0.05."""
+    metrics = ("rmse", "ms_mean", "missed")
+    study = Study(tracks=(0,), seeds=(0, 1), grids=({"lag": [1.0]},), metrics=metrics)
+    runs = frame("fixed-lag", 1, 0.3).assign(noise="nominal", variant="default", ms_mean=1.0)
+    worse = runs.assign(variant="lag=1", rmse=runs["rmse"] + 0.1 * (1 + runs["seed"]))
+    header, rows = study_table(study, pd.concat([runs, worse], ignore_index=True))
+    assert header == ("variant", "rmse [m]", "difference", "p", "missed [%]")
+    assert [label for label, _ in rows] == ["default", "lag=1"]
+    assert [figure.value for figure in rows[0][1][:3]] == [0.3, None, None]
+    assert rows[1][1][1].text == "0.150 ± 0.635"
+    assert rows[1][1][2].value == pytest.approx(0.2048, abs=1e-3)
+
+
+def test_two_estimators_are_compared_by_pairs_in_each_metric() -> None:
+    base = Baseline(estimator="fixed-lag")
+    study = Study(tracks=(0,), seeds=(0, 1), estimators=("fixed-lag", "ckf"), baseline=base)
+    both = pd.concat([frame("fixed-lag", 1, 0.3), frame("ckf", 1, 0.5)], ignore_index=True)
+    both = both.assign(noise="nominal", variant="default")
+    header, rows = difference_table(study, both, "ckf", ("rmse", "ate"))
+    assert header == ("lap 1", "`fixed-lag`", "`ckf`", "difference")
+    assert [figure.value for figure in rows[0][1]] == pytest.approx([0.3, 0.5, 0.2])
+    assert rows[1][1][2].value == 0.0
 
 
 def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
@@ -147,6 +179,8 @@ def test_a_page_has_its_tables_between_the_markers_and_says_how_old_they_are() -
     assert render(Path("page.md"), later, {"one": TABLE}, "old") == now
     with pytest.raises(InputError, match=r"page\.md: expected a table of the report, found one"):
         render(Path("page.md"), page, {}, "old")
+    new = render(Path("page.md"), page.replace("one", "skidpad"), {}, "old")
+    assert "-->\n\n*Not measured yet.*\n\n<!--" in new
 
 
 def test_the_pages_show_the_committed_figures() -> None:
@@ -154,8 +188,9 @@ def test_the_pages_show_the_committed_figures() -> None:
     if not FIGURES.exists():
         pytest.skip("there are no pages beside an installed package")
     tables = read_figures(FIGURES)
-    for name in tables:
-        assert f"<!-- report: {name} -->" in (ROOT / PAGES[name]).read_text(), f"{PAGES[name]}: no {name}"
+    assert set(tables) <= set(PAGES)
+    for name, page in PAGES.items():
+        assert f"<!-- report: {name} -->" in (ROOT / page).read_text(), f"{page}: no {name}"
     for page, text in render_pages(ROOT, tables).items():
         assert page.read_text() == text, f"{page} does not show the figures of {FIGURES.name}"
 

@@ -11,12 +11,12 @@ import pytest
 from rich.console import Console
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.eval.benchmark.measurement import metrics
-from pathspace_graph.eval.benchmark.ratios import (
+from pathspace_graph.eval.benchmark.measurement import (
     BASELINE,
     Metric,
     baseline_table,
     compare,
+    metrics,
     ratios,
     read_baseline,
     write_baseline,

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.benchmark.gtsam_window import linear_window, marginal_keys, orderings, time_gtsam
+from pathspace_graph.eval.benchmark.rivals import linear_window, marginal_keys, orderings, time_gtsam
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 

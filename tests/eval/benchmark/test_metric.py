@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from pathspace_graph.eval.benchmark.ratios import Metric, metrics_table
+from pathspace_graph.eval.benchmark.measurement import Metric, metrics_table
 
 
 def test_a_bound_is_kept_or_not() -> None:

@@ -22,7 +22,7 @@ from pathspace_graph.eval.experiment.compare import (
     read_logs,
     side_by_side,
 )
-from pathspace_graph.eval.experiment.map_panels import find_blind_spot, plot_maps
+from pathspace_graph.eval.experiment.plots import find_blind_spot, plot_maps
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.io.log import Log, Truth, read_log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
@@ -87,11 +87,11 @@ def test_rows_are_of_each_lap_and_of_the_log(folder: Path) -> None:
 
 
 def test_a_failure_is_told_and_the_rest_goes_on(folder: Path) -> None:
-    told: list[None] = []
-    found = compare(read_logs(folder), ["broken", "rings"], on_run=lambda: told.append(None))
+    told: list[int] = []
+    found = compare(read_logs(folder), ["broken", "rings"], on_run=lambda done, _: told.append(done))
     assert [tuple(o.names.values()) for o in found.failures] == [("a", "broken"), ("b", "broken")]
     assert found.failures[0].failure == "ValueError: lost the way"
-    assert len(told) == 4 and len(found.frame) == 6
+    assert told == [0, 1, 2, 3, 4] and len(found.frame) == 6
     assert set(found.times()["stage"]) == {"whole", "guess"}
     table = paper_table(found)
     assert table.rows[0][:2] == ("broken", "failed")

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.eval.experiment.faults import (
-    HEADER,
+    COLUMNS,
     FaultOutcome,
     beside_clean,
     fault_of,
@@ -102,7 +102,8 @@ def test_the_longest_way_astray_is_that_of_the_worst_run(frame: pd.DataFrame) ->
 def test_the_table_has_the_columns_that_something_is_known_of(frame: pd.DataFrame) -> None:
     table = fault_table(STUDY, outcomes(STUDY, frame))
     unknown = "called", "over 1 m off"
-    assert table.header == tuple(name for name in HEADER if not name.startswith(unknown))
+    known = (name for name in COLUMNS if not name.startswith(unknown))
+    assert table.header == ("fault", "strength", *known)
     assert table.rows[0][:7] == ("clean", "", "1.00", "1.0 to 1.0", "1.00", "0.0", "2 of 2")
     assert table.rows[1][2:8] == ("2.50", "1.5 to 3.5", "1.25", "5.0", "2 of 2", "1 of 2")
     assert table.rows[1][-1] == "1 of 2: a notice"

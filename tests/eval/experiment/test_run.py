@@ -137,6 +137,18 @@ def test_a_damaged_cell_is_made_again(study: Study, tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(without_times(first), without_times(again))
 
 
+def test_cells_of_other_code_are_run_again_and_counted(
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = run_study(study, tmp_path)
+    assert study_run.make_plan(study).stale(tmp_path) == 0
+    monkeypatch.setattr(drives, "code_digest", lambda rooms: "other")
+    calls = Pretender.calls
+    assert study_run.make_plan(study).stale(tmp_path) == len(first)
+    pd.testing.assert_frame_equal(without_times(run_study(study, tmp_path)), without_times(first))
+    assert Pretender.calls == 2 * calls
+
+
 def test_a_finished_study_runs_nothing(study: Study, tmp_path: Path) -> None:
     run_study(study, tmp_path)
     calls = Pretender.calls

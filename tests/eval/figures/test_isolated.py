@@ -180,9 +180,9 @@ def test_the_covariance_of_a_simplified_curve_needs_no_sigma_points() -> None:
 def test_the_command_writes_every_figure_and_its_caption(tmp_path: Path) -> None:
     out = tmp_path / "figures"
     assert main(["figures", "--out", str(out)]) == 0
-    expected = {f"{figure.name}{suffix}" for figure in FIGURES for suffix in (".png", ".pdf")}
+    expected = {f"{name}{suffix}" for name in FIGURES for suffix in (".png", ".pdf")}
     assert {file.name for file in out.iterdir()} == expected | {MARKER, MANIFEST_FILE}
-    assert all(f"({figure.name}.png)" in (out / MARKER).read_text() for figure in FIGURES)
+    assert all(f"({name}.png)" in (out / MARKER).read_text() for name in FIGURES)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
     assert main(["figures", "--out", str(tmp_path / "mine")]) == 2

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.view.animation import Animation, lap_seconds
-from pathspace_graph.eval.view.film import film
+from pathspace_graph.eval.view.animation import Animation, film, lap_seconds
 from pathspace_graph.eval.view.recording import recording
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, PointBoundary

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageSequence
 
 from pathspace_graph.errors import OutputError, SettingsError
-from pathspace_graph.eval.view.film import Pixels, check_film_file, film, pixels_of
+from pathspace_graph.eval.view.animation import Pixels, check_film_file, film, pixels_of
 
 FFMPEG = """#!{python}
 import sys

@@ -1,0 +1,228 @@
+"""Logs of a real car, without truth: mapped online, as a batch and by landmarks, and held against each other.
+
+docs/real.md explains the tables.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from pathspace_graph import estimators as registry
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.noise import MeasuredNoise
+from pathspace_graph.factors.se2 import compose, move_points, to_map, to_vehicle, wrap_angle
+from pathspace_graph.factors.sensor import SENSOR, by_sensor
+from pathspace_graph.front_end.front_end import seen_cycles
+from pathspace_graph.front_end.sightings import SeenCycle, Sightings, follow
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.results import RunResult, write_result
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.plausibility.reading import read_plausible_log
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .experiment.cells import run_estimator
+from .metrics.accuracy import crossings, lengths_along
+from .metrics.reference import aligned_distance
+from .metrics.summary import summarize
+from .views import Figure, View
+
+RUNS: Final = {
+    "online": registry.DEFAULT,
+    "batch": registry.DEFAULT_BATCH,
+    "landmarks": "landmark-fixed-lag",
+}
+"""Estimator of each run."""
+FIRST, LAST = 25.0, 14.0
+"""Lengths of the beginning of a drive, and of its end that is registered on it (m)."""
+NEAR: Final = 15.0
+"""Range of the sightings that count there (m)."""
+GATES: Final = (2.0, 1.5, 1.0, 1.0, 0.7, 0.7)
+"""Distance within which a cone is the nearest one of its colour, from step to step (m)."""
+LEAST: Final = 6
+"""Least number of cones of a registration."""
+SAME: Final = 1.0
+"""Distance of two maps of the same cones (m)."""
+ERRORS: Final = {
+    "latency": ("latency [ms]", 1e3),
+    "yaw": ("yaw [°]", 180.0 / np.pi),
+    "range_scale": ("scale [%]", 100.0),
+}
+"""Errors of the sensor in the table, in these units."""
+
+
+@dataclass(frozen=True, eq=False)
+class RealDrive:
+    """A log, its runs, and what they are held against."""
+
+    name: str
+    log: Log
+    runs: dict[str, RunResult]
+    dead_reckoned: Array
+    """Last pose (3,) by odometry alone."""
+    registered: Array | None
+    """Last pose (3,) by registration, where the drive comes back to its beginning."""
+
+    def off(self, pose: Array) -> tuple[float, float]:
+        """Return how far (m) and by what angle (degrees) a last pose (3,) is from that by registration."""
+        if self.registered is None:
+            return np.nan, np.nan
+        turn = float(wrap_angle(np.array(pose[2] - self.registered[2])))
+        return float(np.hypot(*(pose[:2] - self.registered[:2]))), float(np.rad2deg(turn))
+
+
+def map_real_log(folder: Path, out: Path) -> RealDrive:
+    """Map a log that `convert` has written by all estimators of `RUNS`, and write the maps to `out`."""
+    settings, runs = MapperSettings(), {}
+    log, hints = read_plausible_log(folder, settings.limits)
+    for name, estimator in RUNS.items():
+        runs[name] = run_estimator(estimator, settings, log)
+        write_result(out / folder.name / name, runs[name], summarize(runs[name], log, hints))
+    cycles, _ = seen_cycles(log)
+    end = None if log.measured is None else end_by_registration(cycles, log.measured)
+    return RealDrive(folder.name, log, runs, cycles[-1].pose, end)
+
+
+# --- the pose at the end ---------------------------------------------------------------------------------
+
+
+def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Array | None:
+    """Return the last pose (3,) of a drive, by the cones of its end laid on those of its beginning.
+
+    The closest points of the same colour are paired, from starts around dead reckoning. Both stretches are
+    short enough for odometry, and the constant errors of the sensor are taken out.
+    """
+    poses = np.array([cycle.pose for cycle in cycles])
+    path = lengths_along(poses[:, :2])
+    if path[-1] < FIRST + LAST:
+        return None
+    first = [cycle for cycle, s in zip(cycles, path, strict=True) if s <= FIRST]
+    last = [cycle for cycle, s in zip(cycles, path, strict=True) if s >= path[-1] - LAST]
+    start = [_cones(first, label, noise, np.zeros(3)) for label in BOUNDARIES]
+    end = [_cones(last, label, noise, poses[-1]) for label in BOUNDARIES]
+    tries = [
+        _registered(start, end, compose(poses[-1], np.array([ahead, left, turn])))
+        for ahead in (-4.0, -2.0, 0.0, 2.0, 4.0)
+        for left in (-2.0, 0.0, 2.0)
+        for turn in (-0.1, 0.0, 0.1)
+    ]
+    count, _, pose = max(tries, key=lambda one: one[:2])
+    return pose if count >= LEAST else None
+
+
+def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise, frame: Array) -> Array:
+    """Return the cones (k, 2) of a label in the frame of a pose (3,), each the mean of its sightings."""
+    own = []
+    for cycle in cycles:
+        seen = cycle.detections
+        chosen = (seen.labels == label) & (np.hypot(*seen.points_vehicle.T) < NEAR)
+        own.append(replace(cycle, detections=seen.where(chosen)))
+    table: Sightings = follow(own, noise)
+    corrected = table.point + by_sensor(table.point, table.twist) @ noise.sensor
+    points = to_vehicle(to_map(corrected, table.pose), np.tile(frame, (len(table.t), 1)))
+    weights = 1.0 / np.maximum(np.hypot(*table.point.T), 1.0) ** 2
+    again = [rows for cone in np.unique(table.cone) if (rows := table.cone == cone).sum() > 1]
+    means = [np.average(points[rows], axis=0, weights=weights[rows]) for rows in again]
+    return np.array(means).reshape(-1, 2)
+
+
+def _registered(start: list[Array], end: list[Array], pose: Array) -> tuple[int, float, Array]:
+    """Return the number of paired cones, minus their mean distance, and the pose (3,) for it."""
+    count, distance = 0, np.inf
+    for gate in GATES:
+        pairs = []
+        for known, seen in zip(start, end, strict=True):
+            if len(known) and len(seen):
+                away, nearest = KDTree(known).query(move_points(pose, seen))
+                near = away < gate
+                pairs.append((seen[near], known[np.asarray(nearest)[near]]))
+        points, targets = (np.concatenate([np.zeros((0, 2)), *side]) for side in zip(*pairs, strict=True))
+        count = len(points)
+        if count < LEAST:
+            return 0, -np.inf, pose
+        centre, target = points.mean(axis=0), targets.mean(axis=0)
+        cross = (points - centre).T @ (targets - target)
+        turn = np.arctan2(cross[0, 1] - cross[1, 0], np.trace(cross))
+        moved = move_points(np.array([0.0, 0.0, turn]), centre[None])[0]
+        pose = np.append(target - moved, turn)
+        distance = float(np.hypot(*(move_points(pose, points) - targets).T).mean())
+    return count, -distance, pose
+
+
+# --- tables ----------------------------------------------------------------------------------------------
+
+
+def ends_table(drives: Sequence[RealDrive]) -> View:
+    """Return how far each last pose is off, and dead reckoning's, and how many loops are closed."""
+    rows = []
+    for drive in drives:
+        poses = [*(run.trajectory[-1] for run in drive.runs.values()), drive.dead_reckoned]
+        rows.append((drive.name, tuple(Figure.known(drive.off(pose)[0], 2) for pose in poses)))
+    closed = [sum(drive.runs[name].map.closed for drive in drives) for name in RUNS]
+    counts = (*(Figure.known(float(count), 0) for count in closed), Figure(None))
+    header = ("last pose off by [m]", *RUNS, "dead reckoning")
+    return header, (*rows, (f"loops closed, of {len(drives)}", counts))
+
+
+def runs_table(drives: Sequence[RealDrive]) -> View:
+    """Return a row for each run."""
+    header = (
+        *("log, run", "closed [%]", "end off by [m]", "turned by [°]", "dead reckoning's [m]", "[°]"),
+        *("crossings", "own", "degraded [%]", "lost [%]", "update [ms]"),
+    )
+    rows = []
+    for drive in drives:
+        for name, run in drive.runs.items():
+            health = [record.health for record in run.cycles]
+            shares = [100.0 * health.count(word) / len(health) for word in ("degraded", "lost")]
+            reckoned = drive.off(drive.dead_reckoned) if name == "online" else (np.nan, np.nan)
+            crossed = (np.nan, np.nan) if name == "landmarks" else crossings(run.map)
+            ms = np.nan if name == "batch" else 1e3 * float(np.mean([r.seconds for r in run.cycles]))
+            values = [100.0 * run.map.closed, *drive.off(run.trajectory[-1]), *reckoned, *crossed]
+            values += [*(shares if any(health) else (np.nan, np.nan)), ms]
+            figures = zip(values, (0, 2, 1, 2, 1, 0, 0, 1, 1, 1), strict=True)
+            row = tuple(Figure.known(float(value), digits) for value, digits in figures)
+            rows.append((f"{drive.name}, {name}", row))
+    return header, tuple(rows)
+
+
+def maps_table(drives: Sequence[RealDrive]) -> View:
+    """Return the distance between the maps of each two drives around the same cones."""
+    rows = []
+    for k, first in enumerate(drives):
+        for second in drives[k + 1 :]:
+            both = zip(first.runs.values(), second.runs.values(), strict=True)
+            apart = [aligned_distance(one.map, other.map) for one, other in both]
+            if min(apart) < SAME:
+                figures = tuple(Figure.known(distance, 2) for distance in apart)
+                rows.append((f"{first.name}, {second.name}", figures))
+    return ("maps", *(f"{name} [m]" for name in RUNS)), tuple(rows)
+
+
+def measured_table(drives: Sequence[RealDrive]) -> View:
+    """Return what was measured on each drive, and over all of them the mean with its interval."""
+    header = (
+        *("log", "vx [m/s]", "vy [m/s]", "wz [rad/s]", "along at 10 m [m]", "across"),
+        *("stays along [%]", "across [%]", *(title for title, _ in ERRORS.values())),
+    )
+    units, places = [unit for _, unit in ERRORS.values()], [SENSOR.index(name) for name in ERRORS]
+    rows, errors, at = [], [], np.array([10.0])
+    for drive in drives:
+        found = drive.log.measured
+        if found is None or found.along is None or found.across is None:
+            continue
+        rays = (found.along, found.across)
+        values = [*found.odometry, *(ray.sigmas(at)[0] for ray in rays), *(100.0 * ray.share for ray in rays)]
+        digits = (4, 4, 4, 2, 2, 0, 0)
+        known = [Figure.known(float(v), n) for v, n in zip(values, digits, strict=True)]
+        errors.append(found.sensor[places] * units)
+        halves = 1.96 * found.sensor_sigma[places] * units
+        pairs = zip(errors[-1].tolist(), halves.tolist(), strict=True)
+        rows.append((drive.name, (*known, *(Figure(round(v, 6), round(h, 6), 1) for v, h in pairs))))
+    if len(errors) > 1:
+        means = (Figure.of(column, 1) for column in np.transpose(errors))
+        rows.append(("all drives", (*[Figure(None)] * 7, *means)))
+    return header, tuple(rows)
