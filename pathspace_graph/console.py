@@ -17,18 +17,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 class Verbosity(IntEnum):
     """How much is printed; hints and errors always are."""
 
-    QUIET = -1
-    """No results and no progress."""
+    QUIET = -1  # no results and no progress
     NORMAL = 0
-    VERBOSE = 1
-    """Progress in lines where there is no terminal, and the traceback of an error."""
+    VERBOSE = 1  # progress in lines where there is no terminal, and the traceback of an error
 
 
 VERBOSITY: Final = ContextVar("verbosity", default=Verbosity.NORMAL)
-FILE_WIDTH: Final = 160
-"""Width of tables where the output is no terminal (characters)."""
-LINES: Final = 20
-"""About the number of lines of progress, where they are printed."""
+FILE_WIDTH: Final = 160  # width of tables where the output is no terminal (characters)
+LINES: Final = 20  # about the number of lines of progress, where they are printed
 
 
 class _Output(Console):
@@ -39,7 +35,6 @@ class _Output(Console):
 
 @contextmanager
 def verbosity(level: str) -> Iterator[None]:
-    """Set the level, by its name, within the context."""
     before = VERBOSITY.set(Verbosity[level])
     try:
         yield
@@ -55,12 +50,10 @@ def output(wide: bool = False) -> Console:
 
 
 def say(*lines: str) -> None:
-    """Print lines of a result, as they are."""
     _print(output(), lines)
 
 
 def note(*lines: str) -> None:
-    """Print lines on standard error, as they are."""
     _print(Console(stderr=True), lines)
 
 

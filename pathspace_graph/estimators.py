@@ -25,21 +25,15 @@ from .run import BatchEstimator, OnlineEstimator
 MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
 MakeBatch = Callable[[MapperSettings, KnownNoise], BatchEstimator]
 
-MapKind = Literal["boundaries", "centerline"]
-"""Kind of map: two boundaries, or one centre line with a width."""
+MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or one centre line with a width
 
-DEFAULT: Final = "fixed-lag"
-"""Online estimator where none is named."""
-DEFAULT_BATCH: Final = "spline"
-"""Batch estimator where none is named."""
-ONLINE_GROUP: Final = "pathspace_graph.online"
-"""Group of entry points that add online estimators."""
-BATCH_GROUP: Final = "pathspace_graph.batch"
-"""Group of entry points that add batch estimators."""
+DEFAULT: Final = "fixed-lag"  # online estimator where none is named
+DEFAULT_BATCH: Final = "spline"  # batch estimator where none is named
+ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add online estimators
+BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
 
 
 def _installed(group: str) -> dict[str, Callable[[MapperSettings, KnownNoise], Any]]:
-    """Return the estimators that other packages add; each is imported when it is made."""
     return {point.name: _loading(point) for point in entry_points(group=group)}
 
 
@@ -102,12 +96,10 @@ def _check(name: str, known: dict[str, Any], kind: str) -> None:
 
 
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
-    """Return a new online estimator for a log, of which it is given the noise only."""
     check_online(name)
     return ONLINE[name](settings, log.noise)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
-    """Return a new batch estimator for a log, of which it is given the noise only."""
     check_batch(name)
     return BATCH[name](settings, log.noise)

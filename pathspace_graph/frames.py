@@ -17,18 +17,14 @@ from .errors import InputError, SettingsError
 if TYPE_CHECKING:
     import xarray
 
-OPTIONAL: Final = ("offered", "health", "reason", "dropped")
-"""Columns of `cycles.csv` that may be missing."""
-RESULTS_FILE: Final = "results.csv"
-"""File of a study's metrics, a row for each run and lap."""
-TIMES_FILE: Final = "times.csv"
-"""File of a study's wall times, in the same rows."""
+OPTIONAL: Final = ("offered", "health", "reason", "dropped")  # columns of `cycles.csv` that may be missing
+RESULTS_FILE: Final = "results.csv"  # file of a study's metrics, a row for each run and lap
+TIMES_FILE: Final = "times.csv"  # file of a study's wall times, in the same rows
 KEYS: Final = ("study", "track", "seed", "noise", "estimator", "variant", "lap")
 """Columns that tell the rows of a study apart."""
 TEXTS: Final = ("study", "track", "noise", "estimator", "variant", "failure", "said")
 """Columns of a study that are text, also where it looks like a number."""
-DIMENSIONS: Final = KEYS[1:]
-"""Dimensions of a study's metrics."""
+DIMENSIONS: Final = KEYS[1:]  # dimensions of a study's metrics
 
 
 def read_cycles(folder: Path | str) -> pd.DataFrame:

@@ -73,7 +73,6 @@ class HealthMonitor:
         self._offered, self._last_offered, self._wrong = 0, None, None
 
     def update(self, evidence: Evidence) -> Health:
-        """Return the health at a cycle."""
         if self._recent and self._recent[-1].closed != evidence.closed:
             self.restart()
         self._remember(evidence)
@@ -112,7 +111,6 @@ class HealthMonitor:
         return "" if self._wrong is None else f"the {NAMES[self._wrong]} boundary is not where the map has it"
 
     def _holds(self, label: int) -> bool | None:
-        """Return whether a boundary explains its detections, or None if there are too few of them."""
         offered = sum(one.offered_by[label] for one in self._recent)
         explained = sum(one.explained_by[label] for one in self._recent)
         if offered < self.settings.min_offered / len(BOUNDARIES):
@@ -120,7 +118,6 @@ class HealthMonitor:
         return explained >= self.settings.share_degraded * offered
 
     def _remember(self, evidence: Evidence) -> None:
-        """Add the evidence of a cycle, and drop what is too old and not needed for `min_offered`."""
         recent = self._recent
         recent.append(evidence)
         self._offered += evidence.offered
@@ -132,7 +129,6 @@ class HealthMonitor:
             self._offered -= recent.popleft().offered
 
     def _judge(self, newest: Evidence, share: float, innovation: float, most: float) -> Health:
-        """Return the health by the share of explained detections, and by the innovation and its limit."""
         settings = self.settings
         lost = settings.share_lost if newest.closed else 0.0  # on an open map it goes on by dead reckoning
         degraded = settings.share_degraded if newest.closed else settings.open_degraded
@@ -182,6 +178,5 @@ def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
 
 
 def counts(healths: Sequence[Health]) -> dict[str, int]:
-    """Return the number of cycles of each condition."""
     number = Counter(health.condition for health in healths)
     return {condition: number[condition] for condition in CONDITIONS}

@@ -163,7 +163,6 @@ class ObservedCycle:
 
     @cached_property
     def record(self) -> CycleRecord:
-        """Return the cycle as a row of `cycles.csv` has it."""
         result = self.result
         same = ("readings", "closed", "notice", "dropped", "late", "refused")
         return CycleRecord(
@@ -221,7 +220,6 @@ class Stopwatch:
 
     @property
     def spent(self) -> float:
-        """Return the time (s) of all stages so far."""
         return sum(self.laps.values())
 
     def lap(self, name: str) -> None:
@@ -297,8 +295,6 @@ def run_online(
 
 
 class _Run:
-    """Results of a run in progress."""
-
     def __init__(
         self, estimator: OnlineEstimator, snapshot_times: list[float], observers: Sequence[Observer]
     ) -> None:
@@ -313,7 +309,6 @@ class _Run:
         self._records: list[CycleRecord] = []
 
     def cycle(self, odometry: Odometry, detections: Detections) -> None:
-        """Run and time one update, record it, and show it to the observers."""
         self._take_snapshots(before=detections.t)
         self._waited += timed_wait(self._estimator)
         result, seconds, processor = timed_update(self._estimator, odometry, detections)
@@ -332,7 +327,6 @@ class _Run:
             self._observing += time.perf_counter() - begin
 
     def result(self, name: str) -> RunResult:
-        """Return the results after the last cycle."""
         self._take_snapshots(before=float("inf"))
         estimator, records, track = self._estimator, self._records, self._estimator.map()
         if self._laps.last_lap_is_complete:

@@ -28,24 +28,17 @@ C = TypeVar("C", bound=type[Any])
 
 WIDTH: Final = 3.5
 """Distance of a cone from the nearest one of the other side on a track of Formula Student, m, median."""
-GAP: Final = 3.2
-"""Distance of a cone from the nearest one of its row there, m, median."""
+GAP: Final = 3.2  # distance of a cone from the nearest one of its row there, m, median
 SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Possible scales: what is within a factor of 1.7 of one is mapped as well with it."""
-NEAREST: Final = 5
-"""Number of the nearest cones of each side that tell the scale."""
-FEWEST: Final = 3
-"""Number of cones of each side that a cycle needs."""
-SAME: Final = 3.0
-"""Largest distance (sigmas) of two detections of one cone."""
-FARTHEST: Final = 1e4
-"""Largest distance of a cone (m), in a scene of any scale."""
-MOVED: Final = 0.1
-"""Share of a gap by which the vehicle moves until the next cycle counts."""
+NEAREST: Final = 5  # number of the nearest cones of each side that tell the scale
+FEWEST: Final = 3  # number of cones of each side that a cycle needs
+SAME: Final = 3.0  # largest distance (sigmas) of two detections of one cone
+FARTHEST: Final = 1e4  # largest distance of a cone (m), in a scene of any scale
+MOVED: Final = 0.1  # share of a gap by which the vehicle moves until the next cycle counts
 JUDGED: Final = (1, 5, 20)
 """Numbers of cycles that count after which the scale is judged; it is final after the last."""
-PATIENCE: Final = 200
-"""Number of cycles after which it is final in any case."""
+PATIENCE: Final = 200  # number of cycles after which it is final in any case
 
 
 class SceneScale:
@@ -56,17 +49,14 @@ class SceneScale:
     """
 
     def __init__(self, scale: float | None = None) -> None:
-        self.value = 1.0 if scale is None else scale
-        """Scale as far as it is known."""
-        self.is_final = scale is not None
-        """Whether the value changes no more."""
+        self.value = 1.0 if scale is None else scale  # scale as far as it is known
+        self.is_final = scale is not None  # whether the value changes no more
         self._widths: list[float] = []
         self._gaps: list[float] = []
         self._driven = np.inf  # since the last cycle that counted
         self._cycles = self._counted = 0
 
     def see(self, odometry: Odometry, detections: Detections) -> None:
-        """Take a cycle into account."""
         if self.is_final:
             return
         self._cycles += 1
@@ -113,7 +103,6 @@ def width_and_gap(detections: Detections) -> tuple[float, float]:
 
 
 def _nearest_cones(points: Array, covariances: Array) -> Array:
-    """Return the nearest of points (m, 2), vehicle frame, one for each cone."""
     chosen: list[int] = []
     for k in np.argsort(np.hypot(*points.T)).tolist():
         apart = ((points[chosen] - points[k]) ** 2).sum(axis=1)
@@ -126,7 +115,6 @@ def _nearest_cones(points: Array, covariances: Array) -> Array:
 
 
 def _nearest(widths: list[float], gaps: list[float]) -> float:
-    """Return the scale that is nearest to what widths and gaps (m) say, by ratio."""
     ratios = np.log10([np.median(widths) / WIDTH, np.median(gaps) / GAP])
     if ratios[0] * ratios[1] <= 0.0:
         return 1.0
@@ -147,8 +135,7 @@ ANSWERS: Final = (
 class FrontDoor:
     """The scale of an estimator and, until that is final, what it takes to begin anew."""
 
-    constant: ClassVar = True
-    """An estimator that goes back to what it was before an update keeps it."""
+    constant: ClassVar = True  # an estimator that goes back to what it was before an update keeps it
 
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Any = None, *others: Any, **named: Any

@@ -96,7 +96,6 @@ def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
 
 
 def write(path: Path | str, structure: Structure, numbers: Bytes) -> None:
-    """Write a structure and the memory of its arrays; an earlier file is kept as a backup."""
     text = json.dumps({"format": FORMAT, **structure}, allow_nan=False, separators=(",", ":")).encode()
     with atomic_file(path) as temporary:
         temporary.write_bytes(archive(text, numbers))
@@ -286,7 +285,6 @@ def _lay_out(arrays: list[tuple[NDArray[Any], list[Any]]]) -> Bytes:
 
 
 def _bounds(array: NDArray[Any]) -> tuple[int, int]:
-    """Return the address of the first byte of an array's memory, and of the one after its last."""
     begin = int(array.__array_interface__["data"][0])
     if array.size == 0:
         return begin, begin

@@ -10,8 +10,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from .curves import FloatArray, IntArray, direction, left_normals, ring
 
-RUNG_MAX: Final = 12.0
-"""Largest distance of a left and a right cone of one lane (m)."""
+RUNG_MAX: Final = 12.0  # largest distance of a left and a right cone of one lane (m)
 GATE_REACH: Final = 12.0
 """Distance from the start within which gate cones stand in for missing boundary cones (m)."""
 INSERTION_DETOUR: Final = 5.0
@@ -65,7 +64,6 @@ def _order(left: FloatArray, right: FloatArray, gate: FloatArray, start: FloatAr
 
 
 def _apexes(points: FloatArray) -> Apexes:
-    """Return the third corners of the triangles on each edge (i < j)."""
     apexes: dict[Rung, list[int]] = defaultdict(list)
     try:
         triangles = Delaunay(points).simplices.tolist()
@@ -96,7 +94,6 @@ def _first_rung(points: FloatArray, split: int, apexes: Apexes, start: FloatArra
 def _walk(
     points: FloatArray, split: int, apexes: Apexes, first: Rung, forward: bool
 ) -> tuple[list[Rung], bool]:
-    """Return the rungs from the first one on, and whether they come back to it."""
     rungs = {first: None}  # in order, without repeats
     i, j = first
     while (apex := _next_apex(points, apexes[i, j], (i, j), forward)) is not None:

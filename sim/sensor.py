@@ -13,10 +13,8 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from .curves import FloatArray, IntArray
 
-FALSE_POSITIVE: Final = -1
-"""Association of a detection that is of no cone."""
-CAMERAS: Final = 2
-"""Cameras that may see a cone at once."""
+FALSE_POSITIVE: Final = -1  # association of a detection that is of no cone
+CAMERAS: Final = 2  # cameras that may see a cone at once
 
 
 @dataclass(frozen=True)
@@ -157,8 +155,6 @@ def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatAr
 
 
 class ConeSensor:
-    """Detect the cones of one log, some of which it never sees."""
-
     def __init__(self, cones: FloatArray, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
         blind_rng, self._cone_rng, self._false_rng, self._slow_rng, self._second_rng, self._drop_rng = (
             rng.spawn(6)
@@ -231,7 +227,6 @@ class ConeSensor:
 
 
 def _polar(cones: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return range and bearing (n,) of points in the map frame, seen from a pose."""
     step = cones - pose[:2]
     bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
     return np.hypot(step[:, 0], step[:, 1]), np.asarray((bearings + np.pi) % (2 * np.pi) - np.pi)

@@ -87,7 +87,6 @@ def _noise(settings: SimulationSettings) -> FloatArray | None:
 
 
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
-    """Return what the log says of its making, with its faults and slow errors where it has any."""
     source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
     source |= {"scale": str(settings.scale)} if settings.scale != 1.0 else {}
     for group in ("odometry", "sensor"):
@@ -101,7 +100,6 @@ def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, 
 def _perceive(
     track: Track, driven: Drive, settings: SimulationSettings, sensor_rng: Generator, colour_rng: Generator
 ) -> tuple[list[Detections], IntArray]:
-    """Return the perception cycles that are not empty, and the true cone of each detection."""
     faults, rate, lap = settings.faults, settings.sensor.rate, track.centre_line.length
     cones = ConeSensor(track.cones, colours(track, faults.vehicle.wrong_way), settings.sensor, sensor_rng)
     sensor = FaultySensor(cones, track.cone_labels, driven, lap, faults.sensor, colour_rng)
@@ -180,11 +178,9 @@ Third differences of the readings gave the white noise. The slow errors and the 
 240 m in 90 s ends 1 m and 0.02 rad off by dead reckoning: the three laps ended 0.8, 0.8 and 1.9 m, and 0.01
 to 0.03 rad off. The correlation time is assumed.
 """
-INS_RATE: Final = 40.0
-"""Rate of the INS (Hz)."""
+INS_RATE: Final = 40.0  # rate of the INS (Hz)
 
-PLAIN: Final = "plain"
-"""Name of the preset that changes nothing."""
+PLAIN: Final = "plain"  # name of the preset that changes nothing
 
 
 def _camera(settings: SimulationSettings) -> SimulationSettings:

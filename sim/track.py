@@ -25,19 +25,13 @@ from .curves import (
 class Track:
     """Cones of a track, in a frame of its own."""
 
-    left: FloatArray
-    """Cones of the left boundary in driving order (n, 2) in m."""
-    right: FloatArray
-    """Cones of the right boundary in driving order (m, 2) in m."""
-    other: FloatArray
-    """Cones of no boundary, such as those of a gate (k, 2) in m."""
-    closed: bool
-    """Whether the last cones are followed by the first."""
-    start: FloatArray
-    """Pose [x, y, theta] (3,) from which the vehicle starts, in m, m, rad."""
+    left: FloatArray  # cones of the left boundary in driving order (n, 2) in m
+    right: FloatArray  # cones of the right boundary in driving order (m, 2) in m
+    other: FloatArray  # cones of no boundary, such as those of a gate (k, 2) in m
+    closed: bool  # whether the last cones are followed by the first
+    start: FloatArray  # pose [x, y, theta] (3,) from which the vehicle starts, in m, m, rad
     name: str
-    other_labels: IntArray | None = None
-    """Labels (k,) of the other cones, by default UNKNOWN."""
+    other_labels: IntArray | None = None  # labels (k,) of the other cones, by default UNKNOWN
     path: FloatArray | None = None
     """Points (k, 2) along which the road is driven, if not once along its middle (m)."""
 
@@ -55,7 +49,6 @@ class Track:
 
     @property
     def cone_labels(self) -> IntArray:
-        """Labels (M,) of `cones`."""
         other = np.full(len(self.other), UNKNOWN) if self.other_labels is None else self.other_labels
         return np.concatenate([np.repeat([LEFT, RIGHT], [len(self.left), len(self.right)]), other])
 
@@ -71,25 +64,17 @@ def to_map_frame(track: Track) -> Track:
     return replace(track, **moved, start=np.zeros(3))
 
 
-LANE: Final = 3.0
-"""Width of the road in both events (m)."""
-CIRCLES: Final = 18.25
-"""Distance of the centres of the skidpad's circles (m)."""
-INNER: Final = 15.25 / 2
-"""Radius of the circle of inner cones (m)."""
+LANE: Final = 3.0  # width of the road in both events (m)
+CIRCLES: Final = 18.25  # distance of the centres of the skidpad's circles (m)
+INNER: Final = 15.25 / 2  # radius of the circle of inner cones (m)
 INNER_CONES: Final = 16
 OUTER_CONES: Final = 13
-APPROACH: Final = 15.0
-"""Length of the lanes into and out of the circles (m)."""
-ROUNDS: Final = 2
-"""Rounds in each circle, the right one first."""
+APPROACH: Final = 15.0  # length of the lanes into and out of the circles (m)
+ROUNDS: Final = 2  # rounds in each circle, the right one first
 
-STRETCH: Final = 75.0
-"""Length of the acceleration event (m)."""
-BRAKING: Final = 75.0
-"""Length of the road after its finish line, on which vehicles brake (m)."""
-SPACING: Final = 5.0
-"""Distance of the cones along it (m)."""
+STRETCH: Final = 75.0  # length of the acceleration event (m)
+BRAKING: Final = 75.0  # length of the road after its finish line, on which vehicles brake (m)
+SPACING: Final = 5.0  # distance of the cones along it (m)
 
 
 def skidpad() -> Track:
@@ -127,12 +112,10 @@ def skidpad() -> Track:
 
 
 def _circle(radius: float, angles: FloatArray) -> FloatArray:
-    """Return points (n, 2) of a circle about the origin, from its top on clockwise."""
     return radius * np.column_stack([np.sin(angles), np.cos(angles)])
 
 
 def _line(begin: float, end: float) -> FloatArray:
-    """Return points (n, 2) along the x axis, the end left out."""
     return np.arange(begin, end, STEP)[:, None] * [1.0, 0.0]
 
 

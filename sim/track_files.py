@@ -30,26 +30,16 @@ from .curves import FloatArray, along_polyline, arc_lengths, direction, left_nor
 from .driving_order import driving_order
 from .track import Track
 
-MIN_CONES: Final = 3
-"""Least number of cones of a boundary."""
-DUPLICATE_DISTANCE: Final = 0.3
-"""Distance below which two surveyed cones of one colour are one (m)."""
-REPEAT_DISTANCE: Final = 0.01
-"""Distance below which a cone of an ordered row is the one before again (m)."""
-MAX_UNPLACED: Final = 0.2
-"""Largest share of stray cones, which belong to no lane."""
-MAX_START_DISTANCE: Final = 10.0
-"""Largest distance of the start from the middle of the track (m)."""
-CONE_SPACING: Final = 5.0
-"""Largest distance of cones along a circuit that is given by its widths (m)."""
-ORANGE: Final = "orange"
-"""Part of PacSim's classes of cones of no boundary."""
-INVISIBLE: Final = "invisible"
-"""PacSim's class of cones that are not detected."""
-MIN_CLEARANCE: Final = 0.2
-"""Least distance of the middle of a road from a cone, as a share of the usual one."""
-WIDTH_STEP: Final = 0.5
-"""Distance of samples of a circuit (m)."""
+MIN_CONES: Final = 3  # least number of cones of a boundary
+DUPLICATE_DISTANCE: Final = 0.3  # distance below which two surveyed cones of one colour are one (m)
+REPEAT_DISTANCE: Final = 0.01  # distance below which a cone of an ordered row is the one before again (m)
+MAX_UNPLACED: Final = 0.2  # largest share of stray cones, which belong to no lane
+MAX_START_DISTANCE: Final = 10.0  # largest distance of the start from the middle of the track (m)
+CONE_SPACING: Final = 5.0  # largest distance of cones along a circuit that is given by its widths (m)
+ORANGE: Final = "orange"  # part of PacSim's classes of cones of no boundary
+INVISIBLE: Final = "invisible"  # PacSim's class of cones that are not detected
+MIN_CLEARANCE: Final = 0.2  # least distance of the middle of a road from a cone, as a share of the usual one
+WIDTH_STEP: Final = 0.5  # distance of samples of a circuit (m)
 TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 """Columns of the centre line and of the distances of the boundaries from it."""
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
@@ -60,10 +50,8 @@ EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
 class TrackFormat:
     """A kind of track file: how it is recognized, and what reads it."""
 
-    description: str
-    """Name of the format in messages."""
-    suffixes: tuple[str, ...]
-    """Ends of file names (lower case, with the dot)."""
+    description: str  # name of the format in messages
+    suffixes: tuple[str, ...]  # ends of file names (lower case, with the dot)
     parse: Callable[[Path], Any]
     """Parser of a file to the content that the next two take; it raises an InputError where it can't."""
     recognizes: Callable[[Any], bool]
@@ -112,7 +100,6 @@ def _check(path: Path, track: Track) -> None:
 
 
 def _check_size(path: Path, row: FloatArray, name: str) -> None:
-    """Raise an InputError where a row of points (n, 2) has too many or is too long."""
     length = float(arc_lengths(row)[-1]) if len(row) else 0.0
     if len(row) > MAX_CONES or length > MAX_TRACK_LENGTH:
         expected = f"expected at most {MAX_CONES} cones over {MAX_TRACK_LENGTH:g} m as {name}"
@@ -163,7 +150,6 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
 
 
 def _with_hidden(track: Track, hidden: FloatArray) -> Track:
-    """Return the track without the cones (k, 2) that nobody sees; they still say where its middle is."""
     line = track.centre_line
     left, right = (
         row[~(row[:, None] == hidden).all(axis=2).any(axis=1)] for row in (track.left, track.right)
@@ -236,7 +222,6 @@ def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
 
 
 def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
-    """Remove cones that repeat the one before, and on a closed row a last one that repeats the first."""
     if not len(row):
         return row
     row = row[np.append(True, np.linalg.norm(np.diff(row, axis=0), axis=1) > REPEAT_DISTANCE)]
@@ -348,7 +333,6 @@ def _tum_circuit(path: Path) -> FloatArray:
 
 
 def _spaced(boundary: FloatArray) -> FloatArray:
-    """Return cones at equal gaps along a closed polyline (n, 2)."""
     polyline = ring(boundary)
     s = arc_lengths(polyline)
     at = np.linspace(0.0, s[-1], math.ceil(s[-1] / CONE_SPACING), endpoint=False)

@@ -27,14 +27,11 @@ from .track import Track
 
 MAX_ATTEMPTS: Final = 500
 """Attempts that may fail; two in three keep the default rules, and contradicting settings fail them all."""
-STRAIGHT_RADIUS: Final = 150.0
-"""Radius above which a stretch is straight (m)."""
-CORNER_RADIUS: Final = 8.0
-"""Radius at which cones stand twice as close as on straights (m)."""
+STRAIGHT_RADIUS: Final = 150.0  # radius above which a stretch is straight (m)
+CORNER_RADIUS: Final = 8.0  # radius at which cones stand twice as close as on straights (m)
 CORNER_BLUR: Final = 2.0
 """Standard deviation of the Gaussian by which corners draw cones closer before and after them (m)."""
-MIN_CONE_GAP: Final = 1.0
-"""Least distance of cones along a row (m)."""
+MIN_CONE_GAP: Final = 1.0  # least distance of cones along a row (m)
 
 
 @dataclass(frozen=True)
@@ -104,7 +101,6 @@ class _Layout(NamedTuple):
 
 
 def _least_radius(width: float, settings: TrackGeneratorSettings) -> float:
-    """Return the least radius of the centre line in m."""
     return (settings.hairpin_diameter - width) / 2
 
 
@@ -155,7 +151,6 @@ def _with_hairpin(layout: _Layout, leg: float, least: float, rng: Generator) -> 
 
 
 def _rounded(layout: _Layout, least: float) -> _Layout | None:
-    """Cut the radii to what the sides have room for; return None where one is less than the least."""
     half_turn = np.abs(_turns(layout.corners)) / 2
     before = np.linalg.norm(layout.corners - np.roll(layout.corners, 1, axis=0), axis=1)
     # both corners of a side may take half of it
@@ -165,7 +160,6 @@ def _rounded(layout: _Layout, least: float) -> _Layout | None:
 
 
 def _turns(corners: FloatArray) -> FloatArray:
-    """Return the signed change of direction at each corner (n,) in rad."""
     before = corners - np.roll(corners, 1, axis=0)
     after = np.roll(before, -1, axis=0)
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
@@ -212,7 +206,6 @@ def _straight(
 def _element(
     along: FloatArray, length: float, settings: TrackGeneratorSettings, rng: Generator
 ) -> FloatArray:
-    """Return the lateral offset (n,) of a slalom, a chicane or nothing, on a straight of this length."""
     dice = rng.random()
     if dice < settings.slalom_probability:
         return _slalom(along, length, rng)
@@ -250,7 +243,6 @@ def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
 
 
 def _evenly(points: FloatArray) -> FloatArray:
-    """Return samples (n, 2) of a closed polyline at equal distances of about STEP."""
     polyline = ring(points)
     s = arc_lengths(polyline)
     return along_polyline(np.linspace(0.0, s[-1], int(s[-1] / STEP), endpoint=False), s, polyline)
@@ -267,13 +259,11 @@ def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettin
 
 
 def _curvature(curve: FloatArray) -> FloatArray:
-    """Return the signed curvature (n,) in 1/m of an evenly sampled closed curve."""
     after, before = np.roll(curve, -1, axis=0), np.roll(curve, 1, axis=0)
     return curvature((after - before) / 2, after - 2 * curve + before)
 
 
 def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return start and length of the longest run of good samples on a ring."""
     bad = np.flatnonzero(~good)
     if not len(bad):
         return 0, len(good)
@@ -307,13 +297,10 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
 
 
 def _density(gap: float, crowding: FloatArray, settings: TrackGeneratorSettings) -> FloatArray:
-    """Return the number of cones per metre (n,) along a row for this gap on straights."""
     return 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, settings.cone_gap_max)
 
 
 def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackGeneratorSettings) -> float:
-    """Return the gap on straights, before it is limited, that gives the wanted number of cones."""
-
     def excess(gap: float) -> float:
         density = _density(gap, crowding, settings)
         return float(sum(_cumulative(row, density)[-1] for row in rows)) - settings.cones

@@ -38,18 +38,12 @@ from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import SIDE, CentreCurve, Ribbon, find_line
 
 NAME: Final = "centerline"
-ONLINE_NAME: Final = "centerline-fixed-lag"
-"""Names of the estimators on the command line."""
-ROOM: Final = 4.0
-"""Distance along the line within which a foot point is searched for (m)."""
-RIBBON_LETTER: Final = "a"
-"""Letter of the keys of a ribbon's control points, which hold `Point3` (x, y, h)."""
-ROUNDS: Final = 2
-"""Optimizations; before each, the control points are held beside the poses anew."""
-MAX_ITERATIONS: Final = 15
-"""Most iterations of one of them."""
-TOLERANCE: Final = 1e-5
-"""Share by which an iteration lowers the error at least, or it is the last one."""
+ONLINE_NAME: Final = "centerline-fixed-lag"  # names of the estimators on the command line
+ROOM: Final = 4.0  # distance along the line within which a foot point is searched for (m)
+RIBBON_LETTER: Final = "a"  # letter of the keys of a ribbon's control points, which hold `Point3` (x, y, h)
+ROUNDS: Final = 2  # optimizations; before each, the control points are held beside the poses anew
+MAX_ITERATIONS: Final = 15  # most iterations of one of them
+TOLERANCE: Final = 1e-5  # share by which an iteration lowers the error at least, or it is the last one
 
 
 # --- the map of a ribbon, and the ribbon of a map --------------------------------------------------------
@@ -87,8 +81,7 @@ class FittedRibbon:
     ribbon: Ribbon
     covariance: Array | None
     """Covariance (3m, 3m) of its control points; None where that of the map is not known."""
-    until: dict[int, float]
-    """Parameter up to which an open edge is confirmed, by label."""
+    until: dict[int, float]  # parameter up to which an open edge is confirmed, by label
 
 
 def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
@@ -141,11 +134,9 @@ class CenterlineMapper:
         return self.boundaries.vehicle_state()
 
     def map(self) -> Map:
-        """Return the edges of the ribbon, with their joint covariance."""
         return self._edges(self.boundaries.map())
 
     def outline(self) -> Map:
-        """Return the edges without covariances."""
         return self._edges(self.boundaries.outline())
 
     def _edges(self, track: Map) -> Map:
@@ -161,7 +152,6 @@ class CenterlineMapper:
 
 
 def ribbon_keys(ribbon: Ribbon) -> list[int]:
-    """Return the keys of the distinct control points of a ribbon."""
     return [int(gtsam.symbol(RIBBON_LETTER, j)) for j in range(ribbon.size)]
 
 
@@ -229,8 +219,6 @@ Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 def _of_line(terms: Terms) -> Terms:
-    """Return terms of the control points (1, 3) of a ribbon, from those of points of a line."""
-
     def of_line(points: Array, pose: Array) -> tuple[Array, Array, Array]:
         residual, by_points, by_pose = terms(points[:, :2], pose)
         return residual, np.column_stack([by_points, np.zeros(1)]), by_pose
@@ -272,12 +260,10 @@ class CenterlineBatch:
         odometry_sigma: Array | KnownNoise | None = None,
         online: Callable[[MapperSettings, KnownNoise], CurveMapper] | None = None,
     ) -> None:
-        """Keep the settings and what `BatchMapper` takes."""
         self.settings = settings or MapperSettings()
         self._boundaries = BatchMapper(self.settings, odometry_sigma, online)
 
     def solve(self, log: Log) -> BatchRun:
-        """Return the optimum over a whole log."""
         start = self._boundaries.solve(log)
         run = BatchRun(
             estimator=NAME,
@@ -332,7 +318,6 @@ class CenterlineBatch:
 
 
 def _poses(values: gtsam.Values, count: int) -> Array:
-    """Return the poses (n, 3), with headings that do not jump."""
     poses = np.array([pose_array(values.atPose2(pose_key(k))) for k in range(count)])
     poses[:, 2] = np.unwrap(poses[:, 2])
     return poses

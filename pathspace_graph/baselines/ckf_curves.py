@@ -41,12 +41,10 @@ class CurveState:
 
     def __init__(self, belief: Belief, settings: MapperSettings) -> None:
         self.settings = settings
-        self.belief = belief
-        """Mean and covariance of x."""
+        self.belief = belief  # mean and covariance of x
         self.curves: dict[int, BSpline] = {}
         """Curves by label. Only the number of their control points is current; see `spline`."""
-        self.pose_u: dict[int, float] = {}
-        """Parameter of the vehicle's foot point on each curve, not wrapped."""
+        self.pose_u: dict[int, float] = {}  # parameter of the vehicle's foot point on each curve, not wrapped
 
     @property
     def pose(self) -> Array:
@@ -131,7 +129,6 @@ class CurveState:
         self._limit_bending(label, p + 1)
 
     def _limit_bending(self, label: int, count: int) -> None:
-        """Apply a prior of little bending to a curve's last `count` control points."""
         curve = self.curves[label]
         last = np.arange(curve.size - count, curve.size)
         abscissae = greville(curve.knots, curve.degree)[last]
@@ -162,14 +159,12 @@ class CurveState:
         return boundary
 
 
-STRETCH: Final = 12.0
-"""An extension is at most this long (m), so a longer one takes several."""
+STRETCH: Final = 12.0  # an extension is at most this long (m), so a longer one takes several
 SIGMA_CARRY: Final = 1.0
 """Standard deviation (m) of the control point that carries on a stranded end along the path."""
 RECENT: Final = 40
 """A confirmed track is compared with this many of the last cones, not with those of the lap's beginning."""
-AT_END: Final = 1e-6
-"""A foot point within this distance (m) of the end's parameter is at the end."""
+AT_END: Final = 1e-6  # a foot point within this distance (m) of the end's parameter is at the end
 
 
 class Expansion:
@@ -222,7 +217,6 @@ class Expansion:
     def _candidates(
         self, state: CurveState, label: int, detections: Detections, rows: IntArray, path_ahead: PathAhead
     ) -> Candidates:
-        """Return the detections `rows` of confirmed tracks that come next along the path."""
         settings, tentative = self.settings.growth, self.tentative[label]
         points = to_map(detections.points_vehicle[rows], state.pose[None])
         confirmed = tentative.points[self._undisputed(label, tentative.confirmed())]
@@ -238,7 +232,6 @@ class Expansion:
         return found.where(chain(found, end))
 
     def _undisputed(self, label: int, indices: IntArray) -> IntArray:
-        """Return the tracks that do not have more detections with another label around them."""
         tracks = self.tentative[label]
         votes = tracks.counts[indices].astype(np.float64)
         for other in (self.tentative[b] for b in BOUNDARIES if b != label):
@@ -248,7 +241,6 @@ class Expansion:
         return indices[votes >= 0.0]
 
     def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> BoolArray:
-        """Return which candidates (m,) meet the paper's three conditions, and lie ahead of the end."""
         high, control_points = state.curves[label].domain[1], state.control_points(label)
         low, _ = state.visible_range(label, len(found.points))
         foot = state.foot_points(label, found.points, np.minimum(low, high), np.full(len(low), high))
@@ -272,7 +264,6 @@ class Expansion:
         return True
 
     def _covariances(self, detections: Detections, rows: IntArray) -> Array:
-        """Return the covariances (k, 2, 2) of detections as points of the curve, vehicle frame."""
         model = self.settings.ckf.sigma_model**2 * np.eye(2)
         return np.asarray(detections.covariances[rows] + model)
 

@@ -22,8 +22,7 @@ from pathspace_graph.settings.batch import CkfSettings
 
 from .ckf_curves import CurveState
 
-RANK: Final = 1e-9
-"""Singular values of the gain below this share of the largest one count as zero."""
+RANK: Final = 1e-9  # singular values of the gain below this share of the largest one count as zero
 LEAST_BASIS: Final = 1e-3
 """A control point is updated where its basis values at the detections add up to at least this."""
 
@@ -35,14 +34,10 @@ LEAST_BASIS: Final = 1e-3
 class OnCurve:
     """The detections of a cycle that update a curve."""
 
-    rows: IntArray
-    """(m,) Rows of the cycle's detections."""
-    basis: Array
-    """(m, n) The curve's n basis functions at the foot points: the paper's B."""
-    tangents: Array
-    """(m, 2) Unit tangents at the foot points, map frame."""
-    distances: Array
-    """(m,) Squared Mahalanobis distances across the curve."""
+    rows: IntArray  # (m,) rows of the cycle's detections
+    basis: Array  # (m, n) the curve's n basis functions at the foot points: the paper's B
+    tangents: Array  # (m, 2) unit tangents at the foot points, map frame
+    distances: Array  # (m,) squared Mahalanobis distances across the curve
 
     def where(self, chosen: BoolArray) -> "OnCurve":
         """Return the detections whose entry in `chosen` (m,) is set."""
@@ -98,16 +93,11 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
 class SplineMeasurement:
     """S_z on r control points, in the frame of the detections."""
 
-    points: Array
-    """(r, 2) Control points of S_z, in m."""
-    covariance: Array
-    """(2 r, 2 r) Their covariance over x0, y0, x1, y1 and so on, in m^2."""
-    gain: Array
-    """(r, m) G, the derivative of S_z by the detections."""
-    taken: Array
-    """(r, r) G B, the derivative of S_z by control points whose curve the detections lie on."""
-    known: Array
-    """(r, 2) Control points C_mu before the fit."""
+    points: Array  # (r, 2) control points of S_z, in m
+    covariance: Array  # (2 r, 2 r) their covariance over x0, y0, x1, y1 and so on, in m^2
+    gain: Array  # (r, m) G, the derivative of S_z by the detections
+    taken: Array  # (r, r) G B, the derivative of S_z by control points whose curve the detections lie on
+    known: Array  # (r, 2) control points C_mu before the fit
 
     def refitted(self, points: Array) -> Array:
         """Return `C_mu + G B (C - C_mu)`: the S_z of detections on curves with control points (k, r, 2)."""
@@ -159,14 +149,10 @@ def fit_detections(
 class CurveBlock:
     """The block of the measurement that is the S_z of one curve."""
 
-    columns: IntArray
-    """(2 r,) Entries of the state that are the measured control points."""
-    fitted: SplineMeasurement
-    """S_z in the vehicle frame."""
-    combinations: Array
-    """(2 r, q) Linear combinations of the coordinates of S_z that are measured."""
-    by_sensor: Array
-    """(2 r, 5) Derivative of S_z by the calibration of the sensor, as it corrects detections."""
+    columns: IntArray  # (2 r,) entries of the state that are the measured control points
+    fitted: SplineMeasurement  # S_z in the vehicle frame
+    combinations: Array  # (2 r, q) linear combinations of the coordinates of S_z that are measured
+    by_sensor: Array  # (2 r, 5) derivative of S_z by the calibration of the sensor, as it corrects detections
 
 
 def update(state: CurveState, detections: Detections, found: dict[int, OnCurve]) -> None:

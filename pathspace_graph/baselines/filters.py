@@ -40,8 +40,7 @@ from .ckf_update import OnCurve, classify, update
 from .landmark_association import ROUGH, Association, Gates, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 
-REACH: Final = 9.0
-"""A curve is extended up to this far ahead of the vehicle (m along the predicted path)."""
+REACH: Final = 9.0  # a curve is extended up to this far ahead of the vehicle (m along the predicted path)
 SIGMA_MATCH: Final = 0.6
 """Sigma (m) of a detection in the registration with the early segment, which is worse than online."""
 PATIENCE: Final = 30.0
@@ -64,7 +63,6 @@ class _Filter:
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
-        """Keep the settings, and the standard deviation (3,) of a twist (m/s, m/s, rad/s)."""
         self.settings = settings or MapperSettings()
         noise = known_noise(odometry_sigma)
         self.odometry_sigma = noise.odometry
@@ -73,11 +71,9 @@ class _Filter:
         """State `x = [pose | calibration | control points or landmarks]`."""
 
     def noise_used(self) -> RunNoise:
-        """Return the noise that is used now, and what was measured so far."""
         return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
-        """Return the newest pose and the calibration, with their joint covariance."""
         return self.belief.vehicle_state()
 
 
@@ -97,7 +93,6 @@ class CkfMapper(_Filter):
         self._last_check = 0.0
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Process one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         cycle = self.front_end.admit(odometry, detections)
         reading = self.front_end.update(cycle.odometry, cycle.detections)
@@ -116,14 +111,12 @@ class CkfMapper(_Filter):
         return cycle.counted(self._result(detections.t, used, watch.laps))
 
     def _predict(self, motion: MeasuredMotion) -> None:
-        """Predict the pose by the motion since the last cycle, and locate it on the curves."""
         self.state.belief.follow(motion)
         self.state.locate_vehicle()
         self.path.update(self.state.pose.copy())
         self.path.steer(motion.twists)
 
     def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
-        """Expand the curves; then detections on the new stretch update it with the rest."""
         if self.closed:
             return found
         self.expansion.observe(self.state, detections)
@@ -157,7 +150,6 @@ class CkfMapper(_Filter):
         return CycleResult(t, self.state.pose.copy(), (left, right), used, self.closed, stages)
 
     def map(self) -> Map:
-        """Return the map as it stands, with the joint covariance of each boundary's control points."""
         state = self.state
         curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
         keys = [state.columns(b, np.arange(curve.size)) for b, curve in sorted(state.curves.items())]
@@ -165,7 +157,6 @@ class CkfMapper(_Filter):
         return Map(self.closed, curves, state.belief.covariance[np.ix_(columns, columns)])
 
     def outline(self) -> Map:
-        """Return a copy of the present map without covariances."""
         curves = {b: SplineBoundary(self.state.spline(b), NO_COVARIANCE) for b in self.state.curves}
         return Map(self.closed, curves)
 
@@ -187,7 +178,6 @@ def associate_early_segment(
 
 
 def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveMap:
-    """Return the curves, the newest poses and their detections as the registration takes them."""
     track = CurveMap(state.settings)
     for label in state.curves:
         track.state.add_boundary(label, state.boundary(label), state.control_points(label))
@@ -277,13 +267,11 @@ class LandmarkCkf(_Filter):
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         super().__init__(settings, odometry_sigma)
-        self.labels: IntArray = np.zeros(0, np.intp)
-        """(n,) Labels of the landmarks."""
+        self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """Tracks by label that are not landmarks yet."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Process one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         cycle = self.front_end.admit(odometry, detections)
         reading = self.front_end.update(cycle.odometry, cycle.detections)
@@ -302,7 +290,6 @@ class LandmarkCkf(_Filter):
         )
 
     def _associate(self, detections: Detections) -> Association:
-        """Assign the detections to the nearby landmarks, by the joint covariance of pose and landmarks."""
         points = to_map(detections.points_vehicle, self.belief.pose[None])
         nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH)[1])
         predicted, covariances = self._predict(nearby)
@@ -315,7 +302,6 @@ class LandmarkCkf(_Filter):
         return Association(landmark, found.new)
 
     def _predict(self, landmarks: IntArray) -> tuple[Array, Array]:
-        """Return where landmarks (k,) should be detected (k, 2) and covariances (k, 2, 2), vehicle frame."""
         k = len(landmarks)
         if k == 0:
             return np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
@@ -324,7 +310,6 @@ class LandmarkCkf(_Filter):
         return predicted.mean.reshape(k, POINT), blocks[np.arange(k), :, np.arange(k)]
 
     def _update(self, detections: Detections, landmark: IntArray) -> None:
-        """Make one Kalman update with all associated detections."""
         rows = np.flatnonzero(landmark != UNASSOCIATED)
         if len(rows) == 0:
             return
@@ -354,9 +339,7 @@ class LandmarkCkf(_Filter):
             self.labels = np.concatenate([self.labels, detections.labels[rows]])
 
     def map(self) -> Map:
-        """Return the map as it stands, with the joint covariance of each boundary's landmarks."""
         return point_map(self.belief.points, self.labels, self.belief.covariance[HEAD:, HEAD:], False)
 
     def outline(self) -> Map:
-        """Return a copy of the present map without covariances."""
         return point_map(self.belief.points, self.labels, None, False)

@@ -24,8 +24,7 @@ from pathspace_graph.settings.online import GrowthSettings
 
 from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother, LandmarkState, two_rows
 
-ROUGH: Final = 5.0
-"""A landmark farther from every detection of a cycle than this (m) is not tested at all."""
+ROUGH: Final = 5.0  # a landmark farther from every detection of a cycle than this (m) is not tested at all
 HELD_MARGIN: Final = 1e-9
 """Cost of a held pair below the match gate, as a share: exactly at the gate, round-off would decide."""
 
@@ -34,20 +33,16 @@ HELD_MARGIN: Final = 1e-9
 class Association:
     """The landmark of each of the m detections of one perception cycle."""
 
-    landmark: IntArray
-    """(m,) Column of each detection's landmark, or UNASSOCIATED."""
-    new: BoolArray
-    """(m,) Set where a detection lies beyond the create gate of every compatible landmark."""
+    landmark: IntArray  # (m,) column of each detection's landmark, or UNASSOCIATED
+    new: BoolArray  # (m,) set where a detection lies beyond the create gate of every compatible landmark
 
 
 @dataclass(frozen=True)
 class Gates:
     """Two gates on squared Mahalanobis distances with two degrees of freedom."""
 
-    match: float
-    """A detection may be associated with a landmark below this distance."""
-    create: float
-    """It may create a landmark if it is above this distance from every compatible landmark."""
+    match: float  # a detection may be associated with a landmark below this distance
+    create: float  # it may create a landmark if it is above this distance from every compatible landmark
 
     @staticmethod
     @cache

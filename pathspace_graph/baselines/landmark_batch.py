@@ -50,16 +50,11 @@ from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landm
 
 Ints = NDArray[np.int64]
 
-NAME: Final = "landmark-batch"
-"""The estimator's name on the command line."""
-MAX_ROUNDS: Final = 10
-"""All detections are associated anew at most this number of times."""
-SETTLED: Final = 1e-3
-"""Largest share of the detections that changed their landmark in the last round."""
-MAX_STEPS: Final = 80
-"""Most steps of a round's optimization."""
-TOLERANCE: Final = 1e-6
-"""It ends where |cost_before - cost_after| is at most this share of the cost."""
+NAME: Final = "landmark-batch"  # the estimator's name on the command line
+MAX_ROUNDS: Final = 10  # all detections are associated anew at most this number of times
+SETTLED: Final = 1e-3  # largest share of the detections that changed their landmark in the last round
+MAX_STEPS: Final = 80  # most steps of a round's optimization
+TOLERANCE: Final = 1e-6  # it ends where |cost_before - cost_after| is at most this share of the cost
 
 
 @log_at_scale
@@ -89,7 +84,6 @@ class LandmarkBatch:
         return self._result(system, state, converged)
 
     def _refresh(self, system: "LandmarkSystem", state: LandmarkState) -> int:
-        """Associate anew, merge and remove landmarks; return how many associations have changed."""
         detections, problem = system.detections, system.eliminated(state)
         before, known = detections.landmark.copy(), len(state)
         Reassociation(state, detections, problem, self.settings, system.chain.stamps).run()
@@ -125,13 +119,10 @@ class LandmarkSystem:
     The associations are constant, and a detection without a landmark costs nothing.
     """
 
-    detections: LandmarkDetections
-    """Detections of the whole log."""
-    chain: LogOdometry
-    """Odometry of the whole log."""
+    detections: LandmarkDetections  # detections of the whole log
+    chain: LogOdometry  # odometry of the whole log
     settings: MapperSettings
-    noise: RunNoise
-    """Noise that is used."""
+    noise: RunNoise  # noise that is used
 
     @classmethod
     def of_log(cls, log: Log, settings: MapperSettings, noise: KnownNoise) -> "LandmarkSystem":
@@ -236,7 +227,6 @@ class Reassociation:
         self._create(self._assign())
 
     def _assign(self) -> IntArray:
-        """Assign every cycle anew, and return the rows of detections that may create landmarks."""
         detections = self.detections
         rows, landmarks, distances = self._nearby_pairs()
         cost = self._costs(rows, landmarks)
@@ -280,7 +270,6 @@ class Reassociation:
         return squared_mahalanobis(r.residual, spread + detections.covariance[rows])
 
     def _create(self, free: IntArray) -> None:
-        """Add landmarks where enough of the detections `free` (m,) lie together, as the online run does."""
         detections = self.detections
         for label in BOUNDARIES:
             rows = free[detections.label[free] == label]
@@ -345,18 +334,13 @@ def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: in
 class LandmarkSolution:
     """The optimum of a landmark batch with oracle associations."""
 
-    trajectory_t: Array
-    """(n,) Stamps of the perception cycles, in s."""
-    trajectory: Array
-    """(n, 3) Smoothed poses (x, y, theta) in m and rad, map frame; theta is not wrapped."""
-    landmark_ids: Ints
-    """(m,) The associations' numbers of all landmarks that were detected, ascending."""
-    landmarks: Array
-    """(m, 2) Positions of the landmarks in m, map frame."""
+    trajectory_t: Array  # (n,) stamps of the perception cycles, in s
+    trajectory: Array  # (n, 3) smoothed poses (x, y, theta) in m and rad, map frame; theta is not wrapped
+    landmark_ids: Ints  # (m,) the associations' numbers of all landmarks that were detected, ascending
+    landmarks: Array  # (m, 2) positions of the landmarks in m, map frame
     covariance: Array | None
     """(2m, 2m) Joint covariance of the landmarks in m^2, or None if it was not requested."""
-    error: float
-    """Half the sum of the squared whitened residuals."""
+    error: float  # half the sum of the squared whitened residuals
 
 
 def solve_landmarks(

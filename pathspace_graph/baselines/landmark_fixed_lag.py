@@ -73,14 +73,12 @@ class LandmarkFixedLag:
         self.path = DrivenPath()
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """Tracks by label that are not landmarks yet."""
-        self.believed = self.settings
-        """Settings with the priors of the calibrations as they are now."""
+        self.believed = self.settings  # settings with the priors of the calibrations as they are now
         self.closed = False
         self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
         self._last_check = 0.0
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Process one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         cycle = self.front_end.admit(odometry, detections, self.smoother.times)
         if cycle.late:
@@ -103,7 +101,6 @@ class LandmarkFixedLag:
         return cycle.counted(self._result(detections.t, watch.laps))
 
     def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
-        """Use the detections of a late cycle at its time, without a pose of their own."""
         detections = self.front_end.use_late(detections, self.smoother.times)
         late = at_nearest_pose(self.smoother, detections, self.settings.motion)
         new = self.smoother.map.add_late(late)
@@ -126,7 +123,6 @@ class LandmarkFixedLag:
             self.smoother.step()
 
     def _create(self, new: slice, t: float) -> bool:
-        """Add detections without a landmark to the tracks, and return whether any became landmarks."""
         detections, created = self.smoother.map.detections, False
         free = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
         for label, tentative in self.tentative.items():
@@ -193,7 +189,6 @@ class LandmarkFixedLag:
         return CycleResult(t, self.smoother.variables.poses[-1].copy(), sizes, used, self.closed, stages)
 
     def map(self) -> Map:
-        """Return the map as it stands, with the joint covariance of each boundary's landmarks."""
         state = self.smoother.map.state
         if len(state) == 0:
             return Map(self.closed, {})
@@ -201,16 +196,13 @@ class LandmarkFixedLag:
         return point_map(state.landmarks, state.labels, joint, self.closed)
 
     def outline(self) -> Map:
-        """Return a copy of the present map without covariances."""
         state = self.smoother.map.state
         return point_map(state.landmarks, state.labels, None, self.closed)
 
     def window_poses(self) -> Array:
-        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.smoother.variables.poses.copy()
 
     def readings(self) -> Readings:
-        """Return the detections of the newest cycle as they were used or gated, with their landmarks."""
         table, state = self.smoother.map.detections, self.smoother.map.state
         rows = np.flatnonzero(table.cycle == self.smoother.next_cycle - 1)
         used = table.used[rows]
@@ -220,11 +212,9 @@ class LandmarkFixedLag:
         return Readings(points, table.label[rows], used, feet)
 
     def noise_used(self) -> RunNoise:
-        """Return the noise that is used now, and what was measured so far."""
         return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
-        """Return the newest pose and the calibration, with their joint covariance."""
         return vehicle_state(self.smoother)
 
 
@@ -235,19 +225,15 @@ class LandmarkFixedLag:
 class LoopPairs:
     """A hypothesis: pairs of landmarks that are the same cone."""
 
-    recent: IntArray
-    """(k,) Positions of landmarks that were seen lately."""
-    old: IntArray
-    """(k,) Positions of the landmarks of the beginning that they are."""
-    distance: float
-    """Squared Mahalanobis distance of all pairs together, with 2 k degrees of freedom."""
+    recent: IntArray  # (k,) positions of landmarks that were seen lately
+    old: IntArray  # (k,) positions of the landmarks of the beginning that they are
+    distance: float  # squared Mahalanobis distance of all pairs together, with 2 k degrees of freedom
 
     def score(self, gate: float) -> float:
         """Return `k gate - d^2`: how much better the pairs explain the detections than new landmarks do."""
         return len(self.recent) * gate - self.distance
 
     def overlaps(self, other: "LoopPairs") -> bool:
-        """Return whether both hypotheses have a pair in common."""
         pairs = set(zip(self.recent.tolist(), self.old.tolist(), strict=True))
         return not pairs.isdisjoint(zip(other.recent.tolist(), other.old.tolist(), strict=True))
 

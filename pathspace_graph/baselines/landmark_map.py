@@ -30,10 +30,8 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.settings.mapper import MapperSettings
 
-UNASSOCIATED: Final = -1
-"""Landmark of a detection that has none, and that may create one."""
-AMBIGUOUS: Final = -2
-"""Landmark of a detection that has none, and that must not create one."""
+UNASSOCIATED: Final = -1  # landmark of a detection that has none, and that may create one
+AMBIGUOUS: Final = -2  # landmark of a detection that has none, and that must not create one
 SIGMA_MERGE: Final = 0.1
 """Standard deviation (m) of the distance between two landmarks of one cone, beyond their covariance."""
 NO_PAIRS: IntArray = np.zeros((0, 2), np.intp)
@@ -43,12 +41,9 @@ class LandmarkState:
     """Landmarks, oldest first. A landmark's number is that of its key and never changes."""
 
     def __init__(self, variables: Variables | None = None) -> None:
-        self.variables = variables or Variables()
-        """Landmarks, calibration and poses by key."""
-        self.numbers: IntArray = np.zeros(0, np.intp)
-        """(n,) Numbers of the landmarks, ascending."""
-        self.labels: IntArray = np.zeros(0, np.intp)
-        """(n,) Labels of the landmarks."""
+        self.variables = variables or Variables()  # landmarks, calibration and poses by key
+        self.numbers: IntArray = np.zeros(0, np.intp)  # (n,) numbers of the landmarks, ascending
+        self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)
         """(n, 2) Detections with the left and the right label on each landmark."""
         self.next_number = 0
@@ -58,7 +53,6 @@ class LandmarkState:
 
     @property
     def keys(self) -> IntArray:
-        """Return the keys (n,) of the landmarks."""
         return landmark_keys(self.numbers)
 
     @property
@@ -115,27 +109,23 @@ class LandmarkDetections(DetectionColumns):
         self.landmark = np.full(len(self), UNASSOCIATED, np.intp)
 
     def merge(self, gone: IntArray, kept: IntArray) -> None:
-        """Associate all detections of landmarks `gone` (k,), by number, with `kept` (k,)."""
         for number, became in zip(gone.tolist(), kept.tolist(), strict=True):
             self.landmark[self.landmark == number] = became
 
     def take(self, rows: IntArray, numbers: IntArray) -> None:
-        """Associate detections (k,) with landmarks (k,)."""
         self.landmark[rows], self.changed[rows] = numbers, True
 
 
 class LandmarkMap:
     """The landmarks and the detections of the window, as the engine sees them (`graph.window:MapRows`)."""
 
-    reached_inactive = False
-    """No landmark is ever inactive."""
+    reached_inactive = False  # no landmark is ever inactive
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
         self.state = LandmarkState()
         self.variables = self.state.variables
-        self.detections = LandmarkDetections()
-        """Detections from the poses in the window."""
+        self.detections = LandmarkDetections()  # detections from the poses in the window
         self.twist: Array = np.zeros(POSE)
         """(3,) Twist of the vehicle at the newest detections, in m/s, m/s and rad/s."""
         self.loop_pairs: IntArray = NO_PAIRS
@@ -151,7 +141,6 @@ class LandmarkMap:
         return rows
 
     def add_late(self, late: LateDetections) -> slice:
-        """Add late detections to those of their pose, corrected; return their rows."""
         rows = self.detections.append(late.detections, late.cycle, late.twist)
         self.correct()
         return rows
@@ -247,7 +236,6 @@ def two_rows(cycles: IntArray, numbers: IntArray, jacobian: Array, residual: Arr
 
 
 def landmark_counts(labels: IntArray) -> tuple[int, int]:
-    """Return the number of landmarks with the left and with the right label."""
     return int((labels == LEFT).sum()), int((labels == RIGHT).sum())
 
 

@@ -21,20 +21,15 @@ LIST_NAMES: Final = {
 """Labels of the cones in a list with such a word in its name."""
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
 """Fields that may hold the label of a detection, the first one that is there."""
-NO_LABEL: Final = "none"
-"""Name of a label field that says there are no labels."""
+NO_LABEL: Final = "none"  # name of a label field that says there are no labels
 CLOUD_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Type of numpy by the `datatype` of a field of a point cloud."""
-POINT_MARKERS: Final = (1, 2, 3, 10)
-"""Types of markers that are one point: cube, sphere, cylinder, mesh."""
-LIST_MARKERS: Final = (6, 7, 8)
-"""Types of markers that are lists of points: cubes, spheres, points."""
-ADDED: Final = 0
-"""Action of a marker that is added; others are taken away."""
+POINT_MARKERS: Final = (1, 2, 3, 10)  # types of markers that are one point: cube, sphere, cylinder, mesh
+LIST_MARKERS: Final = (6, 7, 8)  # types of markers that are lists of points: cubes, spheres, points
+ADDED: Final = 0  # action of a marker that is added; others are taken away
 POSITIONS: Final = ("point", "position", "location", "center", "pose", "bbox")
 """Fields that lead to the position of a cone that has no `x` and `y` itself."""
-SPEEDS: Final = ("speed", "data")
-"""Fields of a speed alone."""
+SPEEDS: Final = ("speed", "data")  # fields of a speed alone
 
 
 class MessageError(PathspaceError):
@@ -45,15 +40,11 @@ class MessageError(PathspaceError):
 class Points:
     """Detected points of one message, in the frame of its sensor."""
 
-    points: Array
-    """(m, 2) Points in m."""
-    covariances: Array
-    """(m, 2, 2) Covariances in m^2, NaN where the message does not give them."""
-    labels: IntArray
-    """(m,) Labels."""
+    points: Array  # (m, 2) points in m
+    covariances: Array  # (m, 2, 2) covariances in m^2, NaN where the message does not give them
+    labels: IntArray  # (m,) labels
 
     def where(self, chosen: BoolArray) -> "Points":
-        """Return some of the points."""
         return Points(self.points[chosen], self.covariances[chosen], self.labels[chosen])
 
 
@@ -298,7 +289,6 @@ def _label_value(holder: Any, names: Sequence[str]) -> Any:
 
 
 def _names(message: Any) -> Sequence[str]:
-    """Return the names of a message's fields."""
     if is_dataclass(message):
         return [field.name for field in fields(message)]
     if hasattr(message, "get_fields_and_field_types"):

@@ -45,20 +45,13 @@ detection at the sensor itself is positive definite."""
 class Recording:
     """What a record has of a drive, in its own order and its own frames."""
 
-    t: Array
-    """(N,) Stamps of the twists (s)."""
-    twists: Array
-    """(N, 3) Twists in m/s, m/s and rad/s."""
-    scan_t: Array
-    """(M,) Stamps of the messages with detections (s)."""
-    scans: list[Points]
-    """Detections of each message, in the frame of the sensor."""
-    source: dict[str, str]
-    """Where the record comes from, in words."""
-    notes: Counter[str] = field(default_factory=Counter)
-    """What was done, in words, with the number of times."""
-    truth: Truth | None = None
-    """What is known of the drive, for evaluation only."""
+    t: Array  # (N,) stamps of the twists (s)
+    twists: Array  # (N, 3) twists in m/s, m/s and rad/s
+    scan_t: Array  # (M,) stamps of the messages with detections (s)
+    scans: list[Points]  # detections of each message, in the frame of the sensor
+    source: dict[str, str]  # where the record comes from, in words
+    notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, with the number of times
+    truth: Truth | None = None  # what is known of the drive, for evaluation only
     odometry_sigma: Array | None = None
     """(3,) Standard deviations of a twist (m/s, m/s, rad/s), where the record states them."""
     mounting: tuple[float, float, float] | None = None
@@ -198,7 +191,6 @@ def _cycles(
 
 
 def join(scans: list[Points]) -> Points:
-    """Return the points of several messages as those of one."""
     parts = zip(*((scan.points, scan.covariances, scan.labels) for scan in scans), strict=True)
     return scans[0] if len(scans) == 1 else Points(*map(np.concatenate, parts))
 
@@ -263,8 +255,7 @@ def default_covariances(points: Array, noise: NoiseSettings) -> Array:
 
 # --- messages as they arrive -------------------------------------------------------------------------------
 
-MAX_BUFFERED: Final = 10_000
-"""Largest number of twists that wait for a perception cycle, the newest ones."""
+MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle, the newest ones
 BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexError, OverflowError)
 """Errors of a message that cannot be read."""
 
@@ -285,8 +276,7 @@ class MessageStream:
     ) -> None:
         self.frames, self.noise = frames or Frames(), noise or NoiseSettings()
         self.rule, self.label_field = rule or LabelRule(), label_field
-        self.refused: Counter[str] = Counter()
-        """Number of messages for each reason."""
+        self.refused: Counter[str] = Counter()  # number of messages for each reason
         self._twists: deque[tuple[float, list[float]]] = deque(maxlen=MAX_BUFFERED)
         self._first = np.inf  # the stamp (s) of the first twist
         self._newest = -np.inf  # the stamp (s) of the newest cycle in order
@@ -329,7 +319,6 @@ class MessageStream:
             self._twists.popleft()
 
     def _odometry_until(self, t: float) -> Odometry:
-        """Return the buffered twists up to t (s); there are none for a late cycle."""
         rows = [] if t <= self._newest else [row for row in self._twists if row[0] <= t]
         twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
         return Odometry(np.array([stamp for stamp, _ in rows]), twists)

@@ -29,8 +29,7 @@ QUANTITIES: Final = {
     },
 }
 """Columns of each file and their quantities; a covariance is of the square of one."""
-COVARIANCE: Final = ("xx", "xy", "yy")
-"""Columns of the covariance of a detection, if there is one."""
+COVARIANCE: Final = ("xx", "xy", "yy")  # columns of the covariance of a detection, if there is one
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
@@ -39,16 +38,11 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "yaw_rate": {"rad/s": 1.0, "deg/s": pi / 180.0},
 }
 """Units of each quantity, in SI units."""
-MAX_BEARING: Final = 2.0 * pi
-"""Largest bearing (rad); more are degrees."""
-LARGEST: Final = 1e30
-"""Largest number of a file; stamps in nanoseconds are large."""
-UNSTATED: Final = ((np.nan, np.nan), (np.nan, np.nan))
-"""Covariance of a detection that states none."""
-MIN_PERIOD: Final = 1e-5
-"""Least mean period of samples (s); less is a wrong unit of time."""
-MAX_PERIOD: Final = 1e3
-"""Largest mean period of samples (s); more is a wrong unit of time."""
+MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
+LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
+UNSTATED: Final = ((np.nan, np.nan), (np.nan, np.nan))  # covariance of a detection that states none
+MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong unit of time
+MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong unit of time
 
 
 class Columns:
@@ -128,7 +122,6 @@ class _File:
         return (self.kind, key) in self.columns.named or key in self.table.columns
 
     def column(self, key: str) -> str:
-        """Return the column of a quantity; an InputError lists the columns that are there."""
         column = self.columns.named.get((self.kind, key), key).removeprefix("-")
         if column not in self.table.columns:
             expected = f"expected a column '{column}' for {key} (--columns {key}=NAME)"

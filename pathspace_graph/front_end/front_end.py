@@ -40,30 +40,23 @@ COLOURLESS: Final = {
     False: "most detections have a colour again",
 }
 """Notices that most colours are unknown from now on, or no longer."""
-NEAREST: Final = 2
-"""Number of nearest cones that are orange where the vehicle drives between orange cones."""
+NEAREST: Final = 2  # number of nearest cones that are orange where the vehicle drives between orange cones
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
     """Readings of a cycle after they were judged."""
 
-    motion: MeasuredMotion
-    """Motion that leads to the cycle."""
-    detections: Detections
-    """Detections of cones that bound the road."""
-    seen_again: BoolArray
-    """(m,) Whether each of them lies where the cycles just before had one."""
-    orange: Detections
-    """Detections of orange cones, which bound no road."""
-    stated: Array
-    """(m, 2, 2) Covariances of the detections in m^2 as stated, before any noise was measured."""
+    motion: MeasuredMotion  # motion that leads to the cycle
+    detections: Detections  # detections of cones that bound the road
+    seen_again: BoolArray  # (m,) whether each of them lies where the cycles just before had one
+    orange: Detections  # detections of orange cones, which bound no road
+    stated: Array  # (m, 2, 2) covariances of the detections in m^2 as stated, before any noise was measured
     sensor_doubted: bool = False
     """Whether the readings so far contradict the prior of the sensor's yaw or latency."""
     measured: MapperSettings | None = None
     """Settings with the priors of the calibrations, in a cycle in which they were measured."""
-    notice: str = ""
-    """What the labels mean from now on, where that has changed."""
+    notice: str = ""  # what the labels mean from now on, where that has changed
 
 
 class FrontEnd:
@@ -125,7 +118,6 @@ class FrontEnd:
 
     @property
     def noise_used(self) -> RunNoise:
-        """Noise that is used now, and what was measured so far."""
         return self.noise.used(self._settings)
 
     @property
@@ -151,13 +143,10 @@ class FrontEnd:
 class JudgedLog:
     """Readings of a whole log after they were judged cycle by cycle."""
 
-    chain: LogOdometry
-    """Motion from each cycle to the next."""
+    chain: LogOdometry  # motion from each cycle to the next
     cycles: Sequence[Detections]
-    orange: Sequence[Detections]
-    """Those of orange cones."""
-    settings: MapperSettings
-    """Settings, with wide priors of the sensor where the readings contradict them."""
+    orange: Sequence[Detections]  # those of orange cones
+    settings: MapperSettings  # settings, with wide priors of the sensor where the readings contradict them
     noise: RunNoise
 
 
@@ -190,7 +179,6 @@ def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
 
 
 def is_orange(detections: Detections) -> BoolArray:
-    """Return which detections (m,) are of orange cones."""
     return np.asarray(detections.labels >= min(POINTS))
 
 
@@ -223,11 +211,9 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
 class LateDetections:
     """The detections of a late cycle as they would be seen from a pose of the window."""
 
-    detections: Detections
-    """Detections in the vehicle frame of that pose."""
+    detections: Detections  # detections in the vehicle frame of that pose
     cycle: int
-    twist: Array
-    """(3,) Mean twist of the vehicle then, m/s, m/s and rad/s."""
+    twist: Array  # (3,) mean twist of the vehicle then, m/s, m/s and rad/s
 
 
 def at_nearest_pose(

@@ -29,42 +29,28 @@ less than 0.05 m/s is lost in the noise of its detections."""
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02])
 """Weak priors of the sensor's errors (rad, m, s, -, m) and of the yaw rate's bias (rad/s), one sigma."""
 FIRST_ALONG: Final = (0.1, 0.04)
-FIRST_ACROSS: Final = (0.05, 0.016)
-"""Noise that the iteration begins with: m and m/m, then m and rad."""
-PASSES: Final = 4
-"""Times that cones are followed."""
-FOLLOWED: Final = 40
-"""Cycles in which cones are followed in a step."""
-ROUNDS: Final = 5
-"""Times that errors, noise and weights are found in turn."""
-STRETCH: Final = 3.0
-"""Time (s) over which errors of the odometry are alike."""
+FIRST_ACROSS: Final = (0.05, 0.016)  # noise that the iteration begins with: m and m/m, then m and rad
+PASSES: Final = 4  # times that cones are followed
+FOLLOWED: Final = 40  # cycles in which cones are followed in a step
+ROUNDS: Final = 5  # times that errors, noise and weights are found in turn
+STRETCH: Final = 3.0  # time (s) over which errors of the odometry are alike
 COUNTED: Final = 0.8
 """Share of `MAX_RANGE` beyond which cones hardly count: they are followed only where they seem nearer."""
 HARDLY: Final = 1e-6
 """Weight of their sightings. It is not zero, so that a cone seen only there still has a place."""
 HUBER: Final = 2.0
-MIN_COUNT: Final = 5
-"""Least number of sightings of a cone that counts."""
-MIN_ROWS: Final = 60
-"""Least number of sightings with a reference that tell the noise of detections."""
-NEAR: Final = 0.6
-"""Share of a sighting's range within which the same cone's sightings are its reference."""
-NEAR_TIME: Final = 6.0
-"""Greatest time to a reference (s), over which odometry is trusted."""
+MIN_COUNT: Final = 5  # least number of sightings of a cone that counts
+MIN_ROWS: Final = 60  # least number of sightings with a reference that tell the noise of detections
+NEAR: Final = 0.6  # share of a sighting's range within which the same cone's sightings are its reference
+NEAR_TIME: Final = 6.0  # greatest time to a reference (s), over which odometry is trusted
 BINS: Final = 8
-TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-"""Correlation times that are tried (s)."""
-LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
-"""Edges of the lags at which correlation is measured (s)."""
-MODEL_ERROR: Final = 0.05
-"""Share of an error that the linear model may be wrong by, one sigma."""
+TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # correlation times that are tried (s)
+LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)  # edges of the lags at which correlation is measured (s)
+MODEL_ERROR: Final = 0.05  # share of an error that the linear model may be wrong by, one sigma
 FIRST_SHARE: Final = 0.5
 """Share of a cone's error that stays with it, as long as hardly any cone says otherwise."""
-FIRST_CONES: Final = 8.0
-"""Number of cones that `FIRST_SHARE` counts as much as."""
-LEAST: Final = (0.02, 0.002)
-"""Least noise along the ray (m) and across it (rad): a cone is no point."""
+FIRST_CONES: Final = 8.0  # number of cones that `FIRST_SHARE` counts as much as
+LEAST: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
 
 
 # --- errors of the sensor --------------------------------------------------------------------------------
@@ -78,14 +64,11 @@ class _Cones:
     begins: IntArray
     pairs: tuple[IntArray, IntArray]
     """Ordered pairs of sightings of one cone that are less than `NEAR_TIME` apart, by index."""
-    ranges: Array
-    """(n,) Range of the cone as the sensor measures it, without noise (m)."""
-    ray: Array
-    """(n, 2) Unit vector along the ray, map frame."""
+    ranges: Array  # (n,) range of the cone as the sensor measures it, without noise (m)
+    ray: Array  # (n, 2) unit vector along the ray, map frame
     side: Array
     points: Array
-    columns: Array
-    """(n, 2, 6) Derivatives by the sensor's errors and by the bias of the yaw rate."""
+    columns: Array  # (n, 2, 6) derivatives by the sensor's errors and by the bias of the yaw rate
 
     def without(self, off: Array) -> _Cones:
         """Return the sightings with ranges and derivatives where they would be without their errors (n, 2).
@@ -98,11 +81,9 @@ class _Cones:
         return replace(self, ranges=ranges, columns=_columns(self.table, self.begins, seen))
 
     def sums(self, values: Array) -> Array:
-        """Return the sum of values (n, ...) over each cone."""
         return np.asarray(np.add.reduceat(values, self.begins, axis=0))
 
     def spread(self, values: Array) -> Array:
-        """Return values (c, ...) of the cones for each of their sightings."""
         return np.repeat(values, np.diff(np.append(self.begins, len(self.ranges))), axis=0)
 
 
@@ -141,7 +122,6 @@ def _columns(table: Sightings, begins: IntArray, seen: Array) -> Array:
 
 
 def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Array) -> Array:
-    """Return the information (n, 2, 2) of each sighting, map frame."""
     by_ray = cones.ray[:, :, None] * cones.ray[:, None, :] / (along.sigmas(cones.ranges) ** 2)[:, None, None]
     by_side = cones.side[:, :, None] * cones.side[:, None, :]
     by_side /= (across.sigmas(cones.ranges) ** 2)[:, None, None]
@@ -189,8 +169,7 @@ class _Residuals:
     """What is left of far sightings about nearer ones of the same cone, after the constant errors."""
 
     rows: IntArray
-    offsets: Array
-    """(k, 2) Along the ray and across it, m."""
+    offsets: Array  # (k, 2) along the ray and across it, m
     reference: Array
     """(k, 2) Variance of the reference and of the odometry in between, along and across (m^2)."""
 
@@ -296,7 +275,6 @@ class _Rounds:
         self._left = ROUNDS
 
     def advance(self) -> MeasuredNoise | None:
-        """Do one round; return what was found after the last one."""
         walk, noise = self._found.odometry * np.sqrt(self._found.interval), self._noise
         information = _information(self._cones, *noise, self._weights)
         errors, *covariances, off = _solve(self._cones, information)
@@ -380,7 +358,6 @@ class Measurement:
         return None
 
     def _passed(self, found: MeasuredNoise) -> MeasuredNoise | None:
-        """End a pass, and begin the next one unless it was the last."""
         self._passes -= 1
         self._found, self._rounds, self._followed = found, None, 0
         self._follower, self._sightings = Follower(found), [Sightings.none()]

@@ -32,32 +32,25 @@ NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))
 """A motion that no odometry has measured does not depend on the calibration of the odometry."""
 DOUBT_AGAIN: Final = 3.8
 """Contradiction of an odometry that was contradicted not long ago, standard deviations."""
-DISTRUST: Final = 12.0
-"""Time for which it is distrusted so, s: wheels that slip do so in the next bends, too."""
+DISTRUST: Final = 12.0  # time for which it is distrusted so, s: wheels that slip do so in the next bends, too
 DOUBT_RATE: Final = 2.0
 """Agreement within which the yaw rate of a contradicted odometry is still believed, standard deviations."""
-MIN_DOUBTING: Final = 4
-"""Least number of matched detections of a contradiction."""
+MIN_DOUBTING: Final = 4  # least number of matched detections of a contradiction
 MISFIT: Final = 1.5
 """Mean-square misfit beyond which detections are worse than they claim: its excess scales covariances."""
-MISFIT_GAIN: Final = 0.02
-"""Smoothing gain of the mean-square misfit."""
+MISFIT_GAIN: Final = 0.02  # smoothing gain of the mean-square misfit
 MAX_MISFIT: Final = 3.0
 """Largest misfit that tells a motion: about 1 where the vehicle moved, 4 where it was put down elsewhere."""
-MISFIT_ODOMETRY: Final = 2.0
-"""Least misfit at the odometry's own pose in a contradiction."""
-MISFIT_RATIO: Final = 1.3
-"""Least ratio of that misfit to the one of the match."""
-MAX_CHANGE: Final = 3.5
-"""Largest difference of a motion from the one before, in `SIGMAS_CHANGE`."""
+MISFIT_ODOMETRY: Final = 2.0  # least misfit at the odometry's own pose in a contradiction
+MISFIT_RATIO: Final = 1.3  # least ratio of that misfit to the one of the match
+MAX_CHANGE: Final = 3.5  # largest difference of a motion from the one before, in `SIGMAS_CHANGE`
 SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)
 """Standard deviations (m/s, m/s, rad/s) of a velocity's change in a cycle whose odometry is not believed."""
 BEFORE: Final = 0.5
 """Share of a contradiction's size added to its motion's sigma: it may have begun a few cycles before."""
 WIDENING: Final = 1.5
 """Factor of the standard deviations of a motion told from detections, since the estimator uses them again."""
-HOLD: Final = 0.15
-"""Time for which a twist is held without a loss of certainty, s."""
+HOLD: Final = 0.15  # time for which a twist is held without a loss of certainty, s
 HOLD_INTERVALS: Final = 3.0
 """Shortest intervals between two twists for which it is held so; the longer time counts."""
 STUCK: Final = 3
@@ -66,8 +59,7 @@ REST: Final = 1.0
 """Time of standing from which the vehicle is at rest, s: its mean yaw rate measures the bias then."""
 REST_TWIST: Final = (0.1, 0.1, 0.05)
 """Largest mean twist (m/s, m/s, rad/s) of a vehicle that stands, but for noise; the yaw rate is bias."""
-REST_SIGMAS: Final = 3.0
-"""Standard deviations of the mean that count as its noise."""
+REST_SIGMAS: Final = 3.0  # standard deviations of the mean that count as its noise
 SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)
 """Standard deviations (m, m, rad) of a motion at rest from cycle to cycle."""
 
@@ -79,15 +71,13 @@ class MotionCheck:
     """
 
     def __init__(self, sigma: Array, settings: MotionSettings) -> None:
-        """Keep the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         self.settings = settings
         self.sigma = sigma
         self.seen_again: BoolArray = np.zeros(0, bool)
         """(m,) Whether each detection of the newest cycle lies where the cycles before had one."""
         self.pose: Array = np.zeros(3)
         """(3,) Newest pose in the frame of the front end, in which the drive began at 0."""
-        self.errors = SensorErrors(settings)
-        """How much the sensor is turned, and how late its detections are."""
+        self.errors = SensorErrors(settings)  # how much the sensor is turned, and how late its detections are
         self._recent = RecentDetections()
         self._velocity: Array | None = None
         self._t: float | None = None
@@ -172,7 +162,6 @@ class MotionCheck:
         )
 
     def _at_rest(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
-        """Return no motion at all, where the detections say so as well, or else the given one."""
         standing = self._match(detections, variances, self.pose, REACHES_CHECK)
         none = integrated_odometry(np.zeros(3), np.diag(SIGMAS_REST) ** 2, NO_CALIBRATION)
         if standing is None or self._denies(standing, self._difference(none, self.pose, standing)):
@@ -227,26 +216,22 @@ class MotionCheck:
     def _best(
         self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float
     ) -> Match | None:
-        """Return the better match of those that begin at two poses (3,), the first going on as before."""
         matches = [self._match(detections, variances, start, reaches()) for start in starts]
         possible = [one for one in matches if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)
 
     def _is_possible(self, matched: Match, going_on: Array, dt: float) -> bool:
-        """Return whether a match is that of a vehicle which went on from pose to pose (3,)."""
         sigmas = np.array(SIGMAS_CHANGE) * dt + np.sqrt(np.diag(np.linalg.inv(matched.information)))
         change = np.abs(relative(going_on, matched.pose))
         fits = matched.misfit < MAX_MISFIT * self._excess
         return fits and bool((change < MAX_CHANGE * sigmas).all())
 
     def _denies(self, matched: Match, difference: Difference) -> bool:
-        """Return whether a match of detections is too far off a motion."""
         return matched.matched >= MIN_DOUBTING and self.errors.square_of(difference) > self._limit**2
 
     def _match(
         self, detections: Detections, variances: Array, start: Array, reaches: Sequence[float]
     ) -> Match | None:
-        """Return the match of a cycle's detections that begins at a pose (3,), if it holds the pose."""
         matched = match(self._recent, detections.points_vehicle, variances, start, reaches)
         return matched if matched.matched >= MIN_MATCHED and matched.is_certain else None
 
@@ -292,7 +277,6 @@ class Rest:
     """Judge of whether the vehicle stands, by the odometry; it averages the yaw rate meanwhile."""
 
     def __init__(self, sigma: Array) -> None:
-        """Keep the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         self.sigma = sigma
         self._since: float | None = None
         self._sum: Array = np.zeros(3)

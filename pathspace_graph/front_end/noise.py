@@ -19,17 +19,12 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .measurement import Measurement
 from .sightings import SeenCycle, TwistRecord
 
-FIRST: Final = 8.0
-"""Driving time (s) after which noise is measured first."""
-AGAIN: Final = 1.5
-"""Growth of the driving time after which it is measured again."""
-MOST_CYCLES: Final = 300
-"""Newest cycles on which it is measured, which bounds its time."""
-MIN_SPEED: Final = 0.3
-"""Speed from which on the vehicle drives (m/s)."""
+FIRST: Final = 8.0  # driving time (s) after which noise is measured first
+AGAIN: Final = 1.5  # growth of the driving time after which it is measured again
+MOST_CYCLES: Final = 300  # newest cycles on which it is measured, which bounds its time
+MIN_SPEED: Final = 0.3  # speed from which on the vehicle drives (m/s)
 SCALE: Final = SENSOR.index("range_scale")
-REFERENCE_RANGE: Final = 10.0
-"""Range at whose noise ranges are compared with speeds (m)."""
+REFERENCE_RANGE: Final = 10.0  # range at whose noise ranges are compared with speeds (m)
 
 
 class NoiseLearner:
@@ -43,8 +38,7 @@ class NoiseLearner:
         """Whether the noise of odometry and detections is the measured one."""
         self.of_sensor = use != "stated"
         """Whether constant errors of the sensor are measured: stated noise says nothing of them."""
-        self.measured = known.measured
-        """What was measured so far, or by an earlier look at the whole drive."""
+        self.measured = known.measured  # what was measured so far, or by an earlier look at the whole drive
         self._cycles: deque[SeenCycle] = deque(maxlen=MOST_CYCLES)
         self._twists = TwistRecord()
         self._measurement: Measurement | None = None
@@ -53,17 +47,14 @@ class NoiseLearner:
 
     @property
     def is_learning(self) -> bool:
-        """Return whether the drive is still needed to know its noise."""
         return self.of_sensor and self.known.measured is None
 
     @property
     def is_settled(self) -> bool:
-        """Return whether the noise of the detections is known, stated or measured."""
         return not self.of_detections or (self.measured is not None and self.measured.along is not None)
 
     @property
     def twist_sigma(self) -> Array:
-        """Return the standard deviation (3,) of a twist."""
         if self.of_odometry and self.measured is not None:
             return self.measured.twist_sigma
         return self.known.odometry

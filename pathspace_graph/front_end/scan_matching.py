@@ -33,22 +33,17 @@ MINUTE: Final = 60.0
 
 MEMORY: Final = 0.65
 """Time for which detections are remembered, s: several cycles, over which odometry hardly drifts."""
-MOST_REMEMBERED: Final = 2000
-"""Largest number of remembered detections, which bounds the time of a match."""
+MOST_REMEMBERED: Final = 2000  # largest number of remembered detections, which bounds the time of a match
 REACH: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
 ITERATIONS: Final = 6
 REACHES_CHECK: Final = (REACH, REACH_LAST)
 """Reaches in the check of the odometry, which begins near the solution."""
-FARTHEST: Final = 3.0
-"""Distance in reaches from which on a remembered detection has no weight."""
-MIN_WEIGHT: Final = 0.7
-"""Least sum of weights of a matched detection."""
-MIN_MATCHED: Final = 3
-"""Least number of matched detections that tell a motion."""
-HUBER: Final = 2.5
-"""Whitened distance beyond which the Huber loss reduces the weight of a matched detection."""
+FARTHEST: Final = 3.0  # distance in reaches from which on a remembered detection has no weight
+MIN_WEIGHT: Final = 0.7  # least sum of weights of a matched detection
+MIN_MATCHED: Final = 3  # least number of matched detections that tell a motion
+HUBER: Final = 2.5  # whitened distance beyond which the Huber loss reduces the weight of a matched detection
 SIGMA_CONE: Final = 0.05
 """Standard deviation added to that of a detection, m, since one side of a cone is seen."""
 LEAST_SHARE: Final = 1e-6
@@ -68,8 +63,7 @@ class RecentDetections:
     """Detections of the newest cycles in one frame."""
 
     def __init__(self) -> None:
-        self.points: Array = np.zeros((0, 2))
-        """(n, 2) Place of each detection, m."""
+        self.points: Array = np.zeros((0, 2))  # (n, 2) place of each detection, m
         # a row is [stamp | point as measured | place of the vehicle | derivatives of x | derivatives of y]
         self._table: Array = np.zeros((0, 5 + 2 * len(ERRORS)))
 
@@ -109,14 +103,10 @@ class RecentDetections:
 class Match:
     """Pose that lays detections on earlier ones."""
 
-    pose: Array
-    """(3,) In the frame of the earlier detections, m, m and rad."""
-    information: Array
-    """(3, 3) Information about the pose from the matched detections, same frame."""
-    is_matched: BoolArray
-    """(m,) Whether each detection lies on earlier ones."""
-    misfit: float
-    """Mean square of the matched detections' whitened distances."""
+    pose: Array  # (3,) in the frame of the earlier detections, m, m and rad
+    information: Array  # (3, 3) information about the pose from the matched detections, same frame
+    is_matched: BoolArray  # (m,) whether each detection lies on earlier ones
+    misfit: float  # mean square of the matched detections' whitened distances
 
     @property
     def matched(self) -> int:
@@ -236,12 +226,9 @@ def by_errors(points_vehicle: Array, twist: Array) -> Array:
 class Difference:
     """Distance of a match of detections from the odometry, in the vehicle frame."""
 
-    off: Array
-    """(3,) m, m and rad."""
-    covariance: Array
-    """(3, 3) Its covariance, for a sensor without errors."""
-    shifts: Array
-    """(3, 2) Its derivatives by the errors of the sensor."""
+    off: Array  # (3,) m, m and rad
+    covariance: Array  # (3, 3) its covariance, for a sensor without errors
+    shifts: Array  # (3, 2) its derivatives by the errors of the sensor
 
 
 class SensorErrors:
@@ -253,10 +240,8 @@ class SensorErrors:
     """
 
     def __init__(self, settings: MotionSettings) -> None:
-        self.mean: Array = np.zeros(len(ERRORS))
-        """(2,) Yaw (rad, to the left) and latency (s)."""
-        self.covariance: Array = np.diag(np.square(SIGMAS_ERRORS))
-        """(2, 2) Their covariance."""
+        self.mean: Array = np.zeros(len(ERRORS))  # (2,) yaw (rad, to the left) and latency (s)
+        self.covariance: Array = np.diag(np.square(SIGMAS_ERRORS))  # (2, 2) their covariance
         self._drift: Array = np.diag(np.square(SIGMAS_CHANGES)) / MINUTE
         self._velocity: Array = np.zeros(3)
         self._possible: Array = 0.5 * MEMORY * np.array(settings.accelerations)

@@ -13,20 +13,15 @@ from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Odometry
 
-MAD: Final = 1.4826
-"""Standard deviation of a Gaussian by its median absolute deviation."""
+MAD: Final = 1.4826  # standard deviation of a Gaussian by its median absolute deviation
 MOST_TWISTS: Final = 4000
 MOST_PARTS: Final = 200
-MIN_SPEED_SHARE: Final = 0.3
-"""Share of its median speed below which a vehicle says little of noise in motion."""
-MIN_TWISTS: Final = 30
-"""Least number of twists that tell white noise."""
+MIN_SPEED_SHARE: Final = 0.3  # share of its median speed below which a vehicle says little of noise in motion
+MIN_TWISTS: Final = 30  # least number of twists that tell white noise
 MAX_RANGE: Final = 30.0
 """Range beyond which sightings are not followed (m): they are hardly ever seen near later."""
-MAX_AGE: Final = 3.0
-"""Time without a sighting after which a cone counts as another one (s)."""
-GATE: Final = (0.4, 0.06, 1.5)
-"""Gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m."""
+MAX_AGE: Final = 3.0  # time without a sighting after which a cone counts as another one (s)
+GATE: Final = (0.4, 0.06, 1.5)  # gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m
 FOLLOWING: Final = (0.5, 0.15)
 """Share by which a cone goes to where it is seen, and where it was seen from nearer before."""
 GATE_SIGMAS: Final = 3.5
@@ -39,18 +34,12 @@ GATE_MOST: Final = 3.5
 class Sightings:
     """Columns of sightings of cones, in order of time."""
 
-    cone: IntArray
-    """(n,) Number of the cone."""
-    t: Array
-    """(n,) Stamp (s)."""
-    point: Array
-    """(n, 2) Detection as measured (m), vehicle frame."""
-    twist: Array
-    """(n, 3) Twist of the vehicle then: m/s, m/s, rad/s."""
-    pose: Array
-    """(n, 3) Pose of the vehicle by dead reckoning."""
-    by_bias: Array
-    """(n, 3) Derivative of that pose by the bias of the yaw rate."""
+    cone: IntArray  # (n,) number of the cone
+    t: Array  # (n,) stamp (s)
+    point: Array  # (n, 2) detection as measured (m), vehicle frame
+    twist: Array  # (n, 3) twist of the vehicle then: m/s, m/s, rad/s
+    pose: Array  # (n, 3) pose of the vehicle by dead reckoning
+    by_bias: Array  # (n, 3) derivative of that pose by the bias of the yaw rate
 
     @classmethod
     def none(cls) -> "Sightings":
@@ -73,12 +62,9 @@ class Sightings:
 class SeenCycle:
     """A perception cycle where dead reckoning has placed it."""
 
-    detections: Detections
-    """Detections as measured."""
-    pose: Array
-    """(3,) Pose of the vehicle by dead reckoning."""
-    twist: Array
-    """(3,) Twist of the vehicle: m/s, m/s, rad/s."""
+    detections: Detections  # detections as measured
+    pose: Array  # (3,) pose of the vehicle by dead reckoning
+    twist: Array  # (3,) twist of the vehicle: m/s, m/s, rad/s
 
 
 def follow(cycles: Iterable[SeenCycle], known: MeasuredNoise) -> Sightings:

@@ -27,10 +27,8 @@ CENTRE_LINE_HEADER: Final = "# x_m,y_m,w_tr_right_m,w_tr_left_m"
 """Header of TUM's raceline format; its reader takes the line for a comment."""
 PROFILE_HEADER: Final = "# s_m,x_m,y_m,psi_rad,kappa_radpm,vx_mps,ax_mps2"
 """Columns of TUM's trajectories."""
-POINTS_HEADER: Final = "x,y,label"
-"""Header of a table of points, as that of a log's true cones."""
-_FEWEST_INTERVALS: Final = 4
-"""Least number of intervals of a sampled boundary."""
+POINTS_HEADER: Final = "x,y,label"  # header of a table of points, as that of a log's true cones
+_FEWEST_INTERVALS: Final = 4  # least number of intervals of a sampled boundary
 
 
 def write_centre_line(file: Path, track: Map, step: float) -> None:
@@ -105,16 +103,11 @@ def _write_lines(file: Path, lines: Iterable[str]) -> None:
 
 # --- latitude and longitude ------------------------------------------------------------------------------
 
-SEMI_MAJOR_AXIS: Final = 6_378_137.0
-"""Radius of the equator of WGS84 (m)."""
-FLATTENING: Final = 1.0 / 298.257223563
-"""Flattening of the ellipsoid of WGS84."""
-_SQUARE: Final = FLATTENING * (2.0 - FLATTENING)
-"""Square e^2 of its eccentricity."""
-_ITERATIONS: Final = 8
-"""Iterations of the latitude, each of which leaves less than a hundredth of the error."""
-_DECIMALS_DEGREES: Final = 10
-"""Number of decimals of degrees, which is 0.01 mm."""
+SEMI_MAJOR_AXIS: Final = 6_378_137.0  # radius of the equator of WGS84 (m)
+FLATTENING: Final = 1.0 / 298.257223563  # flattening of the ellipsoid of WGS84
+_SQUARE: Final = FLATTENING * (2.0 - FLATTENING)  # square e^2 of its eccentricity
+_ITERATIONS: Final = 8  # iterations of the latitude, each of which leaves less than a hundredth of the error
+_DECIMALS_DEGREES: Final = 10  # number of decimals of degrees, which is 0.01 mm
 
 
 @dataclass(frozen=True)
@@ -177,8 +170,7 @@ def _normal_radius(sine: Any) -> Any:
 
 # --- GeoJSON ---------------------------------------------------------------------------------------------
 
-CENTRE: Final = "centre"
-"""Name of the centre line."""
+CENTRE: Final = "centre"  # name of the centre line
 _PROPERTIES: Final = (
     ("arc_length_m", "arc_length"),
     ("curvature_per_m", "curvature"),
@@ -234,13 +226,11 @@ LANELET_TAGS: Final = {
     "participant:vehicle": "yes",
 }
 """Tags of a lanelet: a road for vehicles, in the direction of travel."""
-CONE: Final = "cone"
-"""Type of the node of an orange cone, whose subtype is its label."""
+CONE: Final = "cone"  # type of the node of an orange cone, whose subtype is its label
 _PIECES: Final = 4
 """Number of lanelets of a loop; Lanelet2 knows neither length nor successor of a single one."""
 _FEWEST_WAY_INTERVALS: Final = 2
-_DECIMALS: Final = 5
-"""Number of decimals of local coordinates (m)."""
+_DECIMALS: Final = 5  # number of decimals of local coordinates (m)
 
 
 def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> None:

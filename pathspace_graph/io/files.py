@@ -33,12 +33,10 @@ try:
 except ImportError:  # Windows has no such locks
     fcntl = None  # type: ignore[assignment]
 
-STDOUT: Final = Path("-")
-"""Path at which a single file is written to standard output."""
+STDOUT: Final = Path("-")  # path at which a single file is written to standard output
 SYNC: Final = "pathspace_graph.sync"
 """Audit event before a file or a folder is flushed to the disk, with its path."""
-RENAME: Final = "pathspace_graph.rename"
-"""Audit event before a rename with flags, with both paths."""
+RENAME: Final = "pathspace_graph.rename"  # audit event before a rename with flags, with both paths
 
 _AT_FDCWD: Final = -100  # a relative path is relative to the working folder
 _NOREPLACE: Final = 1
@@ -128,12 +126,10 @@ def write_json(file: Path, content: Any, indent: int | None = 2) -> None:
 
 
 def write_manifest(folder: Path) -> None:
-    """Write the manifest of what a folder holds now."""
     write_text(folder / MANIFEST_FILE, manifest_of(folder))
 
 
 def remove_manifest(folder: Path) -> None:
-    """Remove the manifest of a folder that is about to change, where there is one."""
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
 
 
@@ -206,7 +202,6 @@ def _placed(final: Path, make: Callable[[Path], None], check: Callable[[], None]
 
 
 def _put_in_place(temporary: Path, final: Path) -> None:
-    """Move what was written to its place, and what was there to a numbered backup."""
     if temporary.is_dir():
         with suppress(OSError):
             temporary.rename(final)  # also over an empty folder, but over nothing else
@@ -243,7 +238,6 @@ def _naming(final: Path) -> Iterator[None]:
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether a file has the name of a temporary one."""
     return re.fullmatch(rf"\..*\.{_TOKEN}\.tmp(\.[^.]*)?", name) is not None
 
 

@@ -52,8 +52,7 @@ COLUMNS: Final[dict[str, dict[str, Column]]] = {
 """Columns of each table, in the order in which they are written; those of the truth are optional files."""
 FILES: Final = (LOG_FILE, *COLUMNS)
 
-CALIBRATION: Final = ("scale", "bias")
-"""Names of the true calibration of the odometry in the log's header."""
+CALIBRATION: Final = ("scale", "bias")  # names of the true calibration of the odometry in the log's header
 
 SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 """Names of the true constant errors of the sensor in the log's header."""
@@ -112,7 +111,6 @@ class Detections(Brief):
     """Their labels (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE."""
 
     def where(self, chosen: BoolArray) -> Detections:
-        """Return the chosen detections of the cycle."""
         if chosen.all():
             return self
         return Detections(self.t, self.points_vehicle[chosen], self.covariances[chosen], self.labels[chosen])
@@ -367,7 +365,6 @@ def _sections(log: Log) -> dict[str, dict[str, Any]]:
 
 
 def _columns(log: Log) -> dict[str, tuple[Any, ...]]:
-    """Return the columns of each table, see `COLUMNS`."""
     cycles, truth = log.cycles, log.truth
     covariances = np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in cycles)])
     columns: dict[str, tuple[Any, ...]] = {

@@ -15,8 +15,7 @@ FORMAT: Final = "pathspace-manifest/1"
 MANIFEST_FILE: Final = "manifest.json"
 _MARK: Final = "pathspace"
 """Word that a manifest holds more than once, so that a damaged one is not taken for another program's."""
-_DIGEST: Final = "pathspace_digest"
-"""Key of the manifest's own SHA-256, taken without this key."""
+_DIGEST: Final = "pathspace_digest"  # key of the manifest's own SHA-256, taken without this key
 
 
 def manifest_of(folder: Path) -> str:

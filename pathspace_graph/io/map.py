@@ -30,8 +30,7 @@ MAP_FILE = "map.json"
 NO_COVARIANCE: Final[Array] = np.zeros((0, 0))
 """Covariance of a boundary for which none was asked; it can't be written."""
 
-_SYMMETRY_TOLERANCE = 1e-9
-"""Largest |P - P^T| over max|P| of a covariance that is symmetric to rounding."""
+_SYMMETRY_TOLERANCE = 1e-9  # largest |P - P^T| over max|P| of a covariance that is symmetric to rounding
 _NEGATIVE_TOLERANCE = 1e-9
 """Most negative eigenvalue over the largest one of a covariance that is positive semidefinite to rounding."""
 
@@ -68,7 +67,6 @@ class PointBoundary(Brief):
 
     @property
     def size(self) -> int:
-        """Return the number m of points."""
         return len(self.points)
 
 

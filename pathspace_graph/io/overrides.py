@@ -11,8 +11,7 @@ from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_json, parse_toml,
 from pathspace_graph.settings.checked import successor
 
 T = TypeVar("T")
-Overrides = Mapping[str, Any]
-"""New values by dotted field."""
+Overrides = Mapping[str, Any]  # new values by dotted field
 
 
 def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:

@@ -179,7 +179,6 @@ def parse_yaml(text: str, file: Path) -> Any:
 
 
 def _row(mark: Any) -> int | None:
-    """Return the row (from 1) of a mark, which the parser may not give."""
     return None if mark is None else int(mark.line) + 1
 
 
@@ -187,8 +186,6 @@ def _row(mark: Any) -> int | None:
 
 
 class Column(NamedTuple):
-    """What the numbers of a column must be."""
-
     largest: float = MAX_COORDINATE
     unit: str = ""
 
@@ -198,10 +195,8 @@ class Table:
     """Rows below a CSV header, as text, column by column."""
 
     file: Path
-    columns: dict[str, list[str]]
-    """Texts of each column, as they stand in the file."""
-    lines: list[int]
-    """Line of each row in the file; the header is line 1."""
+    columns: dict[str, list[str]]  # texts of each column, as they stand in the file
+    lines: list[int]  # line of each row in the file; the header is line 1
     declared: Mapping[str, Column] = field(default_factory=dict)
 
     def __len__(self) -> int:

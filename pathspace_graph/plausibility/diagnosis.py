@@ -9,20 +9,16 @@ from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.results import RunNoise, VehicleState
 
-LIMIT: Final = 3.0
-"""Prior standard deviations from zero beyond which a calibration is worth a line."""
+LIMIT: Final = 3.0  # prior standard deviations from zero beyond which a calibration is worth a line
 
 
 class Cause(NamedTuple):
     """What a calibration means, and the group of the settings with its prior as `sigma_` and its name."""
 
     group: str
-    text: str
-    """Cause, with a place for the size."""
-    unit: float
-    """Size of a calibration of 1."""
-    signs: tuple[str, str]
-    """Words for a positive and for a negative calibration."""
+    text: str  # cause, with a place for the size
+    unit: float  # size of a calibration of 1
+    signs: tuple[str, str]  # words for a positive and for a negative calibration
 
 
 CAUSES: Final = {
@@ -62,14 +58,11 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
 
 # --- measured noise --------------------------------------------------------------------------------------
 
-REFERENCE: Final = 10.0
-"""Range at which the noise of detections is told (m)."""
-CLEAR: Final = 4.0
-"""Standard deviations beyond which a measured error of the sensor is told."""
+REFERENCE: Final = 10.0  # range at which the noise of detections is told (m)
+CLEAR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is told
 WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
 """Size beyond which it is told (rad, m, s, -, m)."""
-STAYING: Final = 0.1
-"""Share of the variance from which errors that stay with a cone are told."""
+STAYING: Final = 0.1  # share of the variance from which errors that stay with a cone are told
 
 
 def noise_lines(noise: RunNoise | None) -> list[str]:
@@ -110,7 +103,6 @@ def size_lines(noise: RunNoise) -> list[str]:
 
 
 def _errors(measured: MeasuredNoise) -> list[str]:
-    """Return the constant errors of the sensor that are clear and worth a word."""
     errors = zip(SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True)
     clear = {name: value for name, value, sigma in errors if abs(value) > max(CLEAR * sigma, WORTH[name])}
     side = {name: "left" if value > 0.0 else "right" for name, value in clear.items()}

@@ -26,54 +26,37 @@ from .hypotheses import (
 from .noise import noise_hints
 from .pairs import DEGREE, GAPS, Meaning, Pairs, motions, pairs_of
 
-LEAST_TWISTS: Final = 20
-"""Least number of twists of a log of which anything is said."""
+LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is said
 OVERLAP: Final = 0.5
 """Share of a cycle's detections that another could have seen, from which the two are compared."""
-SHORTEST_STEP: Final = 2e-4
-"""Shortest usual time between rows (s)."""
-LONGEST_STEP: Final = 5.0
-"""Longest usual time between rows (s)."""
-FARTHEST: Final = 120.0
-"""Usual greatest range of a detector of cones (m)."""
-FAR: Final = 20.0
-"""Range within which cones decide between two units that both give possible positions (m)."""
-NEAREST: Final = 0.05
-"""Usual least range of cones (m)."""
-FASTEST: Final = 100.0
-"""Speed that no vehicle exceeds in a tenth of its time (m/s)."""
-FASTEST_TURN: Final = 8.0
-"""Yaw rate that no vehicle exceeds in a tenth of its time (rad/s)."""
-TURNED: Final = 5.0
-"""Turn of the sensor beyond which it is told (degrees)."""
-TURNED_SIGMA: Final = 1.0
-"""Largest standard deviation of the turn at which it is told (degrees)."""
+SHORTEST_STEP: Final = 2e-4  # shortest usual time between rows (s)
+LONGEST_STEP: Final = 5.0  # longest usual time between rows (s)
+FARTHEST: Final = 120.0  # usual greatest range of a detector of cones (m)
+FAR: Final = 20.0  # range within which cones decide between two units that both give possible positions (m)
+NEAREST: Final = 0.05  # usual least range of cones (m)
+FASTEST: Final = 100.0  # speed that no vehicle exceeds in a tenth of its time (m/s)
+FASTEST_TURN: Final = 8.0  # yaw rate that no vehicle exceeds in a tenth of its time (rad/s)
+TURNED: Final = 5.0  # turn of the sensor beyond which it is told (degrees)
+TURNED_SIGMA: Final = 1.0  # largest standard deviation of the turn at which it is told (degrees)
 ARM: Final = 1.0
 """Distance of the sensor from the point that the odometry describes beyond which it is told (m)."""
 ARM_SIGMA: Final = 0.2
 """Largest standard deviation of its place at which it is told, as a share of the distance."""
 CLAIMED_LESS: Final = 10.0
 """Ratio of one cone's scatter to the claimed one from which covariances are too small."""
-CLAIMED_MORE: Final = 30.0
-"""Ratio of the claimed scatter to one cone's from which covariances are too large."""
-LEAST_SCATTER: Final = 0.02
-"""Scatter that detections which scatter less count as (m)."""
+CLAIMED_MORE: Final = 30.0  # ratio of the claimed scatter to one cone's from which covariances are too large
+LEAST_SCATTER: Final = 0.02  # scatter that detections which scatter less count as (m)
 BOTH_SIDES: Final = 0.15
 """Distance from a half of the share of a label's cones on its own side at which they are on both."""
 NEAR: Final = 0.25
 """Move by a share of the usual range, and turn (rad), below which two cycles see the same cones."""
-MANY: Final = 6
-"""Least number of detections that such cycles have together."""
-LEAST_NEAR: Final = 30
-"""Least number of such pairs of cycles that are counted."""
-UNEXPLAINED: Final = 0.15
-"""Share of the detections that the best motion must explain, or else none does."""
-LINE_RATIO: Final = 0.1
-"""Ratio of the variations of two coordinates below which detections lie on a line."""
+MANY: Final = 6  # least number of detections that such cycles have together
+LEAST_NEAR: Final = 30  # least number of such pairs of cycles that are counted
+UNEXPLAINED: Final = 0.15  # share of the detections that the best motion must explain, or else none does
+LINE_RATIO: Final = 0.1  # ratio of the variations of two coordinates below which detections lie on a line
 TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
 """Units of stamps by their size in s."""
-LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}
-"""Units of positions by their size in m."""
+LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # units of positions by their size in m
 SPEEDS: Final = {
     1.0 / 3.6: "are in km/h, not in m/s",
     0.44704: "are in miles per hour, not in m/s",
@@ -98,8 +81,7 @@ FRAMES: Final = {
     Frame(-90.0, True): "the sensor's frame has x to the right and y to the rear",
 }
 """What a frame in quarter turns means; the one with y to the right has its own hint."""
-MIRRORED: Final = Frame(0.0, True)
-"""Frame in which y points to the right and x ahead."""
+MIRRORED: Final = Frame(0.0, True)  # frame in which y points to the right and x ahead
 
 
 def hints(log: Log) -> list[Hint]:
@@ -115,7 +97,6 @@ def hints(log: Log) -> list[Hint]:
 
 
 def _hints(log: Log) -> list[Hint]:
-    """Return the hints about a log at scale 1."""
     of_parts = whole_stamps(log)
     if of_parts:
         return of_parts
@@ -193,7 +174,6 @@ def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def beyond_any_vehicle(odometry: Odometry) -> list[Hint]:
-    """Return hints about speeds and yaw rates that no vehicle has."""
     speed = float(np.quantile(np.hypot(odometry.twist[:, 0], odometry.twist[:, 1]), 0.9))
     rate = float(np.quantile(np.abs(odometry.twist[:, 2]), 0.9))
     found = [told("too fast", speed=speed)] if speed > FASTEST else []
@@ -201,7 +181,6 @@ def beyond_any_vehicle(odometry: Odometry) -> list[Hint]:
 
 
 def _stamps(log: Log) -> dict[str, Array]:
-    """Return the stamps (s) of the rows of odometry and of the cycles, by file."""
     return {ODOMETRY_FILE: log.odometry.t, DETECTIONS_FILE: np.array([cycle.t for cycle in log.cycles])}
 
 
@@ -225,7 +204,6 @@ def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
 
 
 def _by_motion(trials: Trials) -> list[Hint]:
-    """Return the hints about frame, odometry, clocks, mounting, covariances and labels."""
     if len(trials.pairs) == 0:
         return beyond_any_vehicle(trials.log.odometry)
     best, found = _meant(trials)
@@ -243,7 +221,6 @@ def _by_motion(trials: Trials) -> list[Hint]:
 
 
 def _meant(trials: Trials) -> tuple[Trial, list[Hint]]:
-    """Return the hypothesis that explains the log, and what it says of frame and odometry."""
     best = trials.best()
     compared = verdict(best, trials.as_written)
     if best is trials.as_written or not compared.is_clear():
@@ -279,7 +256,6 @@ def _of_frame(best: Trial, trials: Trials, compared: Verdict) -> list[Hint]:
 
 
 def _mended(frame: Frame) -> str:
-    """Return how to turn detections into the vehicle's frame."""
     matrix = frame.matrix
     if np.allclose(matrix, np.round(matrix), atol=1e-9):
         signs = {1: "", -1: "-"}
@@ -313,7 +289,6 @@ def _of_odometry(meaning: Meaning, compared: Verdict) -> list[Hint]:
 
 
 def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
-    """Return the trial with the lateness of the detections, and a hint where there is a large one."""
     late = best_lateness(trials, best)
     compared = verdict(late, best)
     if not compared.is_clear():
@@ -324,7 +299,6 @@ def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
 
 
 def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
-    """Return the hints with one about a sensor that is turned by an angle that is no quarter turn."""
     yaw, sigma = mounting.yaw
     frame = best.hypothesis.frame
     if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURNED or sigma > TURNED_SIGMA):
@@ -340,7 +314,6 @@ def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
 
 
 def _placed(mounting: Mounting) -> list[Hint]:
-    """Return a hint where the sensor sits metres away from the point that the odometry describes."""
     length, sigma = mounting.arm
     if length < ARM or sigma > ARM_SIGMA * length:
         return []
@@ -351,7 +324,6 @@ def _placed(mounting: Mounting) -> list[Hint]:
 
 
 def _certain(mounting: Mounting) -> list[Hint]:
-    """Return a hint where the covariances are far from how detections of one cone scatter."""
     scatter, claimed = mounting.scatter, mounting.claimed
     if claimed * CLAIMED_LESS < scatter:
         unit = "another unit"
@@ -363,7 +335,6 @@ def _certain(mounting: Mounting) -> list[Hint]:
 
 
 def _labelled(trials: Trials, best: Trial) -> list[Hint]:
-    """Return a hint where one label stands for cones on both sides of the vehicle."""
     labels = np.concatenate([cycle.labels for cycle in trials.log.cycles])
     present = [label for label in (LEFT, RIGHT) if (labels == label).any()]
     if len(present) != 1 or (labels == UNKNOWN).any() or abs(best.sided - 0.5) > BOTH_SIDES:
@@ -372,7 +343,6 @@ def _labelled(trials: Trials, best: Trial) -> list[Hint]:
 
 
 def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
-    """Return a hint where detections of cycles close to each other agree with no motion at all."""
     pairs = trials.pairs
     motion = trials.motion(best.hypothesis)
     ranges = np.nanmedian(np.hypot(pairs.before[..., 0], pairs.before[..., 1]))
@@ -386,7 +356,6 @@ def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
 
 
 def is_a_line(pairs: Pairs) -> bool:
-    """Return whether one coordinate of all detections hardly varies beside the other."""
     spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
     return bool(spread.min() < LINE_RATIO * spread.max())
 

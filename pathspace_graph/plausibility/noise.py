@@ -21,10 +21,8 @@ NOISE_AGREEMENT: Final = 1.2
 SCATTER_FACTOR: Final = 2.0
 """Factor between the scatter of detections and their covariances from which these are wrong; it is told
 less well, from a few cones, and with the errors of odometry and stamps in it."""
-NOISE_SHARE: Final = 0.75
-"""Share of the detections from which on wrong covariances are told."""
-NOISE_CYCLES: Final = 300
-"""Most cycles on which the noise of detections is measured."""
+NOISE_SHARE: Final = 0.75  # share of the detections from which on wrong covariances are told
+NOISE_CYCLES: Final = 300  # most cycles on which the noise of detections is measured
 TWIST: Final = (("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s"))
 
 
@@ -64,7 +62,6 @@ def _odometry(log: Log) -> list[Hint]:
 
 
 def _detections(log: Log) -> list[Hint]:
-    """Return hints where covariances contradict how single detections of a cone scatter, by range."""
     cycles = log.cycles[:NOISE_CYCLES]
     measured = measure_log(replace(log, cycles=cycles))
     if measured is None or measured.along is None or measured.across is None:

@@ -16,12 +16,9 @@ from pathspace_graph.settings.online import LimitSettings
 from .hint import Hint, because, told
 from .judge import hints
 
-MOST: Final = 1e20
-"""Largest number that is read, to say what it means."""
-NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})
-"""Words for no label."""
-SHOWN_WORDS: Final = 3
-"""Most foreign labels that are shown."""
+MOST: Final = 1e20  # largest number that is read, to say what it means
+NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
+SHOWN_WORDS: Final = 3  # most foreign labels that are shown
 
 
 def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[Hint]]:
@@ -51,7 +48,6 @@ def refused_hints(folder: Path) -> list[Hint]:
 
 
 def _unchecked(odometry: Table, detections: Table) -> Log:
-    """Return a log of any numbers, whatever their size and order."""
     twists = Odometry(odometry.numbers("t", MOST), odometry.stack(("vx", "vy", "wz"), MOST))
     stamps, points = detections.numbers("t", MOST), detections.stack(("x", "y"), MOST)
     covariances = covariances_of(*(detections.numbers(name, MOST) for name in ("xx", "xy", "yy")))
@@ -61,7 +57,6 @@ def _unchecked(odometry: Table, detections: Table) -> Log:
 
 
 def _foreign_labels(folder: Path, log: Log) -> list[Hint]:
-    """Return a hint where no label is left or right, but many are other words than unknown."""
     if not log.cycles or any((cycle.labels != UNKNOWN).any() for cycle in log.cycles):
         return []
     words = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])

@@ -132,13 +132,11 @@ class _Samples:
     confirmed: BoolArray
 
     def beside(self, distance: float) -> Array:
-        """Return the points (k, 2) from beside the vehicle on, along a distance (m)."""
         wanted = (self.station >= -_SETTLED) & (self.station <= distance + _SETTLED)
         return self.points[wanted][::_ACROSS]
 
 
 def _sampled(curve: CurveAhead, distance: float) -> _Samples:
-    """Return samples from behind the vehicle to where the curve is no longer needed."""
     tables = curve.tables
     begin, end = curve.beside - _BEHIND, curve.beside + _OUTER * distance + _BEHIND
     if tables.periodic:
@@ -194,8 +192,6 @@ def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Arra
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """Points (n, 2) near the centre line, with the stations (n,) of their foot points."""
-
     points: Array
     left: Array
     right: Array

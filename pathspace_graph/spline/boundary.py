@@ -17,26 +17,19 @@ from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
 from .bspline import BSpline, side_of
 
-ROUND_OFF = 1e-9
-"""Largest difference from a knot of parameters that lie on it (m)."""
-SAME_DIRECTION = 0.5
-"""Least cosine of the angle between the curve beside a vehicle and the vehicle's heading."""
+ROUND_OFF = 1e-9  # largest difference from a knot of parameters that lie on it (m)
+SAME_DIRECTION = 0.5  # least cosine of the angle between the curve beside a vehicle and the vehicle's heading
 
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
     """Spacing and smoothness priors of a stretch of control points, by their indices."""
 
-    points: IntArray
-    """(k,) Control points in driving order."""
-    pairs: IntArray
-    """(r, 2) Each row is a control point and the next one."""
-    nominal: Array
-    """(r,) Nominal distance of each pair (m)."""
-    triples: IntArray
-    """(t, 3) Three control points in a row that follow one another."""
-    bending: Array
-    """(t, 3) Coefficients of a triple's second difference in sigmas (1/m)."""
+    points: IntArray  # (k,) control points in driving order
+    pairs: IntArray  # (r, 2) each row is a control point and the next one
+    nominal: Array  # (r,) nominal distance of each pair (m)
+    triples: IntArray  # (t, 3) three control points in a row that follow one another
+    bending: Array  # (t, 3) coefficients of a triple's second difference in sigmas (1/m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +40,11 @@ class Placement:
     differences that the fit assumes to be zero would move them by `by_bend`.
     """
 
-    first: int
-    """Index from which on the fit depends on the known control points."""
-    kept: int
-    """Index before which the control points stay where they are."""
-    by_known: Array
-    """(f, n - first) Derivative of the placed control points by the known ones."""
-    by_target: Array
-    """(f, k) Their derivative by the targets."""
-    by_bend: Array
-    """(f, t) Their derivative by the second differences."""
+    first: int  # index from which on the fit depends on the known control points
+    kept: int  # index before which the control points stay where they are
+    by_known: Array  # (f, n - first) derivative of the placed control points by the known ones
+    by_target: Array  # (f, k) their derivative by the targets
+    by_bend: Array  # (f, t) their derivative by the second differences
 
     def place(self, known: Array, targets: Array) -> Array:
         """Return all control points (n', 2), from the known ones (n, 2) and the targets (k, 2)."""
@@ -74,8 +62,7 @@ class Boundary:
     def __init__(
         self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings, first: int = 0
     ) -> None:
-        self.first = first
-        """Number of the first control point's key; new knots have keys with new numbers."""
+        self.first = first  # number of the first control point's key; new knots have keys with new numbers
         self.settings = settings
         self.gauge = gauge
         self.degree = settings.degree
@@ -84,15 +71,13 @@ class Boundary:
         """Parameter up to which confirmed cones support the curve (m); beyond, it is extrapolated."""
         self.observed: list[Array] = []
         """Cones (2,) that the curve was extended through, in m, map frame, as they were placed then."""
-        self.cone_parameters: list[float] = []
-        """Parameter of each of the `observed` cones on the curve (m)."""
+        self.cone_parameters: list[float] = []  # parameter of each of the `observed` cones on the curve (m)
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
     def _set_tables(self, tables: SpanPolynomials) -> None:
         self.tables, knots = tables, tables.knots
         n = len(knots) - self.degree - 1
-        self.size = n - self.degree if self.periodic else n
-        """Number of distinct control points."""
+        self.size = n - self.degree if self.periodic else n  # number of distinct control points
         self.abscissae = greville(knots, self.degree)[: self.size]
         """(m,) Greville abscissae of the control points: the parameters about which they act (m)."""
         following = self.abscissae[1:]
@@ -110,7 +95,6 @@ class Boundary:
         return self._gauge
 
     def _new_gauge(self, points: IntArray) -> Gauge:
-        """Build the priors: the second differences D are weighted by `1 / (sigma_smoothness spacing)`."""
         whole = self.periodic and len(points) == self.size
         abscissae = self.abscissae[points]
         abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # a stretch past the seam
@@ -235,7 +219,6 @@ class Boundary:
         return max(int(np.searchsorted(self.knots[:size], u - ROUND_OFF)) - 1, 0)
 
     def move(self, motion: Array) -> None:
-        """Move the observed cones by a rigid motion (3,) of the map frame."""
         if self.observed:
             self.observed = [*move_points(motion, np.array(self.observed))]
 
@@ -303,8 +286,7 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
 
 
 NO_PATH: Final = np.zeros((0, 2))
-PATH_STEP: Final = 1.0
-"""Step at which a driven path is looked at for crossings with itself (m)."""
+PATH_STEP: Final = 1.0  # step at which a driven path is looked at for crossings with itself (m)
 LEVEL_SINE: Final = 0.7
 """Least sine of the angle of a level crossing: laps over the same road meet at smaller ones."""
 LEVEL_CROSSING: Final = 8.0

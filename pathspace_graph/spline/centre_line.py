@@ -18,10 +18,8 @@ from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline, side_of
 
-SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}
-"""Side of the centre line on which the edge of each label is."""
-SAMPLE_STEP: Final = 0.5
-"""Distance of the samples of boundaries, of lines, and of edges that are fitted (m)."""
+SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line on which the edge of each label is
+SAMPLE_STEP: Final = 0.5  # distance of the samples of boundaries, of lines, and of edges that are fitted (m)
 _EDGE_BREAKS: Final = 2
 """Knot intervals of an edge for each one of the ribbon, since it is no B-spline itself."""
 
@@ -92,8 +90,7 @@ class Ribbon(BSpline):
 
 SPACING: Final = 3.0
 """Distance of the knots of a planner's line (m); shorter kinks of the boundaries are smoothed."""
-MOST_SAMPLES: Final = 200_000
-"""Largest number of samples of a boundary, which bounds the memory."""
+MOST_SAMPLES: Final = 200_000  # largest number of samples of a boundary, which bounds the memory
 _FEWEST: Final = 4  # smallest number of samples of a boundary and of knot intervals of a line
 _STARTS: Final = 200  # number of samples of the left boundary among which the march begins
 _NEAR: Final = 12  # distance in samples from a pair within which segments are tested for a crossing
@@ -113,12 +110,9 @@ class CentreCurve:
     """A ribbon between two boundaries, with samples that lead from its parameter to theirs."""
 
     ribbon: Ribbon
-    u: Array
-    """(k,) Parameters of the ribbon, about evenly spaced; those of a loop end before its beginning."""
-    sides: tuple[BSpline, BSpline]
-    """Left and right boundary."""
-    beside: tuple[Array, Array]
-    """(k,) Their parameters beside each sample, not wrapped."""
+    u: Array  # (k,) parameters of the ribbon, about evenly spaced; those of a loop end before its beginning
+    sides: tuple[BSpline, BSpline]  # left and right boundary
+    beside: tuple[Array, Array]  # (k,) their parameters beside each sample, not wrapped
 
     @property
     def size(self) -> int:
@@ -171,14 +165,10 @@ class Crossing:
     """The points where normals of a line cross a boundary."""
 
     spline: BSpline
-    u: Array
-    """(k,) Parameters of the boundary, not wrapped; of the sample beside where a normal misses it."""
-    normal: Array
-    """(k, 2) Unit normals of the line, to the left."""
-    offset: Array
-    """(k,) Signed distance along the normal, positive to the left (m)."""
-    good: BoolArray
-    """(k,) Whether the normal crosses the boundary there."""
+    u: Array  # (k,) parameters of the boundary, not wrapped; of the sample beside where a normal misses it
+    normal: Array  # (k, 2) unit normals of the line, to the left
+    offset: Array  # (k,) signed distance along the normal, positive to the left (m)
+    good: BoolArray  # (k,) whether the normal crosses the boundary there
 
     @cached_property
     def own_normal(self) -> Array:
@@ -273,7 +263,6 @@ class _Fit:
         self._factor: SuperLU = splu(csc_array(self._basis.T @ self._basis + _SMOOTHNESS**2 * (D.T @ D)))
 
     def solve(self, values: Array) -> Array:
-        """Return the control points (m, d) nearest to values (k, d)."""
         return np.asarray(self._factor.solve(np.asarray(self._basis.T @ values)))
 
 
@@ -281,7 +270,6 @@ class _Fit:
 
 
 def _samples(spline: BSpline, closed: bool) -> Array:
-    """Return parameters (k,) evenly spaced by arc length, without the last one of a loop."""
     length = spline.length()
     count = max(int(np.ceil(length / SAMPLE_STEP)), _FEWEST)
     return spline.parameters_at(np.linspace(0.0, length, count + 1)[: count if closed else None])
@@ -386,7 +374,6 @@ def _check_apart(lefts: Array, rights: Array, i: IntArray, j: IntArray, closed: 
 
 
 def _segments(points: Array, index: IntArray, closed: bool) -> tuple[Array, Array]:
-    """Return both ends of the segments that begin at some indices; beyond an open end they are points."""
     if closed:
         return points[index % len(points)], points[(index + 1) % len(points)]
     last = len(points) - 1

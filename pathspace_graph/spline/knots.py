@@ -165,7 +165,6 @@ def fit_spline(
 
 
 def _chord_lengths(points: Array, periodic: bool) -> tuple[Array, float]:
-    """Return the chord length (k,) from the first point to each point, and that of the whole curve."""
     following = np.roll(points, -1, axis=0) if periodic else points[1:]
     chords = np.linalg.norm(following - points[: len(following)], axis=1)
     along = np.concatenate([[0.0], np.cumsum(chords)])
@@ -177,7 +176,6 @@ def _chord_lengths(points: Array, periodic: bool) -> tuple[Array, float]:
 def _fit_on(
     points: Array, u: Array, breaks: Array, periodic: bool, settings: FitSettings
 ) -> tuple[BSpline, Array, float]:
-    """Fit on given breaks and refresh foot points; return spline, parameters (k,) and rmse (m)."""
     frame = _frame(breaks, periodic, settings.degree)
     bending = np.sqrt(settings.smoothness) * energy_rows(frame)
     zeros = np.zeros((len(bending), 2))
@@ -218,13 +216,10 @@ COINCIDENT: Final = 1e-9
 class Thinned:
     """Least-squares spline through ordered points, after the removal of some knots."""
 
-    breaks: Array
-    """(b + 1,) Knots that remain, in the parameter of the points (m)."""
+    breaks: Array  # (b + 1,) knots that remain, in the parameter of the points (m)
     size: int
-    residual: Array
-    """(k, 2) Offset from the spline to each point, at the point's parameter (m)."""
-    leverage: Array
-    """(k,) Share of each point in the curve there: the diagonal of the hat matrix."""
+    residual: Array  # (k, 2) offset from the spline to each point, at the point's parameter (m)
+    leverage: Array  # (k,) share of each point in the curve there: the diagonal of the hat matrix
 
     @property
     def crossed(self) -> float:
@@ -285,7 +280,6 @@ def thin(
 
 
 def _breaks(u: Array, high: float) -> Array:
-    """Return the distinct parameters among 0, u (k,) and `high`."""
     inner = np.unique(u[(u > COINCIDENT) & (u < high - COINCIDENT)])
     inner = inner[np.diff(inner, prepend=0.0) > COINCIDENT]
     return np.concatenate([[0.0], inner, [high]])

@@ -123,10 +123,8 @@ def _square(speed: float | None) -> float:
 # --- the sampled centre line -----------------------------------------------------------------------------
 
 
-LEAST_STEP: Final = 0.01
-"""Least distance of the points of a line (m)."""
-MOST_POINTS: Final = 200_000
-"""Largest number of points of a line, which bounds the memory."""
+LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
+MOST_POINTS: Final = 200_000  # largest number of points of a line, which bounds the memory
 _FEWEST: Final = 4  # smallest number of points of a line
 _NEIGHBOURS: Final = 10  # number of points apart up to which normals must not cross
 _SHORT: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
