@@ -38,8 +38,7 @@ class Recovery:
     def called(self, again: partial[Any], *, is_doubtful: bool = False) -> None:
         """Note a call that has changed the estimator: it is made again after a copy has taken its place.
 
-        From a doubtful call on until the next one that is not, no copy is made, so that `undo` can make all
-        of them in another way.
+        No copy is made after a doubtful call until the next sure one, so that `undo` can change all of them.
         """
         if not is_doubtful:
             self._doubtful = None

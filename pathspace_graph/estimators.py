@@ -76,10 +76,7 @@ def check_batch(name: str) -> None:
 
 
 def for_map(name: str, kind: MapKind) -> str:
-    """Return the estimator that maps a track as asked for, in place of a default one.
-
-    SettingsError is raised where the named estimator has no such map.
-    """
+    """Return the estimator with this kind of map in place of a default one; SettingsError for others."""
     lines = {DEFAULT: centerline.ONLINE_NAME, DEFAULT_BATCH: centerline.NAME}
     if kind == "boundaries" or name in lines.values():
         return name

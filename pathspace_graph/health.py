@@ -98,10 +98,9 @@ class HealthMonitor:
         return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
 
     def _wrong_side(self) -> str:
-        """Return which boundary is wrong, where the other one explains its detections, or an empty string.
+        """Return which boundary is wrong, where the other one explains its detections.
 
-        The map is wrong then: a lost vehicle has both boundaries beside it. A boundary stays wrong while too
-        little of the other one is mapped to say anything.
+        It stays so while too little of the other one is mapped to say anything.
         """
         holds = [self._holds(label) for label in BOUNDARIES]
         if True in holds:

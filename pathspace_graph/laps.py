@@ -84,11 +84,7 @@ class LapCounter:
 
 
 def lap_end_indices(poses: Array, settings: LapSettings | None = None) -> NDArray[np.intp]:
-    """Return the index of the pose (k,) at which each complete lap ends, of poses (N, 3) in the map frame.
-
-    A last lap that ends within `end_tolerance` of the line is complete, and ends with the last pose. A lap
-    that the log breaks off is not listed.
-    """
+    """Return the index of the pose (k,) at which each complete lap ends, of poses (N, 3), map frame."""
     counter = LapCounter(settings)
     laps = np.array([counter.update(pose) for pose in poses], dtype=int)
     ends = np.flatnonzero(np.diff(laps)) + 1

@@ -232,8 +232,7 @@ class Stopwatch:
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
     """Yield each perception cycle with the twists since the cycle before it, none later than its stamp.
 
-    The rows tile the time without a gap, row i being in force during [t_i, t_(i+1)). The first row begins at
-    the stamp of the cycle before with the twist that was held then. The last row is held until the cycle.
+    The first row begins at the cycle before with the twist held then; the last is held until this one.
     """
     since = float(log.odometry.t[0])
     for detections in log.cycles:
@@ -242,10 +241,7 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
 
 
 def timed_wait(estimator: OnlineEstimator) -> float:
-    """Wait for what the next update may take from another process; return the wall time (s) of that.
-
-    So the update itself waits for nothing, and a replay depends on no other process's speed.
-    """
+    """Wait for what the next update may take from another process; return the wall time (s) of that."""
     if not hasattr(estimator, "wait"):
         return 0.0
     begin = time.perf_counter()
@@ -274,11 +270,9 @@ def run_online(
 ) -> RunResult:
     """Feed a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
 
-    The truth of the log is not read. For each of the `snapshot_times` (s, ascending) the map is kept as it
-    stood after the last cycle that isn't later. Each of the `observers` is shown each cycle, outside of its
-    time. `on_cycle` is an observer that takes the record of a cycle only, `observer` one that takes its
-    result and the outline of the map. BLAS has one thread, since its threads stall small solves. Results of
-    another process are waited for between cycles.
+    Maps are kept as they stood at the `snapshot_times` (s, ascending). The `observers` are shown each cycle,
+    outside of its time; `on_cycle` takes its record only, `observer` its result and the map's outline. BLAS
+    has one thread, and results of another process are waited for between cycles.
     """
     check_type("log", log, Log)
     check_type("estimator", estimator, OnlineEstimator)

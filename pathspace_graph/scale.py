@@ -26,18 +26,15 @@ from .run import settings_dict
 
 C = TypeVar("C", bound=type[Any])
 
-WIDTH: Final = 3.5
-"""Distance of a cone from the nearest one of the other side on a track of Formula Student, m, median."""
+WIDTH: Final = 3.5  # m from a cone to the nearest one of the other side in Formula Student, median
 GAP: Final = 3.2  # distance of a cone from the nearest one of its row there, m, median
-SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Possible scales: what is within a factor of 1.7 of one is mapped as well with it."""
+SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)  # within a factor of 1.7 of one, maps are as good
 NEAREST: Final = 5  # number of the nearest cones of each side that tell the scale
 FEWEST: Final = 3  # number of cones of each side that a cycle needs
 SAME: Final = 3.0  # largest distance (sigmas) of two detections of one cone
 FARTHEST: Final = 1e4  # largest distance of a cone (m), in a scene of any scale
 MOVED: Final = 0.1  # share of a gap by which the vehicle moves until the next cycle counts
-JUDGED: Final = (1, 5, 20)
-"""Numbers of cycles that count after which the scale is judged; it is final after the last."""
+JUDGED: Final = (1, 5, 20)  # cycles that count after which the scale is judged, the last time finally
 PATIENCE: Final = 200  # number of cycles after which it is final in any case
 
 
@@ -85,10 +82,7 @@ def scale_of(log: Log) -> float:
 
 
 def width_and_gap(detections: Detections) -> tuple[float, float]:
-    """Return the width of the road and the gap of its rows (m) in a cycle; NaN where they aren't seen.
-
-    Without labels, what is to the left of the vehicle is the left side.
-    """
+    """Return the width of the road and the gap of its rows (m) in a cycle; NaN where they aren't seen."""
     usable = (np.abs(detections.points_vehicle) < FARTHEST).all(axis=1)  # the gate drops the others
     points, labels = detections.points_vehicle[usable], detections.labels[usable]
     sides = labels if (labels != UNKNOWN).any() else np.where(points[:, 1] > 0.0, LEFT, RIGHT)

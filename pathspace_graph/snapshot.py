@@ -146,10 +146,7 @@ def known_classes() -> dict[str, type]:
 
 @cache
 def layout(kind: type) -> dict[str, str]:
-    """Return the names of the attributes that the code of a class sets, those of fields with their types.
-
-    A program whose class has another layout than the one in the file refuses the file.
-    """
+    """Return the attributes that the code of a class sets, with their types; another layout is refused."""
     members = [member for base in kind.__mro__ for member in vars(base).values()]
     functions = [getattr(member, "fget", None) or getattr(member, "__func__", member) for member in members]
     functions += [unwrap(function) for function in functions if hasattr(function, "__wrapped__")]
@@ -268,10 +265,7 @@ class Encoder:
 
 
 def _lay_out(arrays: list[tuple[NDArray[Any], list[Any]]]) -> Bytes:
-    """Return the memory of all arrays, and note in the node of each where it begins.
-
-    Arrays that overlap in memory overlap here as well. Bytes that belong to no array are zero.
-    """
+    """Return the memory of all arrays, which overlap as before, and note in each node where it begins."""
     bounds, end = [_bounds(array) for array, _ in arrays], 0
     for group in _overlapping(bounds):
         begin, low = -(-end // _ALIGNMENT) * _ALIGNMENT, min(bounds[i][0] for i in group)

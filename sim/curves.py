@@ -50,13 +50,10 @@ def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
 
 STEP: Final = 0.25  # distance of the samples of a curve that is fitted (m)
 KNOT_STEP: Final = 0.5  # distance of the knots of the finished curve (m)
-SMOOTHING: Final = 1.0
-"""Standard deviation of the smoothing Gaussian (m), which cuts a corner of radius R by its square / 2R."""
+SMOOTHING: Final = 1.0  # sigma of the Gaussian (m), which cuts a corner of radius R by its square / 2R
 CENTRINGS: Final = 4  # times that the curve is moved to equal distances from both rows and smoothed
-NEIGHBOURS: Final = 3
-"""Cones to both sides of a sample's own one, up to which its distance to a row is measured."""
-START_CANDIDATES: Final = 4
-"""Cones of each row nearest to the start that are tried as the first pair of the matching."""
+NEIGHBOURS: Final = 3  # cones to both sides of a sample's, up to which its distance to a row is measured
+START_CANDIDATES: Final = 4  # cones of each row nearest to the start, tried as the first pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +89,7 @@ class CentreLine:
 def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> CentreLine:
     """Return the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
 
-    The rows are matched from `near` on by the triangulation of least total squared width that runs along
-    both. So their counts and spacings may differ, and other parts of the track may be near.
+    The rows are matched from `near` on by the triangulation of least total squared width along both.
     """
     rungs = match_rows(left, right, closed, near)
     middles = (left[rungs[:, 0]] + right[rungs[:, 1]]) / 2

@@ -128,11 +128,7 @@ def turned_round(track: Track) -> Track:
 
 
 def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
-    """Return the drive without the stretch that the vehicle is carried over; a lap is `lap` m long.
-
-    From one stamp to the next the vehicle is `put_down` m farther along its path. Nothing else changes, so
-    the twists do not integrate to the poses there.
-    """
+    """Return the drive without the stretch that the vehicle is carried over; a lap is `lap` m long."""
     if not faults.put_down:
         return driven
     s = arc_lengths(driven.poses[:, :2])
@@ -198,10 +194,7 @@ class FaultySensor:
         self._unseen = np.flatnonzero(sides == NAMES.index(faults.blind_side))
 
     def detect(self, t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
-        """Return a perception cycle from a pose [x, y, theta], and the true cone of each detection (m,).
-
-        The pose is the vehicle's at the time of the image, which a late sensor stamps with a later `t`.
-        """
+        """Return a cycle from the pose at the time of the image, and the true cone of each detection."""
         faults = self._faults
         detections, cones = self._sensor.detect(
             t, mounted(pose, faults), faults.range_scale, faults.range_bias

@@ -66,10 +66,7 @@ def swapped(log: Log) -> Log:
 
 
 def camera(log: Log, height: float = 0.6, sigma: float = 0.02) -> Log:
-    """Return the log with x to the right and y down of a camera at a height (m); z ahead is lost.
-
-    The cones are not all equally low, by a standard deviation (m).
-    """
+    """Return the log with x to the right and y down of a camera at a height (m); z ahead is lost."""
     rng = np.random.default_rng(0)
     return with_points(
         log, lambda points: np.column_stack([-points[:, 1], rng.normal(height, sigma, len(points))])

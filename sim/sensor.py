@@ -41,10 +41,9 @@ class OdometryNoise:
         check_numbers(self, "odometry", ("slow_time",), "a positive number")
 
     def drift_sigmas(self, dt: float) -> FloatArray:
-        """Return the standard deviations (3,) of white noise that drifts as much, of readings `dt` s apart.
+        """Return the standard deviations (3,) of white noise that drifts as much, `dt` s apart.
 
-        It has the spectrum of the noise at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, where
-        `rho = exp(-dt / slow_time)`.
+        The spectrum at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, `rho = exp(-dt / slow_time)`.
         """
         rho = np.exp(-dt / self.slow_time)
         return np.asarray(np.hypot(self.white, np.sqrt((1.0 + rho) / (1.0 - rho)) * np.array(self.slow)))
@@ -129,10 +128,7 @@ class SensorSettings:
 def measure_twists(
     twists: FloatArray, dt: float, noise: OdometryNoise, rng: Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return measured twists (N, 3), and the scale error (-) and the bias (rad/s) that they have (2,).
-
-    They are `dt` s apart: `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise and a slow error.
-    """
+    """Return `(1 + scale) [vx, vy]`, `wz + bias` (N, 3), `dt` s apart, with noise, and [scale, bias]."""
     scale = noise.scale * rng.standard_normal()
     bias = noise.gyro_bias * rng.standard_normal()
     white = rng.standard_normal(twists.shape) * np.array(noise.white)
@@ -144,10 +140,7 @@ def measure_twists(
 
 
 def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatArray:
-    """Return stationary first-order Gauss-Markov processes of unit variance along the first axis.
-
-    `step` is that from sample to sample by the correlation time, so neighbours correlate by `exp(-step)`.
-    """
+    """Return Gauss-Markov processes of unit variance along axis 0; neighbours correlate by `exp(-step)`."""
     rho = np.exp(-step)
     drawn = rng.standard_normal(shape)
     drawn[1:] *= np.sqrt(1.0 - rho**2)
@@ -168,9 +161,9 @@ class ConeSensor:
     def detect(
         self, t: float, pose: FloatArray, scale: float = 0.0, bias: float = 0.0
     ) -> tuple[Detections, IntArray]:
-        """Return a perception cycle from a pose [x, y, theta], and the true cone of each detection (m,).
+        """Return a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
 
-        A range r reads `(1 + scale) r + bias`, beside its systematic and its random error.
+        The second result is the true cone of each detection (m,).
         """
         parts = zip(self._detect_cones(pose, scale, bias), self._false_positives(), strict=True)
         ranges, bearings, labels, cones = (np.concatenate(part) for part in parts)
@@ -204,7 +197,7 @@ class ConeSensor:
         return ranges[rows], bearings[rows], labels[index], cones[index]
 
     def _errors(self, white: FloatArray, cones: IntArray) -> FloatArray:
-        """Return errors (2, 2, m) of unit variance by camera, range or bearing, and cone, from white noise.
+        """Return errors (2, 2, m) of unit variance by camera, range or bearing, and cone.
 
         Each cone's slow errors are Gauss-Markov processes that go on while it is not seen.
         """

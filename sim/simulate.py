@@ -41,9 +41,8 @@ class SimulationSettings:
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     """Return the log of a drive; a seed gives the same log to the byte.
 
-    Wander, odometry, sensor and colours that are lost have random streams of their own, so that a setting of
-    one does not shift the others. A cycle in which nothing is detected is not in the log, since the file
-    format has no row for it.
+    Wander, odometry, sensor and lost colours have random streams of their own, so that a setting of one does
+    not shift the others. A cycle in which nothing is detected is not in the log.
     """
     if seed < 0:
         raise SettingsError(f"seed: expected at least 0, found {seed}")

@@ -80,8 +80,7 @@ SPACING: Final = 5.0  # distance of the cones along it (m)
 def skidpad() -> Track:
     """Return the two circles, entered and left along x between them: two rounds right, two rounds left.
 
-    Inner and outer cones have the colour of their side as each circle is driven. The cones of the lanes into
-    and out of the circles are orange.
+    Cones have the colour of their side as each circle is driven; those of the lanes are orange.
     """
     middle, outer = CIRCLES / 2, INNER + LANE
     # the outer rows leave the lanes free

@@ -40,8 +40,7 @@ ORANGE: Final = "orange"  # part of PacSim's classes of cones of no boundary
 INVISIBLE: Final = "invisible"  # PacSim's class of cones that are not detected
 MIN_CLEARANCE: Final = 0.2  # least distance of the middle of a road from a cone, as a share of the usual one
 WIDTH_STEP: Final = 0.5  # distance of samples of a circuit (m)
-TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
-"""Columns of the centre line and of the distances of the boundaries from it."""
+TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # centre line and widths
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
 """EUFS tags of cones of no boundary; further tags, such as midpoint, are no cones."""
 
@@ -60,11 +59,7 @@ class TrackFormat:
 
 
 def read_track(path: Path | str) -> Track:
-    """Return the track in a file of a known format: its cones in driving order, in the file's own frame.
-
-    Raises an InputError that names the row or the key where the file is missing, of no known format or
-    malformed.
-    """
+    """Return the track in a file, with its cones in driving order; an InputError names the row or the key."""
     path = Path(path)
     if not path.is_file():
         raise InputError(path, f"expected a track file, found {'a folder' if path.is_dir() else 'none'}")

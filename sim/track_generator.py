@@ -25,12 +25,10 @@ from .curves import (
 )
 from .track import Track
 
-MAX_ATTEMPTS: Final = 500
-"""Attempts that may fail; two in three keep the default rules, and contradicting settings fail them all."""
+MAX_ATTEMPTS: Final = 500  # two in three keep the default rules; contradicting ones fail them all
 STRAIGHT_RADIUS: Final = 150.0  # radius above which a stretch is straight (m)
 CORNER_RADIUS: Final = 8.0  # radius at which cones stand twice as close as on straights (m)
-CORNER_BLUR: Final = 2.0
-"""Standard deviation of the Gaussian by which corners draw cones closer before and after them (m)."""
+CORNER_BLUR: Final = 2.0  # sigma (m) by which corners draw cones closer before and after
 MIN_CONE_GAP: Final = 1.0  # least distance of cones along a row (m)
 
 
@@ -79,10 +77,7 @@ class TrackGeneratorSettings:
 
 
 def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = None) -> Track:
-    """Return a random closed track that keeps the rules and starts on its longest straight.
-
-    Layouts are drawn until one keeps every rule; a SettingsError is raised where none does.
-    """
+    """Return a random closed track that keeps the rules and starts on its longest straight."""
     settings = settings or TrackGeneratorSettings()
     for _ in range(MAX_ATTEMPTS):
         width = rng.uniform(*settings.width)

@@ -79,10 +79,7 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
 
 
 def integrate(twists: FloatArray, dt: float) -> FloatArray:
-    """Integrate body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from (0, 0, 0), not wrapped.
-
-    Over one step the vehicle moves by `V(wz dt) [vx, vy] dt` in its own frame, the exponential map of SE(2).
-    """
+    """Integrate body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from 0 by SE(2)'s exp."""
     theta = np.concatenate([[0.0], np.cumsum(twists[:, 2] * dt)])
     a, b = _exponential(twists[:, 2] * dt)
     dx = (a * twists[:, 0] - b * twists[:, 1]) * dt

@@ -52,8 +52,7 @@ TOLERANCE: Final = 1e-5  # share by which an iteration lowers the error at least
 def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
     """Return the edges of a ribbon as a map, with the covariance (3m, 3m) of its control points, if known.
 
-    `sigma_shape` (m) is added to each control point: what the edges cannot follow of the cones. `until` has
-    the parameter up to which an edge is confirmed, where it is open.
+    `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.
     """
     edges = {label: ribbon.edge_spline(label) for label in BOUNDARIES}
     if covariance is None:
@@ -85,10 +84,7 @@ class FittedRibbon:
 
 
 def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
-    """Return the ribbon between the boundaries of a map, with the covariance that follows from theirs.
-
-    SettingsError is raised where the map has no two boundaries side by side.
-    """
+    """Return the ribbon between the boundaries of a map with its covariance, or raise a SettingsError."""
     curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
     P = track.covariance_of(*curves.values())
     left, right = (curve.spline for curve in curves.values())
@@ -105,10 +101,9 @@ def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
 class CenterlineMapper:
     """Maps a track online as a ribbon.
 
-    The fixed-lag smoother holds what all detections so far say, as a joint Gaussian of both boundaries. The
-    ribbon is estimated from it whenever the map is asked for, so that every detection counts as much as it
-    does there, and a cycle takes the same time. Where there is no line between the boundaries, the map is
-    theirs. What isn't described is that of `FixedLagMapper`.
+    The fixed-lag smoother holds what all detections say as a joint Gaussian of both boundaries, from which
+    the ribbon is estimated whenever the map is asked for. Where there is no line between the boundaries, the
+    map is theirs. What isn't described is that of `FixedLagMapper`.
     """
 
     def __init__(
@@ -187,10 +182,9 @@ def edge_factors(
 
 
 def shape_factors(ribbon: Ribbon, poses: Array, settings: MapperSettings) -> Iterator[gtsam.CustomFactor]:
-    """Yield the weak priors of the control points, each in the frame of the nearest pose of poses (n, 3).
+    """Yield the weak priors of the control points, each in the frame of the nearest of poses (n, 3).
 
-    Those of the line are the priors of a boundary (`CurveGauge`), and second differences of the width are
-    small as well.
+    Those of a boundary (`CurveGauge`), and small second differences of the width.
     """
     points, keys = ribbon.distinct_control_points[:, :2], np.array(ribbon_keys(ribbon))
     cycle = ((points[:, None] - poses[:, :2]) ** 2).sum(axis=2).argmin(axis=1)
@@ -250,8 +244,7 @@ def ribbon_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r
 class CenterlineBatch:
     """Maps a whole log as a ribbon: all poses and one ribbon, by GTSAM's own optimizer.
 
-    The start, with the sides of the detections, is the batch of two boundaries. Where there is no line
-    between them, since one was never seen or they cross, their map is the result.
+    The start is the batch of two boundaries, whose map is the result where there is no line between them.
     """
 
     def __init__(

@@ -32,8 +32,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
-SIGMA_START: Final = 0.3
-"""Standard deviation (m) of each control point of a new curve, beyond that of its first detections."""
+SIGMA_START: Final = 0.3  # of a new curve's control points (m), beyond that of its detections
 
 
 class CurveState:
@@ -114,10 +113,7 @@ class CurveState:
         self.pose_u[label] = 0.0
 
     def extend(self, label: int, detection: Array, covariance: Array) -> None:
-        """Extend a curve to a detection (2,), vehicle frame: unclamp, insert, clamp (Hu et al. 2002).
-
-        The new control point has the uncertainty of the detection (2, 2) and of the pose.
-        """
+        """Extend a curve to a detection (2,), vehicle frame: unclamp, insert, clamp (Hu et al. 2002)."""
         belief, spline, p = self.belief, self.spline(label), self.curves[label].degree
         belief.add_points(detection[None], covariance[None])
         knots = spline.extension_knots(belief.points[-1])
@@ -160,10 +156,8 @@ class CurveState:
 
 
 STRETCH: Final = 12.0  # an extension is at most this long (m), so a longer one takes several
-SIGMA_CARRY: Final = 1.0
-"""Standard deviation (m) of the control point that carries on a stranded end along the path."""
-RECENT: Final = 40
-"""A confirmed track is compared with this many of the last cones, not with those of the lap's beginning."""
+SIGMA_CARRY: Final = 1.0  # of the control point that carries on a stranded end (m)
+RECENT: Final = 40  # last cones with which a confirmed track is compared
 AT_END: Final = 1e-6  # a foot point within this distance (m) of the end's parameter is at the end
 
 
@@ -171,7 +165,7 @@ class Expansion:
     """What was detected beyond the curves, which expands them.
 
     A detection expands a curve only if it belongs to a confirmed track that comes next along the path. An end
-    that the vehicle has passed is extended beside the path, as in the other estimators.
+    that the vehicle has passed is extended beside the path.
     """
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -289,8 +283,8 @@ def beyond_end(
 ) -> BoolArray:
     """Return which points (m, 2) with foot points at u (m,) meet the paper's three conditions (m,).
 
-    The foot point is the end of the curve, at the parameter `high`; the point is farther from `C_n` than the
-    growth threshold, and farther from `C_{n-1}` than the separation.
+    The foot point is the end `high`; the point is farther from `C_n` than the growth threshold, and farther
+    from `C_{n-1}` than the separation.
     """
     at_end = u >= high - AT_END
     far = np.hypot(*(points - control_points[-1]).T) > settings.threshold

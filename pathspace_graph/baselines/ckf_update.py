@@ -23,8 +23,7 @@ from pathspace_graph.settings.batch import CkfSettings
 from .ckf_curves import CurveState
 
 RANK: Final = 1e-9  # singular values of the gain below this share of the largest one count as zero
-LEAST_BASIS: Final = 1e-3
-"""A control point is updated where its basis values at the detections add up to at least this."""
+LEAST_BASIS: Final = 1e-3  # least sum of a control point's basis values for its update
 
 
 # --- classification --------------------------------------------------------------------------------------
@@ -57,7 +56,7 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     """Return the detections within the gate of a curve: `d^2 < chi^2 (n' K n + sigma^2 + g' Sigma g)`.
 
     d is the signed distance across the curve, n its normal, K the covariance of the detection, sigma^2 the
-    variances of the settings, and g the derivative of d by pose and control points. Sigma is their joint
+    variances of the settings, g the derivative of d by pose and control points, and Sigma their joint
     covariance. The foot point is in the stretch that the vehicle sees, and is not at an end of it.
     """
     gate, curve = state.settings.gate, state.curves[label]
@@ -125,8 +124,7 @@ def fit_detections(
 ) -> SplineMeasurement:
     """Fit S_z to detections (m, 2) with covariances (m, 2, 2): a cubature transform of the ridge regression.
 
-    basis (m, r) is evaluated at their foot points. known (r, 2) holds the control points in the frame of the
-    detections.
+    basis (m, r) is evaluated at their foot points, known (r, 2) are the control points in their frame.
     """
     m, r = basis.shape
     gain = ridge_gain(basis, settings)

@@ -41,23 +41,20 @@ from .landmark_association import ROUGH, Association, Gates, associate, compatib
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 
 REACH: Final = 9.0  # a curve is extended up to this far ahead of the vehicle (m along the predicted path)
-SIGMA_MATCH: Final = 0.6
-"""Sigma (m) of a detection in the registration with the early segment, which is worse than online."""
+SIGMA_MATCH: Final = 0.6  # of a detection in the registration (m), which is worse than online
 PATIENCE: Final = 30.0
 """Once this length of the beginning has been driven again (m), it closes the loop, however uncertain the
 position is: `SIGMA_PATIENCE` (m) replaces `closing.sigma_max`."""
 SIGMA_PATIENCE: Final = 1000.0
-SIGMA_TIE: Final = 0.15
-"""Standard deviation (m) of the distance between the ends of a curve where the loop closes."""
-TIE_REACH: Final = 1.0
-"""Points of the end that stay farther from the beginning than this (m) are no correspondences."""
+SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the loop closes (m)
+TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
 
 class _Filter:
     """What both filters share.
 
-    A cycle that cannot be used is a ReadingError and changes nothing. So is one that is late, since a filter
-    has no earlier pose that could take its detections.
+    A cycle that cannot be used, or that is late, is a ReadingError and changes nothing: a filter has no
+    earlier pose that could take its detections.
     """
 
     def __init__(
@@ -193,7 +190,7 @@ def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
 
     `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where the motion moves S(u), near the end, on S(w), with
     the normal n. Along the tangent all k correspondences are one result of the registration, so each has
-    sqrt(k) times its sigma. Returns False, and does nothing, if an end has not reached its beginning yet.
+    sqrt(k) times its sigma. False, and nothing is done, if an end has not reached its beginning yet.
     """
     overlaps = {label: _overlap(state, label, motion) for label in state.curves}
     if not all(len(u) for u, _ in overlaps.values()):
@@ -254,13 +251,10 @@ class LandmarkCkf(_Filter):
     """Maps cones as points: predict, associate, update, create.
 
     The paper describes its baseline as "a similarly structured state and overall implementation style", with
-    the Mahalanobis distance as the cost of the assignment (section Results). Where it leaves something open,
-    the choice makes the baseline no weaker than it has to be: the gates are those of the landmark graph, a
-    detection is associated only with a landmark of its own label, a track becomes a landmark after
-    `ckf.sightings` detections (with 1, every detection beyond the gate creates one, as in the description),
-    and the calibration of the odometry is in its state too.
-
-    Landmarks are never merged, and the loop never closes. So ghosts stay, as the paper says of its baseline.
+    the Mahalanobis distance as the cost of the assignment (section Results). What it leaves open makes the
+    baseline no weaker than it has to be: the gates are those of the landmark graph, a detection is associated
+    only with a landmark of its own label, a track becomes a landmark after `ckf.sightings` detections, and
+    the odometry is calibrated. Landmarks are never merged, and the loop never closes, so ghosts stay.
     """
 
     def __init__(

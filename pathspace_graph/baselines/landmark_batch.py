@@ -1,8 +1,6 @@
 """The Hungarian landmark graph over a whole log: all poses and landmarks at once, associations refreshed.
 
-With oracle associations, the true landmark of every detection is given. No estimator can know them. The limit
-of a run is computed from this solution. It is the batch's own system with the same calibration of the
-odometry, but without robust weights, since there are no outliers.
+With oracle associations it gives the limit of a run, without robust weights, since there are no outliers.
 """
 
 from dataclasses import dataclass, replace
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.batch.association import insert_drive
 from pathspace_graph.errors import solving
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, huber_loss
@@ -24,7 +23,7 @@ from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph, owners
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import POINT, POSE, indices, pose_keys
+from pathspace_graph.graph.variables import POINT, POSE, indices
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun, RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
@@ -49,7 +48,6 @@ from .landmark_fixed_lag import LandmarkFixedLag
 from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
 
 Ints = NDArray[np.int64]
-
 NAME: Final = "landmark-batch"  # the estimator's name on the command line
 MAX_ROUNDS: Final = 10  # all detections are associated anew at most this number of times
 SETTLED: Final = 1e-3  # largest share of the detections that changed their landmark in the last round
@@ -171,12 +169,6 @@ class LandmarkSystem:
         self.detections.correct(variables.sensor)
 
 
-def insert_drive(state: LandmarkState, calibration: Array, poses: Array) -> None:
-    """Make the calibration, (2,) or (7,), and the poses (P, 3) of the whole log variables of a state."""
-    state.variables.insert_calibrations(calibration)
-    state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
-
-
 def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[LandmarkSystem, LandmarkState]:
     """Return the last map of the online run, with each pose and association as it left the window."""
     online, detections = LandmarkFixedLag(system.settings, noise), system.detections
@@ -197,7 +189,7 @@ def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[L
     state = LandmarkState()
     state.add(track.state.landmarks, track.state.labels, track.state.numbers)
     state.votes, state.next_number = track.state.votes, track.state.next_number
-    insert_drive(state, smoother.variables.calibrations, poses)
+    insert_drive(state.variables, smoother.variables.calibrations, poses)
     sigma = np.array(online.believed.odometry.sigmas_calibration)
     chain = replace(system.chain, calibration_sigma=sigma)  # as the online run believed in the end
     return replace(system, settings=online.believed, chain=chain), state
@@ -224,9 +216,6 @@ class Reassociation:
 
     def run(self) -> None:
         """Set the landmark of every detection, and add new landmarks to the state."""
-        self._create(self._assign())
-
-    def _assign(self) -> IntArray:
         detections = self.detections
         rows, landmarks, distances = self._nearby_pairs()
         cost = self._costs(rows, landmarks)
@@ -241,7 +230,7 @@ class Reassociation:
         # a landmark with another label explains it, or one that a new landmark would be merged with
         known = (cost < self.gates.match) | (distances < self.settings.growth.merge_radius)
         free[rows[known]] = False
-        return np.flatnonzero(free & ~detections.used)
+        self._create(np.flatnonzero(free & ~detections.used))
 
     def _assign_cycle(self, rows: IntArray, landmarks: IntArray, cost: Array, free: BoolArray) -> None:
         detected, i = np.unique(rows, return_inverse=True)
@@ -306,7 +295,7 @@ def relabel(
 def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray, jacobian: Array) -> Array:
     """Return `J Sigma J'` (m, 2, 2) of landmarks with keys (m,), as detected from the poses of cycles (m,).
 
-    J (m, 2, 5) is the derivative by [pose | landmark], and Sigma contains their cross terms.
+    J (m, 2, 5) is the derivative by [pose | landmark].
     """
     landmark = problem.map.columns(keys)[:, None] + np.arange(POINT)
     pose = POSE * cycles[:, None] + np.arange(POSE)
@@ -380,5 +369,5 @@ def start_oracle(system: LandmarkSystem, associations: Ints) -> LandmarkState:
     state = LandmarkState()
     state.add(points, votes.argmax(axis=0).astype(np.intp), numbers.astype(np.intp))
     state.votes = votes[: len(BOUNDARIES)].T
-    insert_drive(state, calibration, poses)
+    insert_drive(state.variables, calibration, poses)
     return state

@@ -45,12 +45,9 @@ from .landmark_association import (
 )
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 
-UNSEEN: Final = 40.0
-"""Path length (m) without a detection after which a landmark is old: none is associated near the start."""
-MIN_PAIRS: Final = 4
-"""Landmarks that must be recognized together to close the loop, a third of them of each colour."""
-MIN_LEAD: Final = 2.0
-"""Least lead of the recognized pairs over any other set, where each landmark counts as one gate."""
+UNSEEN: Final = 40.0  # path (m) without a detection after which a landmark is not associated near the start
+MIN_PAIRS: Final = 4  # recognized landmarks that close the loop, a third of them of each colour
+MIN_LEAD: Final = 2.0  # over any other set of pairs, where each landmark counts as one gate
 
 
 @at_scale
@@ -111,9 +108,7 @@ class LandmarkFixedLag:
 
     def _use(self, new: slice, t: float, watch: Stopwatch, cycle: int | None = None) -> None:
         eligible = np.ones(len(self.smoother.map.state), bool)
-        if (
-            not self.closed and self._near_start()
-        ):  # one detection alone can't tell which old landmark it shows
+        if not self.closed and self._near_start():  # one detection can't tell which old landmark it shows
             eligible = ~self._old()
         associate_newest(self.smoother, new, eligible, cycle)
         watch.lap("associate")
@@ -315,6 +310,6 @@ def detect_loop(
 
 
 def optimize_loop(smoother: LandmarkSmoother, pairs: LoopPairs) -> None:
-    """Solve the whole loop with the pairs held together, each submap in its own frame; merge them later."""
+    """Solve the whole loop with the pairs held together; merge them later."""
     smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([pairs.recent, pairs.old])]
     smoother.solve_loop(smoother.map.settings.closing.iterations, None)

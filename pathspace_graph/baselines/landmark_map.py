@@ -32,8 +32,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 UNASSOCIATED: Final = -1  # landmark of a detection that has none, and that may create one
 AMBIGUOUS: Final = -2  # landmark of a detection that has none, and that must not create one
-SIGMA_MERGE: Final = 0.1
-"""Standard deviation (m) of the distance between two landmarks of one cone, beyond their covariance."""
+SIGMA_MERGE: Final = 0.1  # of the distance of two landmarks of one cone (m), beyond their covariance
 NO_PAIRS: IntArray = np.zeros((0, 2), np.intp)
 
 
@@ -65,10 +64,7 @@ class LandmarkState:
         return self.numbers.searchsorted(numbers)
 
     def add(self, points: Array, labels: IntArray, numbers: IntArray | None = None) -> IntArray:
-        """Add landmarks (k, 2) with labels (k,) behind the others, and return their numbers (k,).
-
-        `numbers` must be ascending, and none may be less than `next_number`; by default they follow it.
-        """
+        """Add landmarks (k, 2) with labels (k,), by default with the next numbers, and return these (k,)."""
         new = self.next_number + np.arange(len(labels)) if numbers is None else numbers
         self.variables.insert(landmark_keys(new), points.ravel())
         self.numbers = np.concatenate([self.numbers, new])
@@ -78,10 +74,7 @@ class LandmarkState:
         return new
 
     def vote(self, labels: IntArray, numbers: IntArray) -> None:
-        """Count detections with labels (k,) on landmarks (k,), which take the label of their majority.
-
-        Else a landmark created by a few detections with the wrong label would keep it for ever.
-        """
+        """Count detections with labels (k,) on landmarks (k,), which take the label of their majority."""
         known = np.isin(labels, BOUNDARIES)
         np.add.at(self.votes, (self.positions(numbers[known]), labels[known]), 1)
         most = self.votes.argmax(axis=1)
@@ -207,8 +200,8 @@ def landmark_rows(
 ) -> Rows:
     """Return the rows `w W (R^T (l - t) - z)` of associated detections (m,), with `W' W = K^-1`.
 
-    The factor w is the square root of each row's own Huber weight. The detections z are corrected by the
-    sensor's calibration, and the residuals are those of measured ones (`factors.sensor:restored`).
+    w is the root of each row's Huber weight. The detections z are corrected by the sensor's calibration, and
+    the residuals are those of measured ones (`factors.sensor:restored`).
     """
     cycles, numbers = detections.cycle[chosen], detections.landmark[chosen]
     points = state.landmarks[state.positions(numbers)]

@@ -65,10 +65,7 @@ class Motion:
 
 
 def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
-    """Return what the topics of a bag have of a drive.
-
-    What is wrong is an InputError: a topic that is not there lists those that are, with types and rates.
-    """
+    """Return what the topics of a bag have of a drive; an InputError lists the topics that are there."""
     notes: Counter[str] = Counter()
 
     def motion(message: Any) -> Motion:
@@ -174,10 +171,7 @@ def _twists(
 
 
 def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[Array, Array]:
-    """Return the twists with the mean yaw rate of an IMU until the next of them.
-
-    The heading is then that of the IMU, whichever of both is faster. Twists outside its time are left out.
-    """
+    """Return the twists in the time of an IMU with its mean yaw rate until the next of them."""
     order, turn = np.argsort(t, kind="stable"), np.argsort(imu_t, kind="stable")
     t, twists, imu_t, rates = t[order], twists[order].copy(), imu_t[turn], rates[turn]
     finite = np.isfinite(rates)
@@ -250,8 +244,7 @@ class Bag:
     ) -> Samples:
         """Return samples with header stamps where most have one, else with the times of receipt.
 
-        Both are not mixed, since they may be of different clocks: a message without a stamp among others that
-        have one is left out.
+        Both are not mixed, since they may be of different clocks.
         """
         topic = name.split(maxsplit=1)[0]
         stamped = [] if self.received else [k for k, stamp in enumerate(stamps) if stamp is not None]

@@ -29,9 +29,7 @@ from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_
 from .messages import Points, points_of, stamp_of, twist_of
 from .settings import SIGMA_ODOMETRY, Frames, LabelRule, NoiseSettings, Window
 
-MAX_ASYMMETRY: Final = 1e-3
-"""Largest difference of the entries xy and yx of a covariance, by the larger variance; messages may have
-single precision."""
+MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 """Note of covariances that the record does not have."""
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
@@ -72,8 +70,7 @@ def twists_between(t: Array, poses: Array) -> Array:
 def windowed(record: Recording, window: Window) -> Recording:
     """Return the part of a record that counts, with the stamps of its detections corrected.
 
-    Its truth then no longer says which cone each detection is of, and there is none of a later beginning,
-    where the map has another origin.
+    The truth then has no associations, and there is none of a later beginning, where the map begins.
     """
     if window == Window():
         return record
@@ -98,8 +95,7 @@ def windowed(record: Recording, window: Window) -> Recording:
 
 
 def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) -> Log:
-    """Return the log of a record, in order of time and in the vehicle frame; it counts in `record.notes`
-    what was left out.
+    """Return the log of a record in order of time and in the vehicle frame, and note what is left out.
 
     A record without a usable twist, or without a detection in its time, is an InputError of the `file`.
     """
@@ -298,8 +294,7 @@ class MessageStream:
     def take_detections(self, message: Any, received: float) -> tuple[Odometry, Detections] | None:
         """Return a perception cycle with the twists since the last one that was used, or None.
 
-        A late cycle comes without twists, which the cycles in order have had already. The caller says by
-        `use` that the estimator took the cycle; until then its twists are kept.
+        A late cycle comes without twists. They are kept until the caller says by `use` that it was taken.
         """
         try:
             points = usable(points_of(message, self.rule, self.label_field), self.refused)

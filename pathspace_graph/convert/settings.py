@@ -16,10 +16,8 @@ from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNO
 
 Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
-SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)
-"""Standard deviations of a twist (m/s, m/s, rad/s) where nothing is known of them."""
-SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)
-"""Noise of detections (m, m/m, rad) where nothing is known of it."""
+SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
+SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)  # (m, m/m, rad) where nothing is known
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}

@@ -72,17 +72,11 @@ class FrontEnd:
         self._sides = SideJudge(settings.sides)
 
     def admit(self, odometry: Odometry, detections: Detections, window: Sequence[float] = ()) -> Admitted:
-        """Return a cycle that may be used, or raise a ReadingError; nothing but a count changes.
-
-        A late cycle is admitted between the stamps (s) of the `window`.
-        """
+        """Return a usable cycle, maybe a late one between the `window`'s stamps, or a ReadingError."""
         return self.gate.admit(odometry, detections, self._motion.newest, window)
 
     def use_late(self, detections: Detections, window: Sequence[float]) -> Detections:
-        """Return the detections of a late cycle with the labels of their sides; unknown ones stay so.
-
-        Its stamp is not admitted again as long as it lies in the window, whose poses have these stamps (s).
-        """
+        """Return the detections of a late cycle with the labels of their sides; it counts as used."""
         self.gate.use_late(detections.t, window)
         detections = detections.where(~is_orange(detections))
         return self._sides.relabelled(detections, np.full(len(detections.labels), UNKNOWN))
@@ -151,11 +145,7 @@ class JudgedLog:
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
-    """Return a log as the front end gives it to an estimator of whole logs.
-
-    Unknown noise is measured on the whole log first. A cycle that an online estimator would refuse is a
-    ReadingError.
-    """
+    """Return a log as the front end gives it to a batch; unknown noise is measured on all of it first."""
     front_end = FrontEnd(settings, noise)
     if front_end.noise.is_learning:
         front_end = FrontEnd(settings, replace(noise, measured=measure_log(log)))
@@ -188,10 +178,7 @@ def measure_log(log: Log) -> MeasuredNoise | None:
 
 
 def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
-    """Return the cycles of a log where odometry alone places them, and the twists.
-
-    It is not doubted, since the detections' noise and the sensor's errors are not known yet.
-    """
+    """Return the cycles of a log where odometry alone, which is not doubted, places them, and the twists."""
     readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
     for odometry, _ in readings:
         twists.add(odometry)
@@ -221,11 +208,10 @@ def at_nearest_pose(
 ) -> LateDetections:
     """Return late detections as they would be seen from the pose of the window that is nearest in time.
 
-    No pose is added. The vehicle is taken to move with a constant twist from the pose before the stamp to the
-    pose after it. With T the motion from the nearest pose to the late one, a detection z with covariance K
-    becomes `T z` with `R (K + G Q G') R'`, where `G = [I | J z]` and J is the quarter turn. Q is the
-    covariance of the odometry for the share of the interval up to the nearest pose, and what a changing twist
-    may add: half the acceleration times the times to both poses. This treats the errors of the detections as
+    The vehicle moves with a constant twist between the poses around the stamp. With T the motion from the
+    nearest pose to the late one, a detection z with covariance K becomes `T z` with `R (K + G Q G') R'`,
+    where `G = [I | J z]` and J is the quarter turn. Q is the covariance of the odometry for the share of the
+    interval, and of a changing twist: half the acceleration times the times to both poses. Errors count as
     independent, though one motion has moved them all.
     """
     times, poses, t = smoother.times, smoother.variables.poses, detections.t

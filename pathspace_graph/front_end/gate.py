@@ -28,17 +28,14 @@ UNITS: Final = "stamps are in seconds"  # hint where a stamp looks like one in m
 TWIST: Final = ("vx", "vy", "wz")
 UNIT: Final = ("m/s", "m/s", "rad/s")
 MAX_STAMP: Final = 1e11  # largest stamp, s: some three thousand years. Stamps in nanoseconds are larger
-MIN_INTERVAL: Final = 1e-3
-"""Least time from a cycle to the next, s: between nearer ones the odometry is too certain for doubles."""
+MIN_INTERVAL: Final = 1e-3  # s from cycle to cycle: below, the odometry is too certain for doubles
 MAX_TWISTS: Final = 100_000
 MAX_DETECTIONS: Final = 500  # largest numbers of twists and detections in a cycle, which bound its time
 MIN_RANGE: Final = 0.01  # least distance of a detection from the vehicle, m
 MIN_SIGMA: Final = 1e-6
 MAX_SIGMA: Final = 100.0  # least and largest standard deviation of a detection in any direction, m
-MIN_DETERMINANT: Final = 1e-12
-"""Least det of a covariance over xx * yy; below, it is singular to double precision."""
-MAX_ASYMMETRY: Final = 1e-6
-"""Largest difference of the entries xy and yx of a covariance, by its larger eigenvalue."""
+MIN_DETERMINANT: Final = 1e-12  # least det of a covariance over xx * yy: singular to doubles below
+MAX_ASYMMETRY: Final = 1e-6  # largest |xy - yx| of a covariance by its larger eigenvalue
 _COVARIANCES: Final = (MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA, MAX_SIGMA)
 
 
@@ -79,9 +76,8 @@ def admit(
 ) -> Admitted:
     """Return a cycle as an estimator may use it, or raise a ReadingError.
 
-    A late cycle, older than the newest one, is admitted between the stamps (s) of the `window`, whose poses
-    can still take detections, unless its stamp is among those `used`. Each twist is held until the next one,
-    and what was in force before the newest cycle is left out.
+    A late cycle is admitted between the stamps (s) of the `window`, unless its stamp is among those `used`.
+    Each twist is held until the next one, and what was in force before the newest cycle is left out.
     """
     t = _stamp(_of_type(Detections, detections, "detections").t)
     try:
@@ -131,11 +127,7 @@ class Gate:
         self.refused += 1
 
     def _goes_on(self, detections: Detections) -> bool:
-        """Return whether a cycle goes on from the one that has just been refused.
-
-        One stamp far ahead is an error. Two that agree are of a vehicle that was silent for long, which must
-        not be refused for ever.
-        """
+        """Return whether a cycle goes on from the one just refused: two that agree end a silence."""
         t, before = _stamp_or_none(detections), self._refused_at
         return t is not None and before is not None and 0.0 < t - before <= self.limits.silence
 
@@ -274,11 +266,9 @@ def possible_detections(detections: Detections, t: float, limits: LimitSettings)
 
 @compiled
 def _usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tuple[BoolArray, BoolArray]:
-    """Return whether points (m, 2), vehicle frame, are where a sensor can see; those not finite are not.
+    """Return which points (m, 2) are where a sensor sees, and which covariances (m, 2, 2) are possible.
 
-    The second result is whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible
-    size; the smaller eigenvalue is the determinant by the larger one. The limits are MIN_RANGE, the largest
-    range, and `_COVARIANCES`.
+    The limits are MIN_RANGE, the largest range, and `_COVARIANCES`.
     """
     min_range, max_range, asymmetry, determinant, min_sigma, max_sigma = limits
     distance = np.hypot(points[:, 0], points[:, 1])

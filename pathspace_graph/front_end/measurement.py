@@ -34,10 +34,8 @@ PASSES: Final = 4  # times that cones are followed
 FOLLOWED: Final = 40  # cycles in which cones are followed in a step
 ROUNDS: Final = 5  # times that errors, noise and weights are found in turn
 STRETCH: Final = 3.0  # time (s) over which errors of the odometry are alike
-COUNTED: Final = 0.8
-"""Share of `MAX_RANGE` beyond which cones hardly count: they are followed only where they seem nearer."""
-HARDLY: Final = 1e-6
-"""Weight of their sightings. It is not zero, so that a cone seen only there still has a place."""
+COUNTED: Final = 0.8  # share of `MAX_RANGE` beyond which cones are followed only where they seem nearer
+HARDLY: Final = 1e-6  # weight of sightings beyond: a cone seen only there still has a place
 HUBER: Final = 2.0
 MIN_COUNT: Final = 5  # least number of sightings of a cone that counts
 MIN_ROWS: Final = 60  # least number of sightings with a reference that tell the noise of detections
@@ -47,8 +45,7 @@ BINS: Final = 8
 TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # correlation times that are tried (s)
 LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)  # edges of the lags at which correlation is measured (s)
 MODEL_ERROR: Final = 0.05  # share of an error that the linear model may be wrong by, one sigma
-FIRST_SHARE: Final = 0.5
-"""Share of a cone's error that stays with it, as long as hardly any cone says otherwise."""
+FIRST_SHARE: Final = 0.5  # share of a cone's error that stays with it, unless cones say otherwise
 FIRST_CONES: Final = 8.0  # number of cones that `FIRST_SHARE` counts as much as
 LEAST: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
 
@@ -73,8 +70,7 @@ class _Cones:
     def without(self, off: Array) -> _Cones:
         """Return the sightings with ranges and derivatives where they would be without their errors (n, 2).
 
-        At the measured points both have the noise in them: weights would prefer sightings that came out
-        too short, and errors would come out too small.
+        With the noise in them weights would prefer short sightings, and errors come out too small.
         """
         seen = self.table.point - np.einsum("nij,nj->ni", rotations(-self.table.pose[:, 2]), off)
         ranges = np.maximum(np.hypot(*seen.T), np.finfo(float).tiny)
@@ -109,8 +105,7 @@ def _cones(sightings: Sightings) -> _Cones | None:
 def _columns(table: Sightings, begins: IntArray, seen: Array) -> Array:
     """Return the derivatives (n, 2, 6) of sightings at points (n, 2), vehicle frame, in the map frame.
 
-    The bias of the yaw rate counts from the first sighting of each cone on: what it did before turns all
-    sightings of the cone alike.
+    The bias of the yaw rate counts from each cone's first sighting: before, it turns all of the cone's alike.
     """
     first = np.repeat(begins, np.diff(np.append(begins, len(seen))))
     turn, by_bias, then = rotations(table.pose[:, 2]), table.by_bias, table.by_bias[first]
@@ -129,10 +124,9 @@ def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Arra
 
 
 def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
-    """Return errors b (6,), their covariance twice, and what is left (n, 2) of each sighting about its cone.
+    """Return errors b (6,), both covariances of them, and what is left (n, 2) of the sightings.
 
-    The places of the cones, which are the weighted means of `p + A b`, are eliminated. The covariances are
-    that of independent sightings, and `_clustered`.
+    The cones' places, weighted means of `p + A b`, are eliminated. One covariance is `_clustered`.
     """
     total = np.linalg.inv(cones.sums(information))
     mean_columns = total @ cones.sums(information @ cones.columns)
@@ -150,8 +144,8 @@ def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Arra
 def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
     """Return the covariance (6, 6) of the errors by how much the stretches of the drive disagree.
 
-    With the scores g (c, 6) of the cones summed over stretches of `STRETCH` seconds it is `P (sum g g') P`
-    (White's estimator for clusters). Errors of the odometry, which all cones share, are in it.
+    With the scores g (c, 6) of the cones summed over `STRETCH` seconds it is `P (sum g g') P` (White's
+    estimator for clusters), which has the errors of the odometry in it.
     """
     middle = cones.sums(cones.table.t) / np.diff(np.append(cones.begins, len(cones.ranges)))
     _, stretch = np.unique(np.floor(middle / STRETCH), return_inverse=True)
@@ -175,10 +169,7 @@ class _Residuals:
 
 
 def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], odometry: Array) -> _Residuals:
-    """Return the residuals of sightings against nearer ones.
-
-    `odometry` is the drift (3,) by root of s that white noise of the twists makes.
-    """
+    """Return the residuals against nearer sightings, with the drift (3,) by root of s of white noise."""
     (i, j), t, ranges = cones.pairs, cones.table.t, cones.ranges
     near = ranges[j] < NEAR * ranges[i]
     i, j = i[near], j[near]
@@ -293,8 +284,7 @@ class _Rounds:
     def _result(self, errors: Array, covariance: Array, clustered: Array) -> MeasuredNoise:
         """Return what was found, with errors (6,) and both covariances (6, 6) of them.
 
-        What stays of a cone's errors shifts its place, and only what changes while it is seen is taken for
-        an error of the sensor, as a slope would be.
+        What stays of a cone's errors shifts its place; only what changes is taken for an error of the sensor.
         """
         stamps, cones = np.unique(self._sightings.t), self._cones
         period = float(np.median(np.diff(stamps)))
@@ -315,10 +305,7 @@ class _Rounds:
 
 
 class Measurement:
-    """Measurement of noise in steps short enough for a perception cycle.
-
-    Cones are followed again with the noise and the errors that were found, from those known already on.
-    """
+    """Measurement of noise in steps short enough for a perception cycle, in passes of follow and measure."""
 
     def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
         """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least."""

@@ -28,40 +28,27 @@ from .scan_matching import (
     reaches,
 )
 
-NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))
-"""A motion that no odometry has measured does not depend on the calibration of the odometry."""
-DOUBT_AGAIN: Final = 3.8
-"""Contradiction of an odometry that was contradicted not long ago, standard deviations."""
+NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))  # of a motion that is not by odometry
+DOUBT_AGAIN: Final = 3.8  # contradiction of an odometry that was contradicted not long ago, sigmas
 DISTRUST: Final = 12.0  # time for which it is distrusted so, s: wheels that slip do so in the next bends, too
-DOUBT_RATE: Final = 2.0
-"""Agreement within which the yaw rate of a contradicted odometry is still believed, standard deviations."""
+DOUBT_RATE: Final = 2.0  # agreement within which a contradicted odometry's yaw rate is believed, sigmas
 MIN_DOUBTING: Final = 4  # least number of matched detections of a contradiction
-MISFIT: Final = 1.5
-"""Mean-square misfit beyond which detections are worse than they claim: its excess scales covariances."""
+MISFIT: Final = 1.5  # mean-square misfit beyond which its excess scales the detections' covariances
 MISFIT_GAIN: Final = 0.02  # smoothing gain of the mean-square misfit
-MAX_MISFIT: Final = 3.0
-"""Largest misfit that tells a motion: about 1 where the vehicle moved, 4 where it was put down elsewhere."""
+MAX_MISFIT: Final = 3.0  # largest misfit of a motion: 1 where the vehicle moved, 4 where it was put down
 MISFIT_ODOMETRY: Final = 2.0  # least misfit at the odometry's own pose in a contradiction
 MISFIT_RATIO: Final = 1.3  # least ratio of that misfit to the one of the match
 MAX_CHANGE: Final = 3.5  # largest difference of a motion from the one before, in `SIGMAS_CHANGE`
-SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)
-"""Standard deviations (m/s, m/s, rad/s) of a velocity's change in a cycle whose odometry is not believed."""
-BEFORE: Final = 0.5
-"""Share of a contradiction's size added to its motion's sigma: it may have begun a few cycles before."""
-WIDENING: Final = 1.5
-"""Factor of the standard deviations of a motion told from detections, since the estimator uses them again."""
+SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)  # m/s, m/s, rad/s from cycle to cycle without odometry
+BEFORE: Final = 0.5  # share of a contradiction added to its motion's sigma: it may have begun earlier
+WIDENING: Final = 1.5  # of the sigmas of a motion by detections, which the estimator uses again
 HOLD: Final = 0.15  # time for which a twist is held without a loss of certainty, s
-HOLD_INTERVALS: Final = 3.0
-"""Shortest intervals between two twists for which it is held so; the longer time counts."""
-STUCK: Final = 3
-"""Twists in a cycle equal to the one before from which readings are stuck, if no vehicle moves so."""
-REST: Final = 1.0
-"""Time of standing from which the vehicle is at rest, s: its mean yaw rate measures the bias then."""
-REST_TWIST: Final = (0.1, 0.1, 0.05)
-"""Largest mean twist (m/s, m/s, rad/s) of a vehicle that stands, but for noise; the yaw rate is bias."""
+HOLD_INTERVALS: Final = 3.0  # shortest intervals of twists for which it is held so, if longer
+STUCK: Final = 3  # twists equal to the one before from which readings are stuck
+REST: Final = 1.0  # time of standing from which the mean yaw rate measures the bias, s
+REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest, m/s, m/s, rad/s, but for noise
 REST_SIGMAS: Final = 3.0  # standard deviations of the mean that count as its noise
-SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)
-"""Standard deviations (m, m, rad) of a motion at rest from cycle to cycle."""
+SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # m, m, rad, of a motion at rest from cycle to cycle
 
 
 class MotionCheck:
@@ -90,18 +77,12 @@ class MotionCheck:
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
     def believe(self, sigma: Array) -> None:
-        """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten.
-
-        Its errors are taken out of the detections from now on.
-        """
+        """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten."""
         self.sigma = self._rest.sigma = sigma
         self._recent, self.errors = RecentDetections(), SensorErrors(self.settings)
 
     def update(self, odometry: Odometry, detections: Detections, may_doubt: bool = True) -> MeasuredMotion:
-        """Return the motion since the last cycle.
-
-        Unless it `may_doubt`, odometry is believed: the detections' noise is not known then.
-        """
+        """Return the motion since the last cycle, whose odometry may be doubted if the noise is known."""
         t, measured = detections.t, detections.points_vehicle
         motion = self._integrate(odometry, t)
         columns = by_errors(measured, motion.odometry.twist)
@@ -203,10 +184,7 @@ class MotionCheck:
         return self._replaced(motion, best, going_on, dt) if failed else motion
 
     def _fits_better(self, best: Match, predicted: Array, detections: Detections, variances: Array) -> bool:
-        """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match.
-
-        In a bend, a few cones may as well be laid on each other's neighbours, far from where they fit.
-        """
+        """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
         points, variances = detections.points_vehicle[best.is_matched], variances[best.is_matched]
         at_odometry, at_match = (
             misfit_at(self._recent, points, variances, pose) for pose in (predicted, best.pose)
@@ -285,10 +263,7 @@ class Rest:
         self._rate_sum, self._rate_count = 0.0, 0
 
     def update(self, odometry: Odometry, t: float) -> bool:
-        """Return whether the vehicle has stood for long enough at t (s), by the twists since the last cycle.
-
-        Its mean twist is zero within its own noise, and within the limits of a vehicle that stands.
-        """
+        """Return whether the vehicle has stood for long enough at t (s), by the newest twists."""
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
         if (
             len(twists) == 0

@@ -92,10 +92,7 @@ class NoiseLearner:
         )
 
     def for_map(self, detections: Detections) -> Detections:
-        """Return detections whose covariances say what each adds to the others of its cone.
-
-        Stated ones are those of single detections, which say nothing of errors that stay.
-        """
+        """Return detections whose covariances say what each adds to the others of its cone."""
         measured, points = self.measured, detections.points_vehicle
         if not self.of_sensor or measured is None:
             return detections
@@ -107,11 +104,9 @@ class NoiseLearner:
     def for_lap(
         self, motions: Sequence[MeasuredMotion], detections: Sequence[Detections]
     ) -> tuple[list[MeasuredMotion], list[Detections]]:
-        """Return the readings of a drive with the noise that is known now.
+        """Return the readings of a drive, with stated covariances, with the noise that is known now.
 
-        Its first seconds were driven before any was measured. They decide the heading of the map, so a lap
-        that is solved as a whole must not believe them more than the rest. The detections have their stated
-        covariances.
+        Its first seconds were driven before any was measured, and decide the heading of the map.
         """
         if self.of_odometry and self.measured is not None:
             motions = [motion.with_sigma(self.twist_sigma) for motion in motions]
@@ -167,8 +162,7 @@ class NoiseLearner:
     def trusts_odometry(self, settings: MapperSettings) -> bool:
         """Return whether the odometry sets the size of the map, by default where it is the smoother one.
 
-        Over a second it errs by the white noise of its readings, the ranges by that of their detections. What
-        drifts slowly hardly changes a length.
+        Over a second it errs by the white noise of its readings, the ranges by that of their detections.
         """
         measured, trust = self.measured, settings.calibration.trust
         if trust is not None or measured is None or measured.along is None:

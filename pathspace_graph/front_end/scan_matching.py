@@ -23,33 +23,25 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.online import MotionSettings
 
-ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]
-"""Errors of a sensor that are learned, as indices of its calibration."""
-SIGMAS_ERRORS: Final = (0.02, 0.05)
-"""Standard deviations (rad, s) of yaw and latency before anything is learned: those of a hasty mounting."""
-SIGMAS_CHANGES: Final = (0.001, 0.005)
-"""Their change in a minute (rad, s), one sigma, so that an old value is forgotten."""
+ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
+SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
+SIGMAS_CHANGES: Final = (0.001, 0.005)  # their change in a minute, rad and s
 MINUTE: Final = 60.0
 
-MEMORY: Final = 0.65
-"""Time for which detections are remembered, s: several cycles, over which odometry hardly drifts."""
+MEMORY: Final = 0.65  # age of remembered detections, s, over which odometry hardly drifts
 MOST_REMEMBERED: Final = 2000  # largest number of remembered detections, which bounds the time of a match
 REACH: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
 ITERATIONS: Final = 6
-REACHES_CHECK: Final = (REACH, REACH_LAST)
-"""Reaches in the check of the odometry, which begins near the solution."""
+REACHES_CHECK: Final = (REACH, REACH_LAST)  # of the check, which begins near the solution
 FARTHEST: Final = 3.0  # distance in reaches from which on a remembered detection has no weight
 MIN_WEIGHT: Final = 0.7  # least sum of weights of a matched detection
 MIN_MATCHED: Final = 3  # least number of matched detections that tell a motion
 HUBER: Final = 2.5  # whitened distance beyond which the Huber loss reduces the weight of a matched detection
-SIGMA_CONE: Final = 0.05
-"""Standard deviation added to that of a detection, m, since one side of a cone is seen."""
-LEAST_SHARE: Final = 1e-6
-"""Least determinant of a pose's information that holds it, by the product of the diagonal."""
-MOST_MISFIT: Final = 9.0
-"""Largest whitened square distance that counts in a misfit which is compared with another."""
+SIGMA_CONE: Final = 0.05  # added to a detection's, m, since one side of a cone is seen
+LEAST_SHARE: Final = 1e-6  # least det of a pose's information by the product of its diagonal
+MOST_MISFIT: Final = 9.0  # largest whitened square in a misfit that is compared with another
 _TINY: Final = float(np.finfo(float).tiny)
 
 
@@ -68,10 +60,7 @@ class RecentDetections:
         self._table: Array = np.zeros((0, 5 + 2 * len(ERRORS)))
 
     def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
-        """Add the detections of a cycle at t (s), measured at (m, 2) in the frame of the pose (3,).
-
-        Their derivatives by e errors of the sensor are the columns (m, 2, e), in the same frame.
-        """
+        """Add detections (m, 2) at t (s) from a pose (3,), and their derivatives (m, 2, e) by errors."""
         new = np.empty((len(measured), self._table.shape[1]))
         new[:, 0], new[:, 1:3], new[:, 3:5] = t, to_map(measured, pose[None]), pose[:2]
         new[:, 5:] = (rotation(pose[2]) @ columns).reshape(len(measured), new.shape[1] - 5)
@@ -145,10 +134,7 @@ def _matched(
     reaches: Sequence[float],
     limits: tuple[float, ...],
 ) -> tuple[Array, Array, BoolArray, float]:
-    """Return the pose (3,) of `match`, and of its last step what `_match_step` returns but the gradient.
-
-    The limits are FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE, MIN_MATCHED and LEAST_SHARE.
-    """
+    """Return the pose (3,) of `match`, and of its last step what `_match_step` returns but the gradient."""
     pose, (min_matched, least_share) = start.copy(), limits[4:]
     for reach in reaches:
         information, gradient, matched, cost = _match_step(
@@ -199,10 +185,7 @@ def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array,
 
 @compiled
 def _weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
-    """Return the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights.
-
-    The weights are `exp(-d^2 / 2 reach^2)` below a distance of `farthest` reaches.
-    """
+    """Return means (m, 2) of recent points by `exp(-d^2 / 2 reach^2)`, and the sums of weights."""
     dx = points[:, 0, None] - recent[:, 0]
     dy = points[:, 1, None] - recent[:, 1]
     square = (dx * dx + dy * dy) / reach**2
@@ -271,18 +254,14 @@ class SensorErrors:
     def shifts(self, way: Array, velocity: Array) -> Array:
         """Return the derivatives (3, 2) of how far a match is off the odometry, by the errors.
 
-        Way (2,) and velocity (3,) are in the vehicle frame (m, m/s, m/s, rad/s). Changes of the velocity
-        beyond the accelerations of a vehicle are slip, and not latency.
+        Way (2,) and velocity (3,) are in the vehicle frame; changes that no vehicle makes are slip.
         """
         off = np.minimum(np.maximum(self._velocity - velocity, -self._possible), self._possible)
         (ahead, left), (x, y, turn) = way.tolist(), off.tolist()
         return np.array([[left, x], [-ahead, y], [0.0, turn]])
 
     def update(self, difference: Difference, dt: float) -> None:
-        """Learn from a match that agrees with the odometry, dt (s) after the last cycle.
-
-        Matches share the remembered detections, so one counts by the share of its own time.
-        """
+        """Learn from a match that agrees, dt (s) after the last; it counts by its share of memory."""
         measured = difference.off, difference.covariance, difference.shifts, min(dt / MEMORY, 1.0)
         self.mean, self.covariance = _learned(self.mean, self.covariance, dt * self._drift, *measured)
 
@@ -295,10 +274,7 @@ def off_prediction(
     predicted: Array,
     covariance: Array,
 ) -> tuple[Array, Array]:
-    """Return how far a match is off a predicted pose (3,), in its frame, and the covariance of that.
-
-    The variances of the detections are `excess` times what they claim, and the prediction has a covariance.
-    """
+    """Return how far a match, of variance times `excess`, is off a prediction, and its covariance."""
     turn = np.eye(3)
     turn[:2, :2] = rotation(predicted[2]).T
     return turn @ (pose - predicted), turn @ (excess * np.linalg.inv(information)) @ turn.T + covariance
@@ -314,10 +290,7 @@ def _squared(off: Array, covariance: Array, shifts: Array, errors: Array) -> flo
 def _learned(
     mean: Array, errors: Array, drift: Array, off: Array, covariance: Array, shifts: Array, share: float
 ) -> tuple[Array, Array]:
-    """Return mean (2,) and covariance (2, 2) of the errors after a measurement that counts by a share.
-
-    The errors have a covariance (2, 2), which has grown by the drift (2, 2).
-    """
+    """Return mean (2,) and covariance (2, 2) of the errors after a measurement that counts by a share."""
     weighted = share * np.linalg.solve(covariance, shifts).T
     known = np.asarray(np.linalg.inv(np.linalg.inv(errors + drift) + weighted @ shifts))
     return mean + known @ weighted @ off, known

@@ -23,11 +23,9 @@ from pathspace_graph.settings.online import SidesSettings
 REACH: Final = 8.0  # length of the predicted path beside which coloured cones say what the colours mean, m
 MIN_LATERAL: Final = 0.5
 MAX_LATERAL: Final = 8.0  # distances from the path between which it tells the side of a cone, m
-MAJORITY: Final = 2.5
-"""Least ratio of cones on the other colour's side to those on their own where the colours are swapped."""
+MAJORITY: Final = 2.5  # least ratio of cones on the other colour's side where colours are swapped
 ENOUGH_VOTES: Final = 30  # number of cones that settles what the colours mean
-REMEMBERED: Final = 0.98
-"""Factor by which the detections so far count less in the share without a colour, from cycle to cycle."""
+REMEMBERED: Final = 0.98  # factor from cycle to cycle of the detections so far in the colourless share
 MIN_DETECTIONS: Final = 6  # least number of detections of which the share is taken
 MERGE_RADIUS: Final = 1.0  # distance within which detections are of one cone, m
 FORGET_AFTER: Final = 3.0  # time without a detection after which a cone is forgotten, s
@@ -63,8 +61,8 @@ class SideJudge:
     ) -> Detections:
         """Return the detections of a cycle with the labels of their sides.
 
-        The vehicle came to the pose (3,), in the frame of the front end, with twists (k, 3). In a lane of
-        orange cones it isn't on the road yet, and the colours of others prove nothing.
+        The vehicle came to the pose (3,), front end's frame, with twists (k, 3). In a lane of orange cones
+        it isn't on the road yet, and the colours of others prove nothing.
         """
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
         if not self.colourless and self._agreeing + self._opposing >= ENOUGH_VOTES:
@@ -89,10 +87,7 @@ class SideJudge:
         return detections if (labels == detections.labels).all() else replace(detections, labels=labels)
 
     def _judge_colours(self, path: PathAhead) -> None:
-        """Count cones on the side of their colour and on the other one, and swap the colours by majority.
-
-        Each cone is counted once, when it is a little ahead.
-        """
+        """Count cones once on the side of their colour or the other one, and swap colours by majority."""
         near = self._cones
         fresh = np.flatnonzero(~near.judged & near.votes.any(axis=1))
         if len(fresh) == 0:
@@ -170,9 +165,8 @@ class Row:
 def follow_rows(rows: Mapping[int, Row], points: Array, votes: IntArray, free: IntArray) -> None:
     """Lead both rows on through free cones (k,), as long as it is clear which cone comes next.
 
-    All cones (n,) have points (n, 2) in m, and votes (n, 2) for left and right. The next cone has the least
-    `distance (1 + TURN_COST turn^2)` from the end of its row, and is far dearer for the other row. Else both
-    rows end: they could be confused there.
+    All cones have points (n, 2) in m, and votes (n, 2) for left and right. The next one has the least
+    `distance (1 + TURN_COST turn^2)` from the end of its row, and is far dearer for the other row.
     """
     left = free.tolist()
     while left:

@@ -18,16 +18,13 @@ MOST_TWISTS: Final = 4000
 MOST_PARTS: Final = 200
 MIN_SPEED_SHARE: Final = 0.3  # share of its median speed below which a vehicle says little of noise in motion
 MIN_TWISTS: Final = 30  # least number of twists that tell white noise
-MAX_RANGE: Final = 30.0
-"""Range beyond which sightings are not followed (m): they are hardly ever seen near later."""
+MAX_RANGE: Final = 30.0  # m; beyond, cones are hardly ever seen near later
 MAX_AGE: Final = 3.0  # time without a sighting after which a cone counts as another one (s)
 GATE: Final = (0.4, 0.06, 1.5)  # gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m
-FOLLOWING: Final = (0.5, 0.15)
-"""Share by which a cone goes to where it is seen, and where it was seen from nearer before."""
+FOLLOWING: Final = (0.5, 0.15)  # of a cone to where it is seen, and was seen from nearer before
 GATE_SIGMAS: Final = 3.5
 GATE_LEAST: Final = 0.4
-GATE_MOST: Final = 3.5
-"""Gate once it is known: sigmas along and across the ray, at least and at most this far, m."""
+GATE_MOST: Final = 3.5  # of the gate once noise is known: sigmas along and across the ray; least, most, m
 
 
 @dataclass(eq=False)
@@ -68,11 +65,7 @@ class SeenCycle:
 
 
 def follow(cycles: Iterable[SeenCycle], known: MeasuredNoise) -> Sightings:
-    """Return the sightings of cones in the cycles, in order of time.
-
-    Sightings are matched after known constant errors of the sensor are taken out, and by known noise; they
-    are returned as measured.
-    """
+    """Return the sightings of cones in the cycles, in order of time, as measured."""
     follower = Follower(known)
     return Sightings.stacked([Sightings.none(), *(follower.add(cycle) for cycle in cycles)])
 
@@ -139,10 +132,7 @@ class Follower:
     def _assign(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float
     ) -> tuple[IntArray, IntArray]:
-        """Return which detections (m,), nearest first, are sightings, and of which cones.
-
-        Several cameras may see a cone at once, and each counts: the best one alone would favour known errors.
-        """
+        """Return which detections (m,), nearest first, are sightings, and of which cones."""
         count = len(self._cones)
         place, self._points, self._nearest = _assigned(
             points,
@@ -184,10 +174,9 @@ def _assigned(
 ) -> tuple[IntArray, Array, Array]:
     """Return the cone of each detection at points (m, 2), and places and least ranges of the known cones.
 
-    A detection with gates along and across its ray (m,) from a place (2,) is of the nearest of the known
-    cones (n,) of its label in its gate. The others are new cones from n on, each of the first of those
-    beside it, or -1 where that one is not a cone of its own. A cone goes to its detections by the first of
-    the weights, or by the second where it was seen from nearer before.
+    A detection with gates along and across its ray (m,) from a place (2,) is of the nearest known cone (n,)
+    of its label in its gate. The others are new cones from n on, each of the first of those beside it, or -1
+    where that one is not a cone of its own. A cone goes to its detections by the weights (`FOLLOWING`).
     """
     index, least, moved = np.full(len(points), -1), nearest.copy(), known.copy()
     if len(known):
@@ -214,10 +203,7 @@ def _assigned(
 
 
 def _gated_squares(points: Array, others: Array, place: Array, along: Array, across: Array) -> Array:
-    """Return `(a_ij / along_i)^2 + (c_ij / across_i)^2` (m, n) of points (m, 2) and others (n, 2).
-
-    a and c are their differences along and across the rays from a place (2,) to the points.
-    """
+    """Return `(a_ij / along_i)^2 + (c_ij / across_i)^2` (m, n) on the rays from a place (2,)."""
     ray = points - place
     ray = ray / np.maximum(np.hypot(ray[:, 0], ray[:, 1]), np.finfo(float).tiny)[:, None]
     off = others - points[:, None]
@@ -248,18 +234,14 @@ class TwistRecord:
         return t[new][-MOST_TWISTS:], twists[new][-MOST_TWISTS:]
 
     def white(self) -> tuple[Array, float] | None:
-        """Return the white noise (3,) of a twist, and the time between two twists (s).
-
-        The least of `orders`: the higher the order, the less of the motion itself is in it.
-        """
+        """Return the white noise (3,) of a twist, the least of `orders`, and the time between two (s)."""
         orders = self.orders()
         return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(self._newest[0]))))
 
     def orders(self) -> Array | None:
-        """Return the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
+        """Return the noise (k, 3) of a twist by differences of second to fourth order, if there are enough.
 
-        The median absolute difference over `sqrt(binomial(2 k, k))`, that of white noise. Where the orders
-        differ, the noise is not white, or the motion itself is in it.
+        The median absolute difference over `sqrt(binomial(2 k, k))`; it is not white where orders differ.
         """
         _, twists = self._newest
         if len(twists) < MIN_TWISTS:

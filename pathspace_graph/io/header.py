@@ -18,8 +18,7 @@ from .parsing import MAX_HEADER_BYTES, MAX_NOISE, parse_toml, read_text, shown
 FORMAT: Final = "pathspace-log/1"
 POSITIVE: Final = math.ulp(0.0)
 STATED: Final = "stated"
-UNSTATED: Final = ("measured", "assumed")
-"""Noise that nobody has stated was measured, or it is assumed where the drive shows too little."""
+UNSTATED: Final = ("measured", "assumed")  # measured, or assumed where the drive shows too little
 MEASURED: Final = "noise.measured"
 _ODOMETRY: Final = {"odometry": (3, 0.0), "drift": (3, 0.0), "interval": (1, POSITIVE), "seconds": (1, 0.0)}
 _RAYS: Final = {"along": (4, 0.0), "across": (4, 0.0)}

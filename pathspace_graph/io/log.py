@@ -54,18 +54,15 @@ FILES: Final = (LOG_FILE, *COLUMNS)
 
 CALIBRATION: Final = ("scale", "bias")  # names of the true calibration of the odometry in the log's header
 
-SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
-"""Names of the true constant errors of the sensor in the log's header."""
+SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")  # true errors of the sensor
 NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
 """Names of the true noise in the log's header, where it is not white as the log states it."""
 _TRUE_ERRORS: Final = {"calibration": CALIBRATION, "sensor": SENSOR, "noise": NOISE}
 """Fields of the truth that are in the log's header, by the names of their entries."""
 _SENSOR_INFO: Final = ("range_max", "fov", "rate")
 
-MAX_HOLD: Final = 1.0
-"""Longest time for which the last twist is held (s); a perception cycle later than that has no odometry."""
-MIN_RELATIVE_DETERMINANT: Final = 1e-12
-"""Least det of a covariance over xx * yy; below, it is singular to double precision."""
+MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
+MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to double precision below
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -205,10 +202,7 @@ class Log:
 
 
 def read_log(folder: Path | str) -> Log:
-    """Read and check a log folder (FORMATS: A log).
-
-    Anything wrong is an InputError that names the file, the row and what was expected.
-    """
+    """Read and check a log folder; an InputError names the file, the row and what was expected."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
@@ -244,11 +238,10 @@ def _table(folder: Path, name: str) -> Table:
 
 
 def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
-    """Write a log folder that `read_log` gives back exactly.
+    """Write a log folder that `read_log` gives back exactly, but for cycles without detections.
 
-    A cycle without detections has no row in the file, so it is left out. The folder appears as a whole or not
-    at all; an earlier log there is kept as a numbered backup. With `check`, a log that cannot be read is an
-    InputError, and is not written.
+    It appears as a whole or not at all; an earlier log is kept as a numbered backup. With `check`, a log that
+    cannot be read is an InputError, and is not written.
     """
     with atomic_folder(folder, LOG_FILE) as target:
         (target / LOG_FILE).write_text(to_toml(_sections(log)), encoding="utf-8", newline="\n")

@@ -27,12 +27,10 @@ if TYPE_CHECKING:
 FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
 
-NO_COVARIANCE: Final[Array] = np.zeros((0, 0))
-"""Covariance of a boundary for which none was asked; it can't be written."""
+NO_COVARIANCE: Final[Array] = np.zeros((0, 0))  # none was asked for; it can't be written
 
 _SYMMETRY_TOLERANCE = 1e-9  # largest |P - P^T| over max|P| of a covariance that is symmetric to rounding
-_NEGATIVE_TOLERANCE = 1e-9
-"""Most negative eigenvalue over the largest one of a covariance that is positive semidefinite to rounding."""
+_NEGATIVE_TOLERANCE = 1e-9  # most negative eigenvalue over the largest one of P >= 0, to rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -177,10 +175,7 @@ class Map:
 
 
 def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:
-    """Return a joint covariance (2m, 2m) with each boundary's own covariance as its diagonal block.
-
-    A boundary's covariance may hold what the others don't share, such as the scatter of its cones.
-    """
+    """Return a joint covariance (2m, 2m) with each boundary's own one, which may hold more, inside."""
     joint, at = joint.copy(), 0
     for _, boundary in sorted(boundaries.items()):
         own = slice(at, at := at + len(boundary.covariance))

@@ -22,18 +22,14 @@ from .pairs import DEGREE, SOME_CYCLES, Meaning, Pairs, motions
 
 TURN_STEP: Final = 15.0  # step of the angles that the frame of the detections is tried at (degrees)
 EQUAL: Final = 0.02  # difference of explained shares below which hypotheses are equally good
-SIDED: Final = 0.2
-"""Further share of the labels on its side by which one of equally good hypotheses is better."""
+SIDED: Final = 0.2  # further share of labels on their side by which one of equal hypotheses is better
 TELLING: Final = 0.2  # difference of explained shares from which a pair tells two hypotheses apart
-CHANCE: Final = 1e-8
-"""Probability of winning as many of the pairs by chance below which a hypothesis is believed."""
-FAR_BETTER: Final = 1.8
-"""Least ratio of what a believed hypothesis explains to what the log as it is written does."""
+CHANCE: Final = 1e-8  # probability of winning by chance below which a hypothesis is believed
+FAR_BETTER: Final = 1.8  # least ratio of what it explains to what the log as written does
 LEAST_SHARE: Final = 0.3  # least share of the detections that a believed hypothesis explains
 MOUNTING_STEPS: Final = 5  # Gauss-Newton steps that find the mounting of the sensor
 LEAST_MATCHES: Final = 60  # least number of matched detections from which the mounting is found
-WORST_CONDITION: Final = 1e6
-"""Largest condition number of the normal equations at which the mounting is found."""
+WORST_CONDITION: Final = 1e6  # largest condition number at which the mounting is found
 LATEST: Final = 10.0  # largest delay or lead of detections that is tried (s)
 LATE_STEP: Final = 0.25  # step of these (s)
 QUARTER: Final = 90.0  # a quarter turn in degrees
@@ -189,8 +185,7 @@ class Trials:
 
 # --- where the sensor is in the vehicle, and how late it is ----------------------------------------------
 
-MEDIAN_SQUARE: Final = 2.0 * float(np.log(2.0))
-"""Median of the squared length of a vector of two standard normal numbers."""
+MEDIAN_SQUARE: Final = 2.0 * float(np.log(2.0))  # median of |x|^2 of two standard normals
 
 
 @dataclass(frozen=True, eq=False)

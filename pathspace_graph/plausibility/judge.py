@@ -27,8 +27,7 @@ from .noise import noise_hints
 from .pairs import DEGREE, GAPS, Meaning, Pairs, motions, pairs_of
 
 LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is said
-OVERLAP: Final = 0.5
-"""Share of a cycle's detections that another could have seen, from which the two are compared."""
+OVERLAP: Final = 0.5  # share of its detections that another cycle sees, from which they are compared
 SHORTEST_STEP: Final = 2e-4  # shortest usual time between rows (s)
 LONGEST_STEP: Final = 5.0  # longest usual time between rows (s)
 FARTHEST: Final = 120.0  # usual greatest range of a detector of cones (m)
@@ -38,24 +37,18 @@ FASTEST: Final = 100.0  # speed that no vehicle exceeds in a tenth of its time (
 FASTEST_TURN: Final = 8.0  # yaw rate that no vehicle exceeds in a tenth of its time (rad/s)
 TURNED: Final = 5.0  # turn of the sensor beyond which it is told (degrees)
 TURNED_SIGMA: Final = 1.0  # largest standard deviation of the turn at which it is told (degrees)
-ARM: Final = 1.0
-"""Distance of the sensor from the point that the odometry describes beyond which it is told (m)."""
-ARM_SIGMA: Final = 0.2
-"""Largest standard deviation of its place at which it is told, as a share of the distance."""
-CLAIMED_LESS: Final = 10.0
-"""Ratio of one cone's scatter to the claimed one from which covariances are too small."""
+ARM: Final = 1.0  # distance of sensor and odometry's point beyond which it is told (m)
+ARM_SIGMA: Final = 0.2  # largest sigma of its place at which it is told, by the distance
+CLAIMED_LESS: Final = 10.0  # one cone's scatter by the claimed one: covariances too small
 CLAIMED_MORE: Final = 30.0  # ratio of the claimed scatter to one cone's from which covariances are too large
 LEAST_SCATTER: Final = 0.02  # scatter that detections which scatter less count as (m)
-BOTH_SIDES: Final = 0.15
-"""Distance from a half of the share of a label's cones on its own side at which they are on both."""
-NEAR: Final = 0.25
-"""Move by a share of the usual range, and turn (rad), below which two cycles see the same cones."""
+BOTH_SIDES: Final = 0.15  # distance from a half of the share of a label on its side: it is on both
+NEAR: Final = 0.25  # move by the usual range, and turn (rad), below which cycles see the same cones
 MANY: Final = 6  # least number of detections that such cycles have together
 LEAST_NEAR: Final = 30  # least number of such pairs of cycles that are counted
 UNEXPLAINED: Final = 0.15  # share of the detections that the best motion must explain, or else none does
 LINE_RATIO: Final = 0.1  # ratio of the variations of two coordinates below which detections lie on a line
-TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
-"""Units of stamps by their size in s."""
+TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size in s
 LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # units of positions by their size in m
 SPEEDS: Final = {
     1.0 / 3.6: "are in km/h, not in m/s",
@@ -85,11 +78,7 @@ MIRRORED: Final = Frame(0.0, True)  # frame in which y points to the right and x
 
 
 def hints(log: Log) -> list[Hint]:
-    """Return the likely mistakes in a log, each with its figure; there are none in a good one.
-
-    Only the readings are looked at, never the truth. Where a log is short, or stands still, or goes straight
-    on, the evidence is weak, and nothing is said.
-    """
+    """Return the likely mistakes in a log by its readings; there are none where evidence is weak."""
     if len(log.odometry.t) < LEAST_TWISTS:
         return []
     scale = scale_of(log)
@@ -194,8 +183,8 @@ def _median(values: Array) -> float:
 def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
     """Return the pairs of cycles that see the same cones if the odometry is right.
 
-    One stretch of a track looks like the next. So cycles without cones in common agree best with a vehicle
-    that does not move. Where the odometry is impossible anyway, the pairs are those that follow each other.
+    Cycles without cones in common would agree best with a vehicle that does not move, as one stretch looks
+    like the next. Where the odometry is impossible anyway, the pairs are those that follow each other.
     """
     if beyond_any_vehicle(log.odometry):
         return pairs.chosen(pairs.gap <= GAPS[1])
@@ -231,11 +220,7 @@ def _meant(trials: Trials) -> tuple[Trial, list[Hint]]:
 
 
 def _of_frame(best: Trial, trials: Trials, compared: Verdict) -> list[Hint]:
-    """Return a hint about the frame of the detections, where it is not the vehicle's.
-
-    Where detections turn the other way than the odometry, colours tell which is wrong. The odometry may also
-    be the one that goes backward or to a side.
-    """
+    """Return a hint about the frame of the detections, or an odometry that goes backward or to a side."""
     frame = best.hypothesis.frame
     vx, vy = np.median(trials.log.odometry.twist[:, :2], axis=0)
     sees_ahead = np.nanmedian(trials.pairs.before[..., 0]) > 0.0

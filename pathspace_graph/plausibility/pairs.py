@@ -18,8 +18,7 @@ SOME_CYCLES: Final = 200  # approximate number of cycles from which the spacing 
 GAPS: Final = (1, 2, 4, 8)  # numbers of cycles between the two that are compared
 PAIRS_OF_GAP: Final = 60  # approximate number of pairs of cycles that are compared for each of the gaps
 LONGEST: Final = 1.3  # longest time between the cycles of a pair (s), if cycles do not come more rarely
-REACH: Final = 0.2
-"""Distance from another detection, over the cones' spacing, that counts as the same by `exp(-1/2)`."""
+REACH: Final = 0.2  # distance that counts as the same by `exp(-1/2)`, over the cones' spacing
 SEEN: Final = 0.95  # share of the detections within the range, and between the bearings, that a cycle sees
 ROUND: Final = 0.1  # length of the mean direction to the detections below which a sensor sees all around
 
@@ -40,10 +39,9 @@ class Pairs:
         return len(self.begin)
 
     def distances(self, frame: Array, motion: Array) -> Array:
-        """Return the squared distances (P, m, m) of earlier from later detections, laid on them by a motion.
+        """Return the squared distances (P, m, m) of earlier from later detections, infinite without any.
 
-        frame (2, 2) leads from the frame of the log to the vehicle's, and motion (P, 3) from the later to the
-        earlier vehicle frame. Where there is no detection the distance is infinite.
+        frame (2, 2) leads from the log's frame to the vehicle's, motion (P, 3) from the later to the earlier.
         """
         laid = self.laid(frame, motion)
         off = (self.before @ frame.T)[:, :, None] - laid[:, None]
@@ -67,10 +65,7 @@ class Pairs:
         return replace(self, **arrays)
 
     def overlap(self, motion: Array) -> Array:
-        """Return the share (P,) of the later detections that the earlier cycle could have seen.
-
-        What a cycle sees is told from all detections: up to which range, and to both sides of which bearing.
-        """
+        """Return the share (P,) of the later detections that the earlier cycle could have seen."""
         ranges, bearings = _polar(self.before)
         vector = np.nanmean(np.exp(1j * bearings))
         middle = float(np.angle(vector)) if abs(vector) > ROUND else 0.0
@@ -176,10 +171,7 @@ class Meaning:
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
-    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning.
-
-    Between the stamps (N,) of the poses (N, 3) the motion is even.
-    """
+    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning."""
     first, last = _at(odometry_t, poses, begin), _at(odometry_t, poses, end)
     moved = _turned(last[:, :2] - first[:, :2], -first[:, 2])
     return np.column_stack([moved, last[:, 2] - first[:, 2]])

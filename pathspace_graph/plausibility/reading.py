@@ -22,10 +22,7 @@ SHOWN_WORDS: Final = 3  # most foreign labels that are shown
 
 
 def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[Hint]]:
-    """Read a log whose cycles may all be used, and judges it; otherwise raise an InputError.
-
-    The error names the file, the row and what was expected, and where the log tells it, the likely cause.
-    """
+    """Read and judge a log; an InputError names file, row, what was expected, and the likely cause."""
     try:
         log = read_usable_log(folder, limits)
     except InputError as error:

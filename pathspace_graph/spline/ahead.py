@@ -19,14 +19,12 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from .centre_line import points_across
 from .planning import MOST_POINTS, check_length
 
-_SAMPLE_STEP: Final = 0.5
-"""Approximate distance of boundary samples (m). The circle at a sample is right to a millimetre."""
+_SAMPLE_STEP: Final = 0.5  # of boundaries (m); the circle at a sample is right to a millimetre
 _ACROSS: Final = 2  # stride of the samples among which the points across are searched
 _BEHIND: Final = 3.0  # distance behind the vehicle at which the samples begin (m), since it may stand askew
 _OUTER: Final = 1.8  # largest ratio of the length of a turn's outer boundary to that of the centre line
 _SETTLING_STEPS: Final = 8  # largest number of Newton steps that settle the stations; mostly two are enough
-_SETTLED: Final = 1e-3
-"""Largest difference of a point's distances from both boundaries where it is on the line (m)."""
+_SETTLED: Final = 1e-3  # largest difference of the distances from both boundaries on the line (m)
 _LARGEST_GAP: Final = 2.0  # largest number of steps between neighbours
 
 
@@ -94,10 +92,9 @@ class TrackAhead:
 
 
 def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:
-    """Return the next `distance` metres of a track from a pose (x, y, theta), at points `step` (m) apart.
+    """Return the next `distance` metres from a pose (x, y, theta), at points `step` (m) apart.
 
-    `curves` are the boundaries by label, as far as they are known. SettingsError is raised where a length is
-    out of its range.
+    `curves` are the known boundaries by label. SettingsError where a length is out of its range.
     """
     check_length("step", step)
     if not 0.0 < distance < np.inf:
@@ -165,10 +162,7 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
 
 
 def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Return the positions and two derivatives (n, 2) of a cubic from an end (2,) through points (k, 2).
-
-    It begins with the slope of the curve (2,), and has the slopes of Catmull and Rom at the points.
-    """
+    """Return positions and two derivatives (n, 2) of a Catmull-Rom cubic from an end (2,) through points."""
     nodes = np.concatenate([end[None], points])
     edges = np.diff(nodes, axis=0)
     lengths = np.hypot(edges[:, 0], edges[:, 1])

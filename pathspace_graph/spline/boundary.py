@@ -189,19 +189,17 @@ class Boundary:
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
         """Extend the curve through targets (k, 2) at parameters (k,); return its control points (n', 2).
 
-        Knots are appended until the domain holds the last parameter, the new `confirmed_end`; old basis
-        functions stay. The control points that act only beyond the last cone before are placed again: the
-        direction at the end was a guess.
+        Knots are appended until the domain holds the last parameter, the new `confirmed_end`. Control points
+        that act only beyond the last cone before are placed again: the direction at the end was a guess.
         """
         before = int(np.searchsorted(self.cone_parameters, self.confirmed_end - ROUND_OFF))
         from_u = self.cone_parameters[before - 1] if before else self.confirmed_end
         return self.extend(len(control_points), targets_u, from_u).place(control_points, targets)
 
     def extend(self, old: int, targets_u: Array, from_u: float | None = None) -> Placement:
-        """Extend a curve of `old` control points to targets at parameters (k,), as `grow` does.
+        """Extend a curve of `old` control points to targets at parameters (k,); return how to place them.
 
-        The curve is placed anew from `from_u` on, by default from its confirmed end on; its end stays where
-        it is. Returns how the control points are to be placed.
+        It is placed anew from `from_u` on, by default from its confirmed end on; its end stays where it is.
         """
         spacing = self.settings.spacing
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
@@ -287,10 +285,8 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
 
 NO_PATH: Final = np.zeros((0, 2))
 PATH_STEP: Final = 1.0  # step at which a driven path is looked at for crossings with itself (m)
-LEVEL_SINE: Final = 0.7
-"""Least sine of the angle of a level crossing: laps over the same road meet at smaller ones."""
-LEVEL_CROSSING: Final = 8.0
-"""Largest distance of the crossing boundaries from where the driven path crosses itself there (m)."""
+LEVEL_SINE: Final = 0.7  # of the angle of a level crossing, at least: laps over one road meet at less
+LEVEL_CROSSING: Final = 8.0  # largest distance of crossing boundaries from that of the path (m)
 
 
 def sampled(spline: BSpline, step: float) -> Array:
@@ -318,10 +314,7 @@ def at_level_crossing(points: Array, path: Array) -> BoolArray:
 
 
 def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
-    """Return the points (k, 2) where segments of the polyline a (n, 2) cross those of the polyline b (m, 2).
-
-    Only those count whose angle has at least this sine.
-    """
+    """Return the points (k, 2) where two polylines cross at an angle of at least this sine."""
     middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
     reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
     near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)

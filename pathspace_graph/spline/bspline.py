@@ -19,13 +19,11 @@ from pathspace_graph.factors.bspline import (
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
 
-_PERIODIC_TOLERANCE: Final = 1e-9
-"""Largest difference of repeated values of a periodic spline, over (1 + largest value)."""
+_PERIODIC_TOLERANCE: Final = 1e-9  # of repeated values, over (1 + the largest)
 _GRID_PER_SPAN: Final = 8  # grid points on each span of a foot-point search over the whole curve
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
 _ARC_NEWTON_STEPS: Final = 4  # Newton steps that invert the arc length, from a table with the same grid
-_SHORTEST_EXTENSION: Final = 1e-3
-"""Least knot interval of an extension over the mean one, even if the point is the old end."""
+_SHORTEST_EXTENSION: Final = 1e-3  # knot interval over the mean one, where the point is the end
 
 
 @dataclass(frozen=True, eq=False, repr=False)

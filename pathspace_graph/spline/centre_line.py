@@ -20,8 +20,7 @@ from pathspace_graph.spline.bspline import BSpline, side_of
 
 SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line on which the edge of each label is
 SAMPLE_STEP: Final = 0.5  # distance of the samples of boundaries, of lines, and of edges that are fitted (m)
-_EDGE_BREAKS: Final = 2
-"""Knot intervals of an edge for each one of the ribbon, since it is no B-spline itself."""
+_EDGE_BREAKS: Final = 2  # knot intervals of an edge for each of the ribbon: it is no B-spline itself
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -88,21 +87,17 @@ class Ribbon(BSpline):
 
 # --- the line between two boundaries ---------------------------------------------------------------------
 
-SPACING: Final = 3.0
-"""Distance of the knots of a planner's line (m); shorter kinks of the boundaries are smoothed."""
+SPACING: Final = 3.0  # of the knots of a planner's line (m); shorter kinks are smoothed
 MOST_SAMPLES: Final = 200_000  # largest number of samples of a boundary, which bounds the memory
 _FEWEST: Final = 4  # smallest number of samples of a boundary and of knot intervals of a line
 _STARTS: Final = 200  # number of samples of the left boundary among which the march begins
 _NEAR: Final = 12  # distance in samples from a pair within which segments are tested for a crossing
-_ROUNDS: Final = 3
-"""Number of times that the line is moved to the middle between the crossings of its normals."""
-_SMOOTHNESS: Final = 1e-3
-"""Weight of second differences in the fit, which decides only what the samples leave open."""
+_ROUNDS: Final = 3  # moves of the line to the middle between the crossings of its normals
+_SMOOTHNESS: Final = 1e-3  # weight of second differences, for what the samples leave open
 _CROSSING_STEPS: Final = 8  # number of Newton steps to the crossing of a normal and a boundary
 _CROSSED: Final = 1e-6  # distance of the point found from a boundary below which a normal crosses it (m)
 _LEAST_COSINE: Final = 0.1  # least cosine of the angle between boundary and line at a crossing
-_FARTHEST: Final = 1.5
-"""Distance of a crossing, over that of the paired sample, beyond which it belongs to another stretch."""
+_FARTHEST: Final = 1.5  # of a crossing over the paired sample; beyond, it is of another stretch
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,7 @@ from pathspace_graph.spline.bspline import BSpline
 
 _SAMPLES_PER_BREAK: Final = 40  # equally spaced samples of the curvature for each requested break
 _SAMPLES_PER_SPAN: Final = 8  # least-squares samples of a refit on each span: enough for any degree up to 7
-_BRIDGE: Final = 1e-3
-"""Weight of second derivatives beside the samples of a refit, on spans that have too few samples."""
+_BRIDGE: Final = 1e-3  # weight of second derivatives on spans with too few samples of a refit
 _BENDING_PER_SPAN: Final = 3  # places on each such span at which the second derivative is taken
 
 
@@ -204,12 +203,9 @@ def energy_rows(spline: BSpline) -> Array:
 # --- knots where cones ask for them ----------------------------------------------------------------------
 
 
-EVEN: Final = 1e-9
-"""Weight of the square of the interval (m^2) that a removal leaves against its cost (m^2), for ties."""
-MARGIN: Final = 0.1
-"""Least share by which the sum of squares of a smaller curve must be smaller for it to be chosen."""
-COINCIDENT: Final = 1e-9
-"""Largest difference of parameters of cones that share one knot (m); the cost of a second would be 0 / 0."""
+EVEN: Final = 1e-9  # weight of the square of the interval left by a removal against its cost, for ties
+MARGIN: Final = 0.1  # least share by which a smaller curve's sum of squares must be smaller
+COINCIDENT: Final = 1e-9  # difference of parameters of cones that share one knot (m), lest 0 / 0
 
 
 @dataclass(frozen=True, eq=False)
