@@ -1,7 +1,5 @@
 """What a command prints: results on standard output, hints and the progress of long work on the other."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -63,7 +61,7 @@ def _print(console: Console, lines: tuple[str, ...]) -> None:
 
 
 @contextmanager
-def progress(description: str, total: int | None = None, lines: int = 0) -> Iterator[Steps]:
+def progress(description: str, total: int | None = None, lines: int = 0) -> "Iterator[Steps]":
     """Show a bar on a terminal, or a spinner where the total isn't known, and yield what counts the steps.
 
     Without a terminal nothing is shown, unless `lines` asks for about that many lines over the whole work.

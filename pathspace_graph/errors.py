@@ -1,13 +1,11 @@
 """The few exceptions of this library; the command line turns each into one line and exit code 2 or 3."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from math import inf
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 
 class PathspaceError(Exception):
@@ -48,11 +46,11 @@ class ReadingError(PathspaceError):
         value = f"{found:g}" if isinstance(found, float) else str(found)
         super().__init__(f"{when}{where}: expected {expected}, found {value}")
 
-    def at(self, t: float) -> ReadingError:
+    def at(self, t: float) -> Self:
         """Return the same error of the cycle with this stamp (s)."""
         return type(self)(self.field, self.expected, self.found, self.row, t)
 
-    def __reduce__(self) -> tuple[type[ReadingError], tuple[object, ...]]:
+    def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
         """Return how to make the error again: it comes back from worker processes."""
         return type(self), (self.field, self.expected, self.found, self.row, self.t)
 

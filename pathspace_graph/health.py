@@ -68,7 +68,6 @@ class HealthMonitor:
         self._wrong: int | None = None  # this boundary is wrong, as long as it explains too little
 
     def restart(self) -> None:
-        """Forget the evidence so far, because the map or the pose was replaced."""
         self._recent.clear()
         self._offered, self._last_offered, self._wrong = 0, None, None
 
@@ -167,7 +166,6 @@ class Stretch:
 
 
 def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
-    """Return the stretches of a run that were not good, from the stamps and the health of its cycles."""
     found = []
     for condition, group in groupby(zip(t, healths, strict=True), key=lambda cycle: cycle[1].condition):
         cycles = list(group)

@@ -252,7 +252,6 @@ def timed_wait(estimator: OnlineEstimator) -> float:
 def timed_update(
     estimator: OnlineEstimator, odometry: Odometry, detections: Detections
 ) -> tuple[CycleResult, float, float]:
-    """Do one update; return the estimate, and the wall time and the thread's processor time (s) of it."""
     begin, worked = time.perf_counter(), time.thread_time()
     estimate = estimator.update(odometry, detections)
     return estimate, time.perf_counter() - begin, time.thread_time() - worked

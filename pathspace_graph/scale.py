@@ -166,7 +166,6 @@ class FrontDoor:
 
 
 def noise_at(noise: Array | KnownNoise | None, scale: float) -> Array | KnownNoise | None:
-    """Return the noise of an estimator's odometry as it is at scale 1."""
     if noise is None or isinstance(noise, KnownNoise):
         return scaled(noise, 1.0 / scale)
     try:
@@ -176,7 +175,6 @@ def noise_at(noise: Array | KnownNoise | None, scale: float) -> Array | KnownNoi
 
 
 def in_scene(error: ReadingError, scale: float) -> ReadingError:
-    """Return an error of a cycle at scale 1 with the lengths of the scene."""
     expected, found = times(error.expected, 1, scale), error.found
     if expected != error.expected and isinstance(found, float):
         found = found * scale

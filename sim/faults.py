@@ -107,7 +107,6 @@ class Faults:
 
 
 def time_at(driven: Drive, distance: float) -> float:
-    """Return the stamp (s) at which the vehicle has driven so far (m); it is infinite if it never has."""
     reached = np.flatnonzero(arc_lengths(driven.poses[:, :2]) >= distance)
     return float(driven.t[reached[0]]) if len(reached) else np.inf
 

@@ -44,7 +44,6 @@ class Track:
 
     @property
     def cones(self) -> FloatArray:
-        """All cones (M, 2) in m: left, right, other."""
         return np.vstack([self.left, self.right, self.other])
 
     @property

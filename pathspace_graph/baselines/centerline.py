@@ -233,7 +233,6 @@ def _with_width(terms: Terms, weights: Array) -> Terms:
 
 
 def ribbon_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ribbon: Ribbon) -> Array:
-    """Return the joint covariance (3m, 3m) of the control points, all other variables marginalized out."""
     keys = np.array(ribbon_keys(ribbon))
     marginal = sparse_marginal(graph.linearize(values), keys)
     information, _ = marginal.hessian(gtsam.Ordering(keys.tolist()))
@@ -258,18 +257,9 @@ class CenterlineBatch:
 
     def solve(self, log: Log) -> BatchRun:
         start = self._boundaries.solve(log)
-        run = BatchRun(
-            estimator=NAME,
-            settings=settings_dict(self.settings),
-            map=start.map,
-            trajectory_t=start.trajectory_t,
-            trajectory=start.trajectory,
-            cycles=start.cycles,
-            laps=start.laps,
-            converged=start.converged,
-            cost=start.cost,
-            noise=start.noise,
-        )
+        names = ("map", "trajectory_t", "trajectory", "cycles", "laps", "converged", "cost", "noise")
+        shared = {name: getattr(start, name) for name in names}
+        run = BatchRun(estimator=NAME, settings=settings_dict(self.settings), **shared)
         with threadpool_limits(limits=1), solving("the batch"):
             try:
                 return self._optimized(start, run)

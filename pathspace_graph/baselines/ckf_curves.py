@@ -12,20 +12,9 @@ from pathspace_graph.factors.se2 import rotated, rotation, to_map
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping import path
 from pathspace_graph.mapping.belief import Belief, point_columns
-from pathspace_graph.mapping.path import (
-    CARRIED_TO,
-    END_BEHIND,
-    MIN_CARRY,
-    MIN_LATERAL,
-    SIDES,
-    STATION_MARGIN,
-    STRANDED,
-    Candidates,
-    End,
-    PathAhead,
-    chain,
-)
+from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.settings.batch import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -69,7 +58,6 @@ class CurveState:
         return self.belief.covariance[np.ix_(columns, columns)]
 
     def spline(self, label: int) -> BSpline:
-        """Return a curve with its current control points."""
         return self.curves[label].with_points(self.control_points(label).copy())
 
     def foot_points(self, label: int, points: Array, low: Array, high: Array) -> FootPoints:
@@ -141,7 +129,6 @@ class CurveState:
         self.belief.reorder(np.insert(order, end - added, np.arange(count - added, count)))
 
     def replace(self, label: int, curve: BSpline, matrix: Array, sigma: float) -> None:
-        """Replace a curve by one with `matrix` (k, n) times its control points, plus noise of sigma (m)."""
         start = self.offset(label)
         stop = start + self.curves[label].size
         self.belief.transform_points(start, stop, matrix, np.full(len(matrix), sigma))
@@ -238,7 +225,7 @@ class Expansion:
         high, control_points = state.curves[label].domain[1], state.control_points(label)
         low, _ = state.visible_range(label, len(found.points))
         foot = state.foot_points(label, found.points, np.minimum(low, high), np.full(len(low), high))
-        ahead = found.stations > end.station + STATION_MARGIN
+        ahead = found.stations > end.station + path.STATION_MARGIN
         return ahead & beyond_end(found.points, foot.u, high, control_points, self.settings.ckf)
 
     def _extend(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> bool:
@@ -265,12 +252,12 @@ class Expansion:
         """Extend a curve whose end the vehicle has passed beside the path, nearly as far as the vehicle."""
         settings = self.settings.growth
         end = _end(state, label, path_ahead, END_BEHIND)
-        if end.station >= path_ahead.driven - STRANDED:
+        if end.station >= path_ahead.driven - path.STRANDED:
             return False
-        side = SIDES[label] * max(end.side, MIN_LATERAL)
-        point = path_ahead.beside(path_ahead.driven - CARRIED_TO, side)
+        side = SIDES[label] * max(end.side, path.MIN_LATERAL)
+        point = path_ahead.beside(path_ahead.driven - path.CARRIED_TO, side)
         distance = float(np.hypot(*(point - end.position)))
-        if not MIN_CARRY <= distance <= settings.max_unseen - self._carried[label]:
+        if not path.MIN_CARRY <= distance <= settings.max_unseen - self._carried[label]:
             return False
         self._carried[label] += distance
         point_vehicle = (point - state.pose[:2]) @ rotation(state.pose[2])

@@ -39,7 +39,6 @@ class OnCurve:
     distances: Array  # (m,) squared Mahalanobis distances across the curve
 
     def where(self, chosen: BoolArray) -> "OnCurve":
-        """Return the detections whose entry in `chosen` (m,) is set."""
         return OnCurve(self.rows[chosen], self.basis[chosen], self.tangents[chosen], self.distances[chosen])
 
 

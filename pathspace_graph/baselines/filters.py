@@ -1,5 +1,6 @@
 """The paper's filters: that of splines, which closes its loop, and its landmark baseline (paper: Results)."""
 
+from abc import abstractmethod
 from dataclasses import replace
 from typing import Final
 
@@ -67,6 +68,26 @@ class _Filter:
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
         """State `x = [pose | calibration | control points or landmarks]`."""
 
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        """Process one perception cycle: the twists since the last one, and the detections of now."""
+        watch = Stopwatch()
+        cycle = self.front_end.admit(odometry, detections)
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
+        self.belief.follow(reading.motion)
+        self._locate(reading.motion)
+        detections = self.belief.corrected(reading.detections)
+        watch.lap("predict")
+        used, sizes, closed = self._use(detections, watch)
+        pose = self.belief.pose.copy()
+        return cycle.counted(CycleResult(detections.t, pose, sizes, used, closed, watch.laps))
+
+    def _locate(self, motion: MeasuredMotion) -> None:
+        """Take the newest pose into account."""
+
+    @abstractmethod
+    def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
+        """Map a cycle; return how many detections were used, the sizes, and whether the loop has closed."""
+
     def noise_used(self) -> RunNoise:
         return self.front_end.noise_used
 
@@ -89,13 +110,7 @@ class CkfMapper(_Filter):
         self._recent: list[tuple[Array, Detections]] = []
         self._last_check = 0.0
 
-    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        watch = Stopwatch()
-        cycle = self.front_end.admit(odometry, detections)
-        reading = self.front_end.update(cycle.odometry, cycle.detections)
-        self._predict(reading.motion)
-        detections = self.state.belief.corrected(reading.detections)
-        watch.lap("predict")
+    def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
         found = classify(self.state, detections)
         watch.lap("classify")
         found = self._expand(detections, found)
@@ -104,11 +119,10 @@ class CkfMapper(_Filter):
         watch.lap("update")
         self._close(detections)
         watch.lap("close")
-        used = sum(len(on.rows) for on in found.values())
-        return cycle.counted(self._result(detections.t, used, watch.laps))
+        sizes = [self.state.curves[label].size if label in self.state.curves else 0 for label in BOUNDARIES]
+        return sum(len(on.rows) for on in found.values()), (sizes[LEFT], sizes[RIGHT]), self.closed
 
-    def _predict(self, motion: MeasuredMotion) -> None:
-        self.state.belief.follow(motion)
+    def _locate(self, motion: MeasuredMotion) -> None:
         self.state.locate_vehicle()
         self.path.update(self.state.pose.copy())
         self.path.steer(motion.twists)
@@ -140,11 +154,6 @@ class CkfMapper(_Filter):
         if motion is not None and update_by_correspondences(state, motion):
             simplify(state, self.expansion.observed)
             self.closed = True
-
-    def _result(self, t: float, used: int, stages: dict[str, float]) -> CycleResult:
-        curves = self.state.curves
-        left, right = (curves[label].size if label in curves else 0 for label in (LEFT, RIGHT))
-        return CycleResult(t, self.state.pose.copy(), (left, right), used, self.closed, stages)
 
     def map(self) -> Map:
         state = self.state
@@ -265,23 +274,14 @@ class LandmarkCkf(_Filter):
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """Tracks by label that are not landmarks yet."""
 
-    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        watch = Stopwatch()
-        cycle = self.front_end.admit(odometry, detections)
-        reading = self.front_end.update(cycle.odometry, cycle.detections)
-        self.belief.follow(reading.motion)
-        detections = self.belief.corrected(reading.detections)
-        watch.lap("predict")
+    def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
         found = self._associate(detections)
         watch.lap("associate")
         self._update(detections, found.landmark)
         watch.lap("update")
         self._create(detections, found.new)
         watch.lap("create")
-        used, sizes = int((found.landmark != UNASSOCIATED).sum()), landmark_counts(self.labels)
-        return cycle.counted(
-            CycleResult(detections.t, self.belief.pose.copy(), sizes, used, False, watch.laps)
-        )
+        return int((found.landmark != UNASSOCIATED).sum()), landmark_counts(self.labels), False
 
     def _associate(self, detections: Detections) -> Association:
         points = to_map(detections.points_vehicle, self.belief.pose[None])

@@ -13,7 +13,6 @@ from scipy.optimize import linear_sum_assignment
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
-from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.labels import UNKNOWN
@@ -105,7 +104,7 @@ def associate_newest(
     """
     detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings.landmark
     rows = np.arange(new.start, new.stop)
-    points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
+    points = detections.points_map(rows, smoother.variables)
     near = nearest_within(state.landmarks, points, ROUGH)[1]
     landmarks = np.flatnonzero(near & eligible)
     gates, numbers = Gates.of(settings), state.numbers[landmarks]

@@ -18,7 +18,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, huber_loss
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.residuals import landmark_residuals
-from pathspace_graph.factors.se2 import rotated, to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph, owners
@@ -66,7 +66,6 @@ class LandmarkBatch:
         self.noise = known_noise(odometry_sigma)
 
     def solve(self, log: Log) -> BatchRun:
-        """Solve a log: associate, optimize, merge and remove landmarks, until the associations stay."""
         with threadpool_limits(limits=1), solving("the batch"):
             return self._solve(log)
 
@@ -82,10 +81,10 @@ class LandmarkBatch:
         return self._result(system, state, converged)
 
     def _refresh(self, system: "LandmarkSystem", state: LandmarkState) -> int:
-        detections, problem = system.detections, system.eliminated(state)
-        before, known = detections.landmark.copy(), len(state)
-        Reassociation(state, detections, problem, self.settings, system.chain.stamps).run()
-        gone, kept = find_duplicates(state, known, problem.joint, self.settings)
+        detections, before, known = system.detections, system.detections.landmark.copy(), len(state)
+        again = Reassociation(state, system, self.settings)
+        again.run()
+        gone, kept = find_duplicates(state, known, again.problem.joint, self.settings)
         detections.merge(state.numbers[gone], state.numbers[kept])
         remove_rare(state, detections, self.settings.growth.sightings)
         return int((before != detections.landmark).sum())
@@ -136,12 +135,10 @@ class LandmarkSystem:
         return half_square(drive) + float(losses.sum())
 
     def rows(self, state: LandmarkState) -> list[Rows]:
-        """Return the Gauss-Newton rows at a state, where each row of a detection has its Huber weight."""
         drive = self.chain.rows_at(state.variables, self.settings.calibration)
         return [*drive, self._detection_rows(state, self.settings.gate.huber)]
 
     def eliminated(self, state: LandmarkState) -> Elimination:
-        """Return the linear problem at a state, with the poses eliminated."""
         return Elimination(linear_graph(self.rows(state), state.variables), state.variables.layout)
 
     def _detection_rows(self, state: LandmarkState, huber: float) -> Rows:
@@ -201,21 +198,13 @@ def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[L
 class Reassociation:
     """Repeats the Hungarian assignment of every cycle, and creates landmarks from unassociated detections."""
 
-    def __init__(
-        self,
-        state: LandmarkState,
-        detections: LandmarkDetections,
-        problem: Elimination,
-        settings: MapperSettings,
-        stamps: Array,
-    ) -> None:
-        self.state, self.detections, self.problem = state, detections, problem
-        self.settings, self.stamps = settings, stamps
+    def __init__(self, state: LandmarkState, system: LandmarkSystem, settings: MapperSettings) -> None:
+        self.state, self.detections, self.settings = state, system.detections, settings
+        self.problem, self.stamps = system.eliminated(state), system.chain.stamps
         self.gates = Gates.of(settings.landmark)
-        self.points_map = to_map(detections.point, state.variables.poses_at(detections.cycle))
+        self.points_map = self.detections.points_map(slice(None), state.variables)
 
     def run(self) -> None:
-        """Set the landmark of every detection, and add new landmarks to the state."""
         detections = self.detections
         rows, landmarks, distances = self._nearby_pairs()
         cost = self._costs(rows, landmarks)
@@ -271,8 +260,7 @@ class Reassociation:
         """Return the tracks (k, 2) with enough of these detections, map frame; a batch forgets none."""
         detections = self.detections
         tentative = TentativeTracks(replace(self.settings.growth, forget_after=np.inf))
-        poses = self.state.variables.poses_at(detections.cycle[rows])
-        covariances = rotated(detections.covariance[rows], poses[:, 2])
+        covariances = detections.covariances_map(rows, self.state.variables)
         found = [np.zeros((0, POINT))]
         for cycle in np.unique(detections.cycle[rows]):
             now = detections.cycle[rows] == cycle
@@ -321,8 +309,6 @@ def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: in
 
 @dataclass(frozen=True, eq=False)
 class LandmarkSolution:
-    """The optimum of a landmark batch with oracle associations."""
-
     trajectory_t: Array  # (n,) stamps of the perception cycles, in s
     trajectory: Array  # (n, 3) smoothed poses (x, y, theta) in m and rad, map frame; theta is not wrapped
     landmark_ids: Ints  # (m,) the associations' numbers of all landmarks that were detected, ascending

@@ -13,7 +13,6 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import chi2_quantile
-from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import FrontEnd, at_nearest_pose
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import POINT
@@ -122,9 +121,8 @@ class LandmarkFixedLag:
         free = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
         for label, tentative in self.tentative.items():
             rows = free[detections.label[free] == label]
-            poses = self.smoother.variables.poses_at(detections.cycle[rows])
-            covariances = rotated(detections.covariance[rows], poses[:, 2])
-            tentative.add(to_map(detections.point[rows], poses), covariances, t)
+            points, variables = detections.points_map(rows, self.smoother.variables), self.smoother.variables
+            tentative.add(points, detections.covariances_map(rows, variables), t)
             confirmed = tentative.confirmed()
             if len(confirmed):
                 self._add_landmarks(label, tentative.points[confirmed].copy())
@@ -137,7 +135,7 @@ class LandmarkFixedLag:
         detections, state = self.smoother.map.detections, self.smoother.map.state
         rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
         cycles = detections.cycle[rows]
-        points_map = to_map(detections.point[rows], self.smoother.variables.poses_at(cycles))
+        points_map = detections.points_map(rows, self.smoother.variables)
         chosen, landmark = associate_created(points_map, cycles, points, self.settings.growth)
         held, landmark = np.unique(landmark, return_inverse=True)
         numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
@@ -201,7 +199,7 @@ class LandmarkFixedLag:
         table, state = self.smoother.map.detections, self.smoother.map.state
         rows = np.flatnonzero(table.cycle == self.smoother.next_cycle - 1)
         used = table.used[rows]
-        points = to_map(table.point[rows], self.smoother.variables.poses_at(table.cycle[rows]))
+        points = table.points_map(rows, self.smoother.variables)
         feet = np.full(points.shape, np.nan)
         feet[used] = state.landmarks[state.positions(table.landmark[rows[used]])]
         return Readings(points, table.label[rows], used, feet)

@@ -95,7 +95,6 @@ class LandmarkDetections(DetectionColumns):
 
     @property
     def used(self) -> BoolArray:
-        """Return (m,) whether each detection has a landmark, and so is a row of the graph."""
         return self.landmark >= 0
 
     def _clear_associations(self) -> None:
@@ -157,7 +156,6 @@ class LandmarkMap:
         return self.loop_pairs
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """Return no rows, since the detections alone hold the landmarks."""
         return []
 
     def linear_gauge(self, whole: bool) -> list[Rows]:

@@ -45,6 +45,9 @@ class Points:
     def where(self, chosen: BoolArray) -> "Points":
         return Points(self.points[chosen], self.covariances[chosen], self.labels[chosen])
 
+    def equals(self, other: "Points") -> bool:
+        return np.array_equal(self.points, other.points) and np.array_equal(self.labels, other.labels)
+
 
 def header_of(message: Any) -> Any:
     """Return the header of a message, of the first point of an array of markers, or None."""

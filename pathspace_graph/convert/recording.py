@@ -169,10 +169,7 @@ def _cycles(
             notes[OUTSIDE] += 1
             continue
         scans = found.setdefault(float(t[index]), [])
-        if any(
-            np.array_equal(scan.points, points.points) and np.array_equal(scan.labels, points.labels)
-            for scan in scans
-        ):
+        if any(map(points.equals, scans)):
             notes["messages with detections were repetitions, and were left out"] += 1
             continue
         notes[SHARED_STAMP] += bool(scans)
@@ -192,7 +189,6 @@ def join(scans: list[Points]) -> Points:
 
 
 def usable(points: Points, notes: Counter[str]) -> Points:
-    """Return the points that are finite and in the range of the format."""
     finite = np.asarray(np.isfinite(points.points).all(axis=1))
     inside = ~finite | (np.abs(points.points) <= MAX_RANGE).all(axis=1)
     notes["detections that are not finite were left out"] += int((~finite).sum())

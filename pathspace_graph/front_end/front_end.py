@@ -99,16 +99,10 @@ class FrontEnd:
         # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
         if not (self._sensor_doubted or noise.of_detections):
             self._sensor_doubted = self._motion.errors.contradict(self._settings.calibration)
-        return Reading(
-            motion,
-            judged,
-            self._motion.seen_again,
-            noise.for_map(orange),
-            detections.covariances,
-            self._sensor_doubted,
-            self._measured(odometry, replace(detections, labels=labels), motion),
-            notice="; ".join(notices),
-        )
+        orange, seen, stated = noise.for_map(orange), self._motion.seen_again, detections.covariances
+        measured = self._measured(odometry, replace(detections, labels=labels), motion)
+        doubted = self._sensor_doubted
+        return Reading(motion, judged, seen, orange, stated, doubted, measured, "; ".join(notices))
 
     @property
     def noise_used(self) -> RunNoise:

@@ -5,11 +5,9 @@ What is left depends on range, motion and time: constant errors of the sensor sh
 derivatives, noise scatters them, and errors that stay with a cone scatter its sightings together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from scipy.optimize import nnls
@@ -67,7 +65,7 @@ class _Cones:
     points: Array
     columns: Array  # (n, 2, 6) derivatives by the sensor's errors and by the bias of the yaw rate
 
-    def without(self, off: Array) -> _Cones:
+    def without(self, off: Array) -> Self:
         """Return the sightings with ranges and derivatives where they would be without their errors (n, 2).
 
         With the noise in them weights would prefer short sightings, and errors come out too small.
@@ -316,9 +314,7 @@ class Measurement:
         self._rounds: _Rounds | None = None
 
     @classmethod
-    def of(
-        cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None
-    ) -> Measurement | None:
+    def of(cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None) -> Self | None:
         """Return a measurement; None where not even the noise of the odometry can be told."""
         white = twists.white()
         if white is None:
@@ -328,7 +324,6 @@ class Measurement:
         return cls(cycles, replace(found, odometry=sigma, interval=interval))
 
     def advance(self) -> MeasuredNoise | None:
-        """Do a step; return the noise after the last one."""
         if self._rounds is not None:
             found = self._rounds.advance()
             return None if found is None else self._passed(found)

@@ -13,20 +13,9 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, integrate_odometry
 from pathspace_graph.settings.online import MotionSettings
 
+from . import scan_matching as scans
 from .gate import Newest
-from .scan_matching import (
-    MIN_MATCHED,
-    REACHES_CHECK,
-    Difference,
-    Match,
-    RecentDetections,
-    SensorErrors,
-    by_errors,
-    match,
-    misfit_at,
-    off_prediction,
-    reaches,
-)
+from .scan_matching import REACHES_CHECK, Difference, Match, RecentDetections, SensorErrors, by_errors
 
 NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))  # of a motion that is not by odometry
 DOUBT_AGAIN: Final = 3.8  # contradiction of an odometry that was contradicted not long ago, sigmas
@@ -111,7 +100,6 @@ class MotionCheck:
 
     @property
     def newest(self) -> Newest:
-        """Stamp and twist of the last accepted cycle."""
         t, twist = self._reading
         return Newest(self._t, twist if t > -np.inf else None)
 
@@ -133,14 +121,8 @@ class MotionCheck:
         if missing or held.any():
             excess = held[:, None] * np.array(self.settings.accelerations)
         integrated = integrate_odometry(odometry, t, np.hypot(self.sigma, excess))
-        return MeasuredMotion(
-            integrated,
-            odometry.twist,
-            missing=missing,
-            stuck=_is_stuck(odometry.twist),
-            durations=np.diff(np.append(odometry.t, t)),
-            excess=excess,
-        )
+        durations, stuck = np.diff(np.append(odometry.t, t)), _is_stuck(odometry.twist)
+        return MeasuredMotion(integrated, odometry.twist, False, missing, stuck, None, durations, excess)
 
     def _at_rest(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
         standing = self._match(detections, variances, self.pose, REACHES_CHECK)
@@ -187,14 +169,14 @@ class MotionCheck:
         """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
         points, variances = detections.points_vehicle[best.is_matched], variances[best.is_matched]
         at_odometry, at_match = (
-            misfit_at(self._recent, points, variances, pose) for pose in (predicted, best.pose)
+            scans.misfit_at(self._recent, points, variances, pose) for pose in (predicted, best.pose)
         )
         return at_odometry > max(MISFIT_ODOMETRY, MISFIT_RATIO * at_match)
 
     def _best(
         self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float
     ) -> Match | None:
-        matches = [self._match(detections, variances, start, reaches()) for start in starts]
+        matches = [self._match(detections, variances, start, scans.reaches()) for start in starts]
         possible = [one for one in matches if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)
 
@@ -210,14 +192,14 @@ class MotionCheck:
     def _match(
         self, detections: Detections, variances: Array, start: Array, reaches: Sequence[float]
     ) -> Match | None:
-        matched = match(self._recent, detections.points_vehicle, variances, start, reaches)
-        return matched if matched.matched >= MIN_MATCHED and matched.is_certain else None
+        matched = scans.match(self._recent, detections.points_vehicle, variances, start, reaches)
+        return matched if matched.matched >= scans.MIN_MATCHED and matched.is_certain else None
 
     def _difference(self, odometry: IntegratedOdometry, predicted: Array, matched: Match) -> Difference:
         """Return how far the detections are from the predicted pose (3,), in the vehicle's frame."""
         known = matched.pose, matched.information, self._excess, predicted, odometry.covariance
         way = rotation(predicted[2]).T @ (predicted[:2] - self._recent.seen_from)
-        return Difference(*off_prediction(*known), self.errors.shifts(way, odometry.twist))
+        return Difference(*scans.off_prediction(*known), self.errors.shifts(way, odometry.twist))
 
     @property
     def _excess(self) -> float:
@@ -236,7 +218,8 @@ class MotionCheck:
             gyro_is_right = abs(difference.off[2]) <= near
             if gyro_is_right and not (motion.missing or motion.stuck):
                 mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
-            turn = _to_vehicle(best.pose[2])
+            turn = np.eye(3)  # from the frame of the check to the vehicle's
+            turn[:2, :2] = rotation(best.pose[2]).T
             information = turn @ best.information @ turn.T / (WIDENING**2 * self._excess)
             prior = np.linalg.inv(covariance)
             covariance = np.linalg.inv(information + prior)
@@ -265,11 +248,8 @@ class Rest:
     def update(self, odometry: Odometry, t: float) -> bool:
         """Return whether the vehicle has stood for long enough at t (s), by the newest twists."""
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
-        if (
-            len(twists) == 0
-            or twists[:, 0].min() > REST_TWIST[0] + REST_SIGMAS * self.sigma[0]
-            or not self._is_still(twists.mean(axis=0), len(twists))
-        ):
+        moves = not len(twists) or twists[:, 0].min() > REST_TWIST[0] + REST_SIGMAS * self.sigma[0]
+        if moves or not self._is_still(twists.mean(axis=0), len(twists)):
             self.end()
             return False
         if self._since is None:
@@ -280,7 +260,6 @@ class Rest:
         return self._is_still(self._sum / self._count, self._count) and t - self._since >= REST
 
     def end(self) -> None:
-        """Note that the vehicle moves."""
         self._since, self._sum, self._count = None, np.zeros(3), 0
         self._rate_sum, self._rate_count = 0.0, 0
 
@@ -314,10 +293,3 @@ def _is_stuck(twists: Array) -> bool:
     if same.sum() < STUCK:
         return False
     return bool((twists[1:][same] == twists[:-1][same]).all(axis=1).sum() >= STUCK)
-
-
-def _to_vehicle(theta: float) -> Array:
-    """Return the matrix (3, 3) that turns a small motion from the frame of the check to the vehicle's."""
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(theta).T
-    return turn

@@ -73,7 +73,6 @@ class RecentDetections:
         self.points = self._table[:, 1:3] + columns @ errors
 
     def forget(self, t: float) -> None:
-        """Drop the detections that are too old at t (s)."""
         first = int(self._table[:, 0].searchsorted(t - MEMORY, side="right"))
         self._table = self._table[first:]
         self.points = self._table[:, 1:3]
@@ -99,7 +98,6 @@ class Match:
 
     @property
     def matched(self) -> int:
-        """Number of detections that lie on earlier ones."""
         return int(self.is_matched.sum())
 
     @property
@@ -243,12 +241,10 @@ class SensorErrors:
         self._velocity = self._velocity + share * (velocity - self._velocity)
 
     def covariance_of(self, difference: Difference) -> Array:
-        """Return the covariance (3, 3) of a difference, with what is not known of the errors."""
         shifts = difference.shifts
         return np.asarray(difference.covariance + shifts @ self.covariance @ shifts.T)
 
     def square_of(self, difference: Difference) -> float:
-        """Return the square of a difference in standard deviations, by `covariance_of`."""
         return _squared(difference.off, difference.covariance, difference.shifts, self.covariance)
 
     def shifts(self, way: Array, velocity: Array) -> Array:

@@ -156,7 +156,6 @@ class Row:
     heading: float  # direction in which it leads there, rad
 
     def lead_to(self, cone: int, point: Array) -> None:
-        """Lead the row on to a cone at a point (2,)."""
         dx, dy = point - self.end
         self.cones.append(cone)
         self.end, self.heading = point, float(np.arctan2(dy, dx))

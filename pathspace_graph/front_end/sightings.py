@@ -40,18 +40,13 @@ class Sightings:
 
     @classmethod
     def none(cls) -> "Sightings":
-        empty = np.zeros(0)
-        return cls(
-            empty.astype(np.intp), empty, empty.reshape(0, 2), *(empty.reshape(0, 3) for _ in range(3))
-        )
+        return cls(np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 2)), *np.zeros((3, 0, 3)))
 
     def where(self, rows: IntArray | BoolArray | slice) -> "Sightings":
-        """Return some of the rows."""
         return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     @classmethod
     def stacked(cls, tables: "list[Sightings]") -> "Sightings":
-        """Return the rows of several tables, one after the other."""
         return cls(*(np.concatenate([getattr(one, column.name) for one in tables]) for column in fields(cls)))
 
 
@@ -70,6 +65,9 @@ def follow(cycles: Iterable[SeenCycle], known: MeasuredNoise) -> Sightings:
     return Sightings.stacked([Sightings.none(), *(follower.add(cycle) for cycle in cycles)])
 
 
+COLUMNS: Final = ("_points", "_labels", "_nearest", "_last", "_cones")  # of the cones that are followed
+
+
 class Follower:
     """Cones that were seen in the last seconds, by dead reckoning."""
 
@@ -86,31 +84,20 @@ class Follower:
         self._t = 0.0
 
     def add(self, cycle: SeenCycle) -> Sightings:
-        """Return the sightings of a cycle."""
         detections, pose = cycle.detections, cycle.pose
         self._follow_bias(detections.t, pose)
         keep = self._last > detections.t - MAX_AGE
-        self._points, self._labels, self._nearest = (
-            self._points[keep],
-            self._labels[keep],
-            self._nearest[keep],
-        )
-        self._last, self._cones = self._last[keep], self._cones[keep]
+        for name in COLUMNS:
+            setattr(self, name, getattr(self, name)[keep])
         ranges = np.hypot(*detections.points_vehicle.T)
         order = np.argsort(ranges, kind="stable")
         order = order[ranges[order] < MAX_RANGE]
         measured = detections.points_vehicle[order]
         points = to_map(self._known.corrected(measured, cycle.twist), pose[None])
         rows, cones = self._assign(points, detections.labels[order], ranges[order], pose, detections.t)
-        count = len(rows)
-        return Sightings(
-            cones,
-            np.full(count, detections.t),
-            measured[rows],
-            np.tile(cycle.twist, (count, 1)),
-            np.tile(pose, (count, 1)),
-            np.tile(self._by_bias, (count, 1)),
-        )
+        stamps = np.full(len(rows), detections.t)
+        shared = (np.tile(one, (len(rows), 1)) for one in (cycle.twist, pose, self._by_bias))
+        return Sightings(cones, stamps, measured[rows], *shared)
 
     def _follow_bias(self, t: float, pose: Array) -> None:
         """Carry the derivative of the pose by the yaw rate's bias on: `d theta = -dt`, and what follows."""
@@ -134,25 +121,18 @@ class Follower:
     ) -> tuple[IntArray, IntArray]:
         """Return which detections (m,), nearest first, are sightings, and of which cones."""
         count = len(self._cones)
+        known = self._points, self._labels, self._nearest
+        along, across = self._gates(ranges)
         place, self._points, self._nearest = _assigned(
-            points,
-            labels,
-            ranges,
-            pose[:2],
-            *self._gates(ranges),
-            self._points,
-            self._labels,
-            self._nearest,
-            FOLLOWING,
+            points, labels, ranges, pose[:2], along, across, *known, FOLLOWING
         )
         new = np.flatnonzero(place >= count)
         own, first = np.unique(place[new], return_index=True)
         first = new[first]
-        self._points = np.concatenate([self._points, points[first]])
-        self._labels = np.concatenate([self._labels, labels[first]])
-        self._nearest = np.concatenate([self._nearest, ranges[first]])
-        self._last = np.concatenate([self._last, np.full(len(first), t)])
-        self._cones = np.concatenate([self._cones, self._count + np.arange(len(own))])
+        numbers = self._count + np.arange(len(own))
+        added = points[first], labels[first], ranges[first], np.full(len(first), t), numbers
+        for name, values in zip(COLUMNS, added, strict=True):
+            setattr(self, name, np.concatenate([getattr(self, name), values]))
         self._count += len(own)
         rows = np.concatenate([np.flatnonzero((place >= 0) & (place < count)), new])
         self._last[place[rows]] = t
@@ -219,7 +199,6 @@ class TwistRecord:
         self._parts: list[Odometry] = []
 
     def add(self, odometry: Odometry) -> None:
-        """Add twists."""
         self._parts.append(odometry)
         if len(self._parts) > MOST_PARTS:
             self._parts = [Odometry(*self._newest)]

@@ -3,8 +3,6 @@
 Those rooms stand above the records and import matplotlib and pandas, so they are imported when asked for.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from typing import Any, Final

@@ -104,7 +104,6 @@ def _is_number(value: object, least: float) -> bool:
 
 
 def to_toml(sections: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the text of a header with these sections."""
     lines = [f'format = "{FORMAT}"']
     for name, entries in sections.items():
         lines += ["", f"[{name}]"]
@@ -121,7 +120,6 @@ def toml_text(value: Any) -> str:
 
 
 def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | None) -> dict[str, Any]:
-    """Return the sections about the noise; none where all of it is stated and nothing was measured."""
     if odometry and detections and measured is None:
         return {}
     rays = measured is not None and measured.along is not None

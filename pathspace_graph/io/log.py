@@ -197,7 +197,6 @@ class Log:
 
     @property
     def noise(self) -> KnownNoise:
-        """Return what is known of the noise before the drive."""
         return KnownNoise(self.odometry_sigma, self.odometry_stated, self.detections_stated, self.measured)
 
 
@@ -299,7 +298,6 @@ def cycles_of(
 
 
 def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
-    """Return covariances (m, 2, 2) from their entries (m,)."""
     return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
 
 

@@ -139,7 +139,6 @@ class Map:
 
     @property
     def size(self) -> int:
-        """Return the number of control points or landmarks on both boundaries together."""
         return sum(boundary.size for boundary in self.boundaries.values())
 
     def centre_line(self, step: float = 1.0) -> CentreLine:

@@ -144,7 +144,6 @@ class VehicleState(Brief):
 
     @property
     def sensor_sigmas(self) -> Array:
-        """Return the standard deviations (5,) of the sensor's calibration, or (0,)."""
         return np.sqrt(np.diag(self.sensor_covariance))
 
     @property

@@ -66,7 +66,6 @@ class Frame:
 
     @property
     def matrix(self) -> Array:
-        """Matrix (2, 2) that leads to the vehicle's frame."""
         return rotation(self.turn * DEGREE) @ np.diag([1.0, -1.0 if self.mirrored else 1.0])
 
 
@@ -111,7 +110,6 @@ class Verdict:
 
     @property
     def figures(self) -> dict[str, float]:
-        """The shares of the detections that lie where they are expected, as written and if it is so."""
         return {"as_written": self.share_as_written, "share": self.share}
 
 
@@ -125,8 +123,6 @@ def verdict(trial: Trial, reference: Trial) -> Verdict:
 
 
 class Trials:
-    """Trials of hypotheses on the pairs of cycles of a log."""
-
     def __init__(self, log: Log, pairs: Pairs) -> None:
         self.log, self.pairs = log, pairs
         self._poses: dict[Meaning, Array] = {}

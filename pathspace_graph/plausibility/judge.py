@@ -11,18 +11,9 @@ from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
 from pathspace_graph.scale import scale_of
 
+from . import hypotheses
 from .hint import Hint, told
-from .hypotheses import (
-    LEAST_SHARE,
-    Frame,
-    Mounting,
-    Trial,
-    Trials,
-    Verdict,
-    best_lateness,
-    mounting_of,
-    verdict,
-)
+from .hypotheses import LEAST_SHARE, Frame, Mounting, Trial, Trials, Verdict, verdict
 from .noise import noise_hints
 from .pairs import DEGREE, GAPS, Meaning, Pairs, motions, pairs_of
 
@@ -137,7 +128,6 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def one_clock(log: Log) -> list[Hint]:
-    """Return a hint where the stamps of all cycles are before or after those of the odometry."""
     if not log.cycles:
         return []
     first, last = float(log.odometry.t[0]), float(log.odometry.t[-1])
@@ -148,7 +138,6 @@ def one_clock(log: Log) -> list[Hint]:
 
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
-    """Return the log with its detections in metres, and a hint where they were not."""
     typical = _median(np.concatenate([np.zeros(0), *(np.hypot(*c.points_vehicle.T) for c in log.cycles)]))
     if typical > FARTHEST:
         fitting = [unit for unit in LENGTHS if typical * unit <= FAR] or [min(LENGTHS)]
@@ -201,7 +190,7 @@ def _by_motion(trials: Trials) -> list[Hint]:
     late, of_clocks = _late(trials, best)
     if best.share < LEAST_SHARE and late is best:
         return found + (_unexplained(trials, best) if not found else [])
-    mounting = mounting_of(trials, late.hypothesis)
+    mounting = hypotheses.mounting_of(trials, late.hypothesis)
     found += of_clocks
     if mounting is not None:
         found = _turned(found, late, mounting)
@@ -244,11 +233,8 @@ def _mended(frame: Frame) -> str:
     matrix = frame.matrix
     if np.allclose(matrix, np.round(matrix), atol=1e-9):
         signs = {1: "", -1: "-"}
-        terms = [
-            f"{signs[int(row[k])]}{'xy'[k]}"
-            for row in np.round(matrix)
-            for k in np.flatnonzero(np.round(row))
-        ]
+        rows = np.round(matrix)
+        terms = [f"{signs[int(row[k])]}{'xy'[k]}" for row in rows for k in np.flatnonzero(row)]
         return f"put {terms[0]} into column x and {terms[1]} into column y"
     mirror = "negate column y, then " if frame.mirrored else ""
     return f"{mirror}turn the detections by {_angle(frame.turn)}"
@@ -274,7 +260,7 @@ def _of_odometry(meaning: Meaning, compared: Verdict) -> list[Hint]:
 
 
 def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
-    late = best_lateness(trials, best)
+    late = hypotheses.best_lateness(trials, best)
     compared = verdict(late, best)
     if not compared.is_clear():
         return best, []
@@ -288,11 +274,8 @@ def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
     frame = best.hypothesis.frame
     if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURNED or sigma > TURNED_SIGMA):
         return found
-    hint = told(
-        "turned",
-        angle=_angle(frame.turn + yaw, 1),
-        side=", with y to the right" if frame.mirrored else "",
-    )
+    side = ", with y to the right" if frame.mirrored else ""
+    hint = told("turned", angle=_angle(frame.turn + yaw, 1), side=side)
     figure = next((one.found for one in found if one.cause == "sensor frame"), hint.found)
     others = [one for one in found if one.cause not in ("sensor frame", "y to the right")]
     return [*others, replace(hint, found=figure)]

@@ -1,10 +1,8 @@
 """Pairs of nearby cycles, and motions: cones stand still, so a right one lays detections on each other."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final, Literal, Self
 
 import numpy as np
 
@@ -60,7 +58,7 @@ class Pairs:
         total = weights.max(axis=2).sum(axis=1) + weights.max(axis=1).sum(axis=1)
         return np.asarray(total / np.maximum(self.count, 1))
 
-    def chosen(self, rows: BoolArray) -> Pairs:
+    def chosen(self, rows: BoolArray) -> Self:
         arrays = {name: value[rows] for name, value in vars(self).items() if name != "reach"}
         return replace(self, **arrays)
 
@@ -77,7 +75,6 @@ class Pairs:
 
     @property
     def count(self) -> IntArray:
-        """Number (P,) of detections of both cycles."""
         before, after = (np.isfinite(points[..., 0]).sum(axis=1) for points in (self.before, self.after))
         return np.asarray(before + after)
 
@@ -101,15 +98,9 @@ def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
     if len(first) == 0:
         return None
     points, variances = padded(full, MOST_DETECTIONS)
-    return Pairs(
-        stamps[first],
-        stamps[second],
-        points[first],
-        points[second],
-        variances[first][:, :, None] + variances[second][:, None],
-        gaps,
-        REACH * spacing,
-    )
+    both = variances[first][:, :, None] + variances[second][:, None]
+    begin, end = stamps[first], stamps[second]
+    return Pairs(begin, end, points[first], points[second], both, gaps, REACH * spacing)
 
 
 def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:

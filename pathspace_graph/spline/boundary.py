@@ -150,7 +150,6 @@ class Boundary:
         return joint_foot_points(spans, control_points, points, alone, low, high, *search)
 
     def find_anywhere(self, control_points: Array, points: Array) -> FootPoints:
-        """Search the foot points of points (m, 2) on the whole curve."""
         low, high = (np.full(len(points), end) for end in (self.tables.low, self.tables.high))
         return self.find(control_points, points, low, high)
 
@@ -176,7 +175,6 @@ class Boundary:
         return np.minimum(high, self.trusted)
 
     def evaluate(self, control_points: Array, u: Array, derivative: int = 0) -> Array:
-        """Return S(u) or a derivative of it as (m, 2)."""
         values, span = self.tables.evaluate(np.asarray(u, float), derivative)
         return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
@@ -221,7 +219,6 @@ class Boundary:
             self.observed = [*move_points(motion, np.array(self.observed))]
 
     def add_cones(self, points: Array, u: Array) -> None:
-        """Add observed cones (k, 2) that the curve has grown through, at parameters (k,) in m."""
         self.observed.extend(points)
         self.cone_parameters.extend(u.tolist())
 
@@ -254,7 +251,6 @@ class Boundary:
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
-    """Return an open boundary of one span, from parameter 0 to the spacing."""
     p = settings.degree
     knots = settings.spacing * np.arange(-p, p + 2, dtype=float)
     return Boundary(knots, False, settings, gauge)

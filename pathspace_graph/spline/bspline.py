@@ -282,25 +282,6 @@ class BSpline:
         kept = end_change_matrix(self.knots, self.degree, knots) @ self.control_points
         return BSpline(knots, np.concatenate([kept, np.reshape(point, (1, 2))]), self.degree)
 
-    def grow(self, control_points: Array, interval: float | None = None) -> "BSpline":
-        """Return the curve with control points (k, 2) appended at its floating end.
-
-        No basis function and no other control point changes. Each new point appends a knot, `interval` after
-        the last one (by default the last interval), and the domain advances by one knot. A clamped end would
-        not advance: SettingsError is raised.
-        """
-        self._refuse_periodic("grow")
-        step = self.knots[-1] - self.knots[-2] if interval is None else interval
-        if step <= 0.0:
-            raise SettingsError("a clamped end cannot grow: unclamp it first")
-        added = self.knots[-1] + step * np.arange(1, len(control_points) + 1)
-        knots = np.concatenate([self.knots, added])
-        return BSpline(knots, np.concatenate([self.control_points, control_points]), self.degree)
-
-    def reversed(self) -> "BSpline":
-        """Return the same curve in the opposite direction: S(-u) on [-high, -low]."""
-        return BSpline(-self.knots[::-1], self.control_points[::-1], self.degree, self.periodic)
-
     def covariance_at(self, u: Array, joint_covariance: Array) -> Array:
         """Return cov S(u) = B Sigma B^T (k, 2, 2), cross terms between control points included.
 

@@ -34,7 +34,6 @@ class Ribbon(BSpline):
 
     @cached_property
     def centre(self) -> BSpline:
-        """The centre line alone."""
         centre = BSpline(self.knots, self.control_points[:, :2], self.degree, self.periodic)
         centre.__dict__["tables"] = self.tables
         return centre
@@ -111,7 +110,6 @@ class CentreCurve:
 
     @property
     def size(self) -> int:
-        """Number of control points of both boundaries."""
         return self.sides[0].size + self.sides[1].size
 
     def table(self, side: int) -> Array:
@@ -131,7 +129,6 @@ class CentreCurve:
         return np.interp(u, table[:, 0], table[:, 1])
 
     def crossings(self, u: Array) -> "list[Crossing]":
-        """Return where the normals at parameters u (k,) of the line cross the left and the right boundary."""
         found = []
         for side, spline in enumerate(self.sides):
             own, at = self.table(side).T
