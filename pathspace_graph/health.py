@@ -149,9 +149,6 @@ class HealthMonitor:
         return Health(GOOD)
 
 
-# --- a whole run -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Stretch:
     """A run of cycles of one condition that is not good."""

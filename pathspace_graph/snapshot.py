@@ -129,9 +129,6 @@ def read(file: Path) -> tuple[Structure, Bytes]:
     return structure, numbers
 
 
-# --- the types -------------------------------------------------------------------------------------------
-
-
 def known_classes() -> dict[str, type]:
     """Return every class of the rooms' modules that are loaded, by its name without the package's own."""
     rooms = tuple(PACKAGE + room for room in ROOMS)
@@ -207,9 +204,6 @@ TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]
 }
 """Containers and types of other packages: how an instance is taken apart, and made of its parts."""
 _MAKERS: Final = {kind.__name__: make for kind, (_, make) in TYPES.items()}
-
-
-# --- from objects to a structure -------------------------------------------------------------------------
 
 
 class Encoder:
@@ -306,9 +300,6 @@ def _view(numbers: Bytes, node: list[Any]) -> NDArray[Any]:
     if math.prod(shape) * np.dtype(dtype).itemsize > len(numbers):
         raise ValueError(f"expected an array inside of {len(numbers)} bytes, found {shown(shape)}")
     return np.empty(shape, dtype) if 0 in shape else np.ndarray(shape, dtype, numbers, offset, strides)
-
-
-# --- from a structure to objects -------------------------------------------------------------------------
 
 
 class Decoder:

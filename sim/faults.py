@@ -115,9 +115,6 @@ def _is_within(t: FloatArray, begin: float, time: float) -> NDArray[np.bool_]:
     return np.asarray((t >= begin) & (t < begin + time))
 
 
-# --- the vehicle -----------------------------------------------------------------------------------------
-
-
 def turned_round(track: Track) -> Track:
     """Return a closed track as it is when it is driven the other way round: what was left is right."""
     if not track.closed:
@@ -135,9 +132,6 @@ def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
     kept = (s < begin) | (s >= begin + faults.put_down)
     count = int(kept.sum())
     return Drive(driven.t[:count], driven.poses[kept], driven.twists[kept])
-
-
-# --- the odometry ----------------------------------------------------------------------------------------
 
 
 def measure_odometry(
@@ -162,9 +156,6 @@ def _slipping(driven: Drive, faults: OdometryFaults) -> FloatArray:
     slips = (since < faults.slip_time) & (driven.t >= faults.slip_every)
     factors = 1.0 + faults.slip * slips[:, None] * np.array([1.0, 1.0, 0.0])
     return np.asarray(driven.twists * factors)
-
-
-# --- the sensor ------------------------------------------------------------------------------------------
 
 
 def colours(track: Track, wrong_way: bool) -> IntArray:

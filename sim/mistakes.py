@@ -42,9 +42,6 @@ def with_stamps(log: Log, odometry: float = 1.0, detections: float = 1.0) -> Log
     return replace(log, odometry=replace(log.odometry, t=log.odometry.t * odometry))
 
 
-# --- frames ----------------------------------------------------------------------------------------------
-
-
 def turned(log: Log, to_vehicle: FloatArray) -> Log:
     """Return the log with detections in a frame that a matrix (2, 2) takes to the vehicle's."""
     log = with_covariances(log, lambda covariances: to_vehicle.T @ covariances @ to_vehicle)
@@ -82,9 +79,6 @@ def bearings_as_degrees(log: Log) -> Log:
         return np.asarray(np.hypot(*points.T)[:, None] * rays)
 
     return with_points(log, wrong)
-
-
-# --- what needs the vehicle's path -----------------------------------------------------------------------
 
 
 def dead_reckoned(log: Log) -> FloatArray:

@@ -9,16 +9,8 @@ import numpy as np
 
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
-from .curves import (
-    STEP,
-    CentreLine,
-    FloatArray,
-    IntArray,
-    along_path,
-    direction,
-    fit_centre_line,
-    left_normals,
-)
+from . import curves
+from .curves import CentreLine, FloatArray, IntArray, direction, left_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +31,8 @@ class Track:
     def centre_line(self) -> CentreLine:
         """The smooth curve halfway between the boundaries, or along the path, track frame."""
         if self.path is not None:
-            return along_path(self.path, np.vstack([self.left, self.right]), self.closed)
-        return fit_centre_line(self.left, self.right, self.closed, self.start[:2])
+            return curves.along_path(self.path, np.vstack([self.left, self.right]), self.closed)
+        return curves.fit_centre_line(self.left, self.right, self.closed, self.start[:2])
 
     @property
     def cones(self) -> FloatArray:
@@ -90,7 +82,7 @@ def skidpad() -> Track:
     mirrored = np.array([1.0, -1.0])
     x = np.arange(-APPROACH, -LANE - 2.0, LANE)
     lanes = [(side * at, y) for at in x for side in (1, -1) for y in (-LANE / 2, LANE / 2)]
-    rounds = np.arange(0.0, ROUNDS * 2 * np.pi, STEP / middle)
+    rounds = np.arange(0.0, ROUNDS * 2 * np.pi, curves.STEP / middle)
     path = [
         _line(-APPROACH, 0.0),
         _circle(middle, rounds) + below,
@@ -114,7 +106,7 @@ def _circle(radius: float, angles: FloatArray) -> FloatArray:
 
 
 def _line(begin: float, end: float) -> FloatArray:
-    return np.arange(begin, end, STEP)[:, None] * [1.0, 0.0]
+    return np.arange(begin, end, curves.STEP)[:, None] * [1.0, 0.0]
 
 
 def acceleration() -> Track:

@@ -11,18 +11,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.parsing import (
-    MAX_CONES,
-    MAX_COORDINATE,
-    MAX_TRACK_BYTES,
-    MAX_TRACK_LENGTH,
-    MAX_TRACK_WIDTH,
-    Table,
-    parse_yaml,
-    read_table,
-    read_text,
-    shown,
-)
+from pathspace_graph.io import parsing as limits
+from pathspace_graph.io.parsing import Table, parse_yaml, read_table, read_text, shown
 from pathspace_graph.labels import BIG_ORANGE, POINTS, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
@@ -96,8 +86,8 @@ def _check(path: Path, track: Track) -> None:
 
 def _check_size(path: Path, row: FloatArray, name: str) -> None:
     length = float(arc_lengths(row)[-1]) if len(row) else 0.0
-    if len(row) > MAX_CONES or length > MAX_TRACK_LENGTH:
-        expected = f"expected at most {MAX_CONES} cones over {MAX_TRACK_LENGTH:g} m as {name}"
+    if len(row) > limits.MAX_CONES or length > limits.MAX_TRACK_LENGTH:
+        expected = f"expected at most {limits.MAX_CONES} cones over {limits.MAX_TRACK_LENGTH:g} m as {name}"
         raise InputError(path, f"{expected}, found {len(row)} over {length:g} m")
 
 
@@ -105,7 +95,7 @@ def _check_size(path: Path, row: FloatArray, name: str) -> None:
 
 
 def _parse_yaml(path: Path) -> Any:
-    return parse_yaml(read_text(path, "YAML", MAX_TRACK_BYTES), path)
+    return parse_yaml(read_text(path, "YAML", limits.MAX_TRACK_BYTES), path)
 
 
 def _is_pacsim(data: Any) -> bool:
@@ -194,8 +184,8 @@ def _list(path: Path, value: object, key: str) -> list[Any]:
         return []
     if not isinstance(value, list):
         raise InputError(path, f"expected a list at {key}, found {shown(value)}")
-    if len(value) > MAX_CONES:
-        raise InputError(path, f"expected at most {MAX_CONES} cones at {key}, found {len(value)}")
+    if len(value) > limits.MAX_CONES:
+        raise InputError(path, f"expected at most {limits.MAX_CONES} cones at {key}, found {len(value)}")
     return value
 
 
@@ -210,8 +200,8 @@ def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
         raise InputError(path, f"expected {size} numbers at {key}, found {shown(value)}") from None
     if not np.isfinite(vector).all():
         raise InputError(path, f"expected finite numbers at {key}, found {shown(value)}")
-    if np.abs(vector).max() > MAX_COORDINATE:
-        expected = f"expected numbers of at most {MAX_COORDINATE:g} in size at {key}"
+    if np.abs(vector).max() > limits.MAX_COORDINATE:
+        expected = f"expected numbers of at most {limits.MAX_COORDINATE:g} in size at {key}"
         raise InputError(path, f"{expected}, found {shown(value)}")
     return vector
 
@@ -229,7 +219,7 @@ def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
 
 
 def _parse_csv(path: Path) -> Table:
-    return read_table(path, (), comment="#", most=MAX_TRACK_BYTES)
+    return read_table(path, (), comment="#", most=limits.MAX_TRACK_BYTES)
 
 
 def _is_tum(table: Table) -> bool:
@@ -244,8 +234,8 @@ def _eufs(path: Path, _: Table) -> Track:
     table = read_table(path, ("tag", "x", "y"))
     tags = np.array([tag.strip().lower() for tag in table.columns["tag"]])
     points = table.stack(("x", "y"))
-    if len(points) > 2 * MAX_CONES:
-        raise InputError(path, f"expected at most {2 * MAX_CONES} cones, found {len(points)}")
+    if len(points) > 2 * limits.MAX_CONES:
+        raise InputError(path, f"expected at most {2 * limits.MAX_CONES} cones, found {len(points)}")
     left, right = (_without_duplicates(points[tags == tag]) for tag in ("blue", "yellow"))
     others = [_without_duplicates(points[tags == tag]) for tag in EUFS_OTHER]
     gate = points[tags == "big_orange"]
@@ -315,8 +305,8 @@ def _tum_circuit(path: Path) -> FloatArray:
     circuit = table.stack(TUM_COLUMNS)
     widths = circuit[:, 2:]
     table.require(np.asarray(widths.min(axis=1) > 0), "expected widths above 0")
-    widest = f"expected widths of at most {MAX_TRACK_WIDTH:g} m"
-    table.require(np.asarray(widths.max(axis=1) <= MAX_TRACK_WIDTH), widest)
+    widest = f"expected widths of at most {limits.MAX_TRACK_WIDTH:g} m"
+    table.require(np.asarray(widths.max(axis=1) <= limits.MAX_TRACK_WIDTH), widest)
     _check_size(path, circuit[:, :2], "the middle of the track")
     moved = np.asarray(np.diff(arc_lengths(circuit[:, :2])) > REPEAT_DISTANCE)
     table.require(np.append(True, moved)[: len(circuit)], "expected a point other than the one before")

@@ -12,17 +12,8 @@ from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError, check_numbers
 
-from .curves import (
-    SMOOTHING,
-    STEP,
-    FloatArray,
-    along_polyline,
-    arc_lengths,
-    curvature,
-    left_normals,
-    ring,
-    unit,
-)
+from . import curves
+from .curves import FloatArray, arc_lengths, left_normals, ring, unit
 from .track import Track
 
 MAX_ATTEMPTS: Final = 500  # two in three keep the default rules; contradicting ones fail them all
@@ -174,12 +165,12 @@ def _curve(layout: _Layout, settings: TrackGeneratorSettings, rng: Generator) ->
         pieces.append(_straight(corners[k] + direction * tangent[k], end, settings, rng))
         pieces.append(_arc(end, direction, radii[following], turns[following]))
     curve = _evenly(np.vstack(pieces))
-    return np.asarray(gaussian_filter1d(curve, SMOOTHING / STEP, axis=0, mode="wrap"))
+    return np.asarray(gaussian_filter1d(curve, curves.SMOOTHING / curves.STEP, axis=0, mode="wrap"))
 
 
 def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -> FloatArray:
     """Return samples of an arc from `begin` on, first along `direction`."""
-    angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / STEP), 1), endpoint=False)
+    angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / curves.STEP), 1), endpoint=False)
     normal = left_normals(direction) * np.sign(turn)
     forward, sideways = np.sin(np.abs(angles))[:, None], 1 - np.cos(angles)[:, None]
     return np.asarray(begin + radius * (forward * direction + sideways * normal))
@@ -190,9 +181,9 @@ def _straight(
 ) -> FloatArray:
     """Return samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
     length = float(np.linalg.norm(end - begin))
-    if length < STEP:
+    if length < curves.STEP:
         return begin[None]
-    along = np.arange(0.0, length, STEP)
+    along = np.arange(0.0, length, curves.STEP)
     direction = (end - begin) / length
     offset = _element(along, length, settings, rng)
     return begin + along[:, None] * direction + offset[:, None] * left_normals(direction)
@@ -240,7 +231,9 @@ def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
 def _evenly(points: FloatArray) -> FloatArray:
     polyline = ring(points)
     s = arc_lengths(polyline)
-    return along_polyline(np.linspace(0.0, s[-1], int(s[-1] / STEP), endpoint=False), s, polyline)
+    return curves.along_polyline(
+        np.linspace(0.0, s[-1], int(s[-1] / curves.STEP), endpoint=False), s, polyline
+    )
 
 
 def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettings) -> bool:
@@ -248,14 +241,14 @@ def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettin
     return bool(
         settings.lap_length[0] <= arc_lengths(ring(curve))[-1] <= settings.lap_length[1]
         and bend.max() * _least_radius(width, settings) <= 1
-        and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * STEP <= settings.straight_max
+        and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * curves.STEP <= settings.straight_max
         and _is_separate(curve, width + settings.separation)
     )
 
 
 def _curvature(curve: FloatArray) -> FloatArray:
     after, before = np.roll(curve, -1, axis=0), np.roll(curve, 1, axis=0)
-    return curvature((after - before) / 2, after - 2 * curve + before)
+    return curves.curvature((after - before) / 2, after - 2 * curve + before)
 
 
 def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
@@ -271,7 +264,7 @@ def _is_separate(curve: FloatArray, distance: float) -> bool:
     """Return whether samples nearer than `distance` are of one stretch, apart by less than half a circle."""
     pairs = cKDTree(curve).query_pairs(distance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
-    apart = np.minimum(apart, len(curve) - apart) * STEP
+    apart = np.minimum(apart, len(curve) - apart) * curves.STEP
     return bool((apart < np.pi * distance / 2).all())
 
 
@@ -282,7 +275,7 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     normals = left_normals(unit(along))
     crowding = 1 + CORNER_RADIUS * gaussian_filter1d(
-        np.abs(_curvature(curve)), CORNER_BLUR / STEP, mode="wrap"
+        np.abs(_curvature(curve)), CORNER_BLUR / curves.STEP, mode="wrap"
     )
     rows = [curve + side * normals * width / 2 for side in (1.0, -1.0)]
     gap = _straight_gap(rows, crowding, settings)
@@ -319,4 +312,4 @@ def _place_cones(row: FloatArray, density: FloatArray, rng: Generator) -> FloatA
     total = _cumulative(row, density)
     count = int(np.ceil(total[-1]))
     at = (np.arange(count) + rng.random()) * total[-1] / count
-    return along_polyline(at, total, ring(row))
+    return curves.along_polyline(at, total, ring(row))

@@ -1,7 +1,7 @@
 """One centre line with a width: as the batch of a log, and from the posterior of the online mapper."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import gtsam
@@ -34,7 +34,6 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, settings_dict
 from pathspace_graph.scale import at_scale, log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import SIDE, CentreCurve, Ribbon, find_line
 
 NAME: Final = "centerline"
@@ -54,37 +53,28 @@ def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: 
 
     `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.
     """
-    edges = {label: ribbon.edge_spline(label) for label in BOUNDARIES}
-    if covariance is None:
-        none = {b: _boundary(spline, NO_COVARIANCE, until.get(b)) for b, (spline, _) in edges.items()}
-        return Map(ribbon.periodic, none)
-    by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
-    joint = by_ribbon @ covariance @ by_ribbon.T
-    joint = 0.5 * (joint + joint.T)
-    boundaries, at = {}, 0
-    for label, (spline, jacobian) in edges.items():
-        block = slice(at, at := at + len(jacobian))
-        own = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
-        boundaries[label] = _boundary(spline, own, until.get(label))
-    return Map(ribbon.periodic, boundaries, joint_covariance(joint, boundaries))
+    edges, joint, at = {label: ribbon.edge_spline(label) for label in BOUNDARIES}, None, 0
+    blocks = dict.fromkeys(BOUNDARIES, NO_COVARIANCE)
+    if covariance is not None:
+        by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
+        joint = by_ribbon @ covariance @ by_ribbon.T
+        joint = 0.5 * (joint + joint.T)
+        for label, (_, jacobian) in edges.items():
+            block = slice(at, at := at + len(jacobian))
+            blocks[label] = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
+    boundaries = {
+        label: SplineBoundary(spline, blocks[label], until.get(label, spline.domain[1]))
+        for label, (spline, _) in edges.items()
+    }
+    return Map(ribbon.periodic, boundaries, None if joint is None else joint_covariance(joint, boundaries))
 
 
-def _boundary(spline: BSpline, covariance: Array, until: float | None) -> SplineBoundary:
-    return SplineBoundary(spline, covariance, spline.domain[1] if until is None else until)
+def ribbon_of(track: Map, settings: MapperSettings) -> tuple[Ribbon, Array | None, dict[int, float]]:
+    """Return the ribbon between the boundaries of a map, or raise a SettingsError.
 
-
-@dataclass(frozen=True, eq=False)
-class FittedRibbon:
-    """A ribbon that was fitted to the boundaries of a map."""
-
-    ribbon: Ribbon
-    covariance: Array | None
-    """Covariance (3m, 3m) of its control points; None where that of the map is not known."""
-    until: dict[int, float]  # parameter up to which an open edge is confirmed, by label
-
-
-def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
-    """Return the ribbon between the boundaries of a map with its covariance, or raise a SettingsError."""
+    With it come its covariance (3m, 3m), if that of the map is known, and the parameter up to which each open
+    edge is confirmed.
+    """
     curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
     P = track.covariance_of(*curves.values())
     left, right = (curve.spline for curve in curves.values())
@@ -93,8 +83,7 @@ def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
         if not left.periodic:
             end = np.array([min(curve.confirmed_until, curve.spline.domain[1])])
             until[label] = float(line.ribbon_parameters(side, end)[0])
-    covariance = None if P is None else line.by_boundaries @ P @ line.by_boundaries.T
-    return FittedRibbon(line.ribbon, covariance, until)
+    return line.ribbon, None if P is None else line.by_boundaries @ P @ line.by_boundaries.T, until
 
 
 @at_scale
@@ -136,10 +125,10 @@ class CenterlineMapper:
 
     def _edges(self, track: Map) -> Map:
         try:
-            fitted = ribbon_of(track, self.settings)
+            ribbon, covariance, until = ribbon_of(track, self.settings)
         except SettingsError:
             return track
-        edges = map_of(fitted.ribbon, fitted.covariance, self.settings.spline.sigma_shape, fitted.until)
+        edges = map_of(ribbon, covariance, self.settings.spline.sigma_shape, until)
         return replace(edges, points=track.points)
 
 

@@ -26,9 +26,6 @@ RANK: Final = 1e-9  # singular values of the gain below this share of the larges
 LEAST_BASIS: Final = 1e-3  # least sum of a control point's basis values for its update
 
 
-# --- classification --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class OnCurve:
     """The detections of a cycle that update a curve."""
@@ -84,9 +81,6 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     return OnCurve(rows, basis, foot.tangent_unit, squared).where(passes)
 
 
-# --- the fit of S_z --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class SplineMeasurement:
     """S_z on r control points, in the frame of the detections."""
@@ -137,9 +131,6 @@ def fit_detections(
 
     fitted = transform(fit, detections.ravel(), joint.reshape(2 * m, 2 * m))
     return SplineMeasurement(fitted.mean.reshape(r, 2), fitted.covariance, gain, gain @ basis, known)
-
-
-# --- the update ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,18 +16,12 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.mapping import registration
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.motion import MeasuredMotion, known_noise
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import (
-    BEGINNING,
-    BEGINNING_SHARE,
-    WINDOW,
-    Motion,
-    near_start,
-    register,
-)
+from pathspace_graph.mapping.registration import Motion, near_start
 from pathspace_graph.mapping.seam import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Stopwatch
@@ -144,7 +138,7 @@ class CkfMapper(_Filter):
         if self.closed:
             return
         self._recent.append((state.pose.copy(), detections))
-        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - WINDOW]
+        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - registration.WINDOW]
         if len(state.curves) == 0 or not near_start(self.path, state.pose, settings):
             return
         if self.path.length - self._last_check < settings.check_interval:
@@ -167,9 +161,6 @@ class CkfMapper(_Filter):
         return Map(self.closed, curves)
 
 
-# --- closing and simplification --------------------------------------------------------------------------
-
-
 def associate_early_segment(
     state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
 ) -> Motion | None:
@@ -179,7 +170,7 @@ def associate_early_segment(
     )
     covariance = state.belief.covariance[:POSE, :POSE]
     times = [detections.t for _, detections in cycles]
-    found = register(_recent(state, cycles), times, covariance, beginning, closing)
+    found = registration.register(_recent(state, cycles), times, covariance, beginning, closing)
     return None if found is None else found.motion
 
 
@@ -225,10 +216,10 @@ def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Arra
     """Return parameters (k,) near the end of a curve, and those (k,) of the points they are moved on."""
     spline = state.spline(label)
     high = spline.domain[1]
-    u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
+    u = np.arange(max(high - registration.BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
     moved = motion.apply(spline.evaluate(u))
     zero = np.zeros(len(u))
-    beginning = min(BEGINNING, BEGINNING_SHARE * high)
+    beginning = min(registration.BEGINNING, registration.BEGINNING_SHARE * high)
     foot = state.foot_points(label, moved, zero, zero + beginning)
     on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
     return u[on], foot.u[on]
@@ -250,9 +241,6 @@ def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
         matrix = refit(state.spline(label), curve, periodic.overlap.new_parameter).new_from_old
         state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
         state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
-
-
-# --- the baseline ----------------------------------------------------------------------------------------
 
 
 @at_scale

@@ -49,9 +49,6 @@ class Gates:
         return Gates(chi2_quantile(settings.match, POINT), chi2_quantile(settings.create, POINT))
 
 
-# --- the assignment --------------------------------------------------------------------------------------
-
-
 def associate(cost: Array, gates: Gates) -> Association:
     """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
@@ -89,9 +86,6 @@ def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates) -> Array:
 def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
     """Return for each pair (m, n) whether the detection has the landmark's label or an unknown one."""
     return np.asarray((labels[:, None] == landmark_labels[None]) | (labels == UNKNOWN)[:, None])
-
-
-# --- online ----------------------------------------------------------------------------------------------
 
 
 def associate_newest(
@@ -154,9 +148,6 @@ def associate_created(
     _, first = np.unique(np.column_stack([cycles[rows], nearest[rows]]), axis=0, return_index=True)
     chosen = rows[first]
     return chosen, nearest[chosen]
-
-
-# --- merging ---------------------------------------------------------------------------------------------
 
 
 def find_duplicates(

@@ -34,16 +34,8 @@ from pathspace_graph.run import settings_dict, split_odometry
 from pathspace_graph.scale import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .landmark_association import (
-    ROUGH,
-    Gates,
-    associate,
-    associate_created,
-    compatible,
-    find_duplicates,
-    hysteresis_costs,
-    squared_mahalanobis,
-)
+from . import landmark_association as association
+from .landmark_association import Gates, find_duplicates
 from .landmark_fixed_lag import LandmarkFixedLag
 from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
 
@@ -104,9 +96,6 @@ class LandmarkBatch:
             converged=converged,
             noise=system.noise,
         )
-
-
-# --- the problem -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,9 +181,6 @@ def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[L
     return replace(system, settings=online.believed, chain=chain), state
 
 
-# --- associations between two rounds ---------------------------------------------------------------------
-
-
 class Reassociation:
     """Repeats the Hungarian assignment of every cycle, and creates landmarks from unassociated detections."""
 
@@ -209,7 +195,7 @@ class Reassociation:
         rows, landmarks, distances = self._nearby_pairs()
         cost = self._costs(rows, landmarks)
         held = detections.landmark[rows] == self.state.numbers[landmarks]
-        cost = hysteresis_costs(cost, held, self.gates)
+        cost = association.hysteresis_costs(cost, held, self.gates)
         relabel(self.state, detections.label, rows, landmarks, cost, self.gates.match)
         detections.landmark[:] = UNASSOCIATED
         free = np.ones(len(detections), bool)
@@ -226,8 +212,10 @@ class Reassociation:
         candidates, j = np.unique(landmarks, return_inverse=True)
         table = np.full((len(detected), len(candidates)), np.inf)
         table[i, j] = cost
-        table[~compatible(self.detections.label[detected], self.state.labels[candidates])] = np.inf
-        found = associate(table, self.gates)
+        table[~association.compatible(self.detections.label[detected], self.state.labels[candidates])] = (
+            np.inf
+        )
+        found = association.associate(table, self.gates)
         matched = found.landmark != UNASSOCIATED
         self.detections.take(detected[matched], self.state.numbers[candidates[found.landmark[matched]]])
         free[detected] = found.new
@@ -235,7 +223,7 @@ class Reassociation:
     def _nearby_pairs(self) -> tuple[IntArray, IntArray, Array]:
         """Return the detections (k,), ascending, landmarks and distances (m) of pairs in the rough gate."""
         points, tree = KDTree(self.points_map), KDTree(self.state.landmarks)
-        pairs = points.sparse_distance_matrix(tree, ROUGH, output_type="coo_matrix")
+        pairs = points.sparse_distance_matrix(tree, association.ROUGH, output_type="coo_matrix")
         order = np.argsort(pairs.row, kind="stable")
         return pairs.row[order].astype(np.intp), pairs.col[order].astype(np.intp), pairs.data[order]
 
@@ -245,14 +233,16 @@ class Reassociation:
         r = landmark_residuals(poses, state.landmarks[landmarks], detections.point[rows])
         jacobian = np.concatenate([r.by_pose, r.by_landmark], axis=2)
         spread = predicted_covariances(self.problem, cycles, state.keys[landmarks], jacobian)
-        return squared_mahalanobis(r.residual, spread + detections.covariance[rows])
+        return association.squared_mahalanobis(r.residual, spread + detections.covariance[rows])
 
     def _create(self, free: IntArray) -> None:
         detections = self.detections
         for label in BOUNDARIES:
             rows = free[detections.label[free] == label]
             points, cycles = self._confirmed(rows), detections.cycle[rows]
-            chosen, landmark = associate_created(self.points_map[rows], cycles, points, self.settings.growth)
+            chosen, landmark = association.associate_created(
+                self.points_map[rows], cycles, points, self.settings.growth
+            )
             numbers = self.state.add(points, np.full(len(points), label, np.intp))
             detections.take(rows[chosen], numbers[landmark])
 
@@ -302,9 +292,6 @@ def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: in
     detections.landmark[np.isin(detections.landmark, state.numbers[gone])] = UNASSOCIATED
     state.variables.remove(state.keys[gone])
     state.keep(~gone)
-
-
-# --- oracle associations ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,13 +20,8 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.motion import (
-    doubt_calibrations,
-    known_noise,
-    predict,
-    smoother_settings,
-    vehicle_state,
-)
+from pathspace_graph.mapping import motion as motions
+from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
@@ -34,14 +29,8 @@ from pathspace_graph.run import CycleResult, Readings, Stopwatch
 from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .landmark_association import (
-    Gates,
-    associate_created,
-    associate_newest,
-    find_duplicates,
-    merge,
-    squared_mahalanobis,
-)
+from . import landmark_association as association
+from .landmark_association import Gates, find_duplicates, squared_mahalanobis
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 
 UNSEEN: Final = 40.0  # path (m) without a detection after which a landmark is not associated near the start
@@ -61,10 +50,10 @@ class LandmarkFixedLag:
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = settings or MapperSettings()
-        noise = known_noise(odometry_sigma)
+        noise = motions.known_noise(odometry_sigma)
         self.odometry_sigma = noise.odometry
         self.front_end = FrontEnd(self.settings, noise)
-        self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
+        self.smoother = FixedLagSmoother(motions.smoother_settings(self.settings), LandmarkMap(self.settings))
         self.smoother.window.exact = True
         self.path = DrivenPath()
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
@@ -86,7 +75,7 @@ class LandmarkFixedLag:
         new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
         self._use(new, detections.t, watch)
         if not self.closed:
-            self.believed = doubt_calibrations(
+            self.believed = motions.doubt_calibrations(
                 self.smoother, self.believed, reading.sensor_doubted, reading.measured
             )
         watch.lap("update")
@@ -109,7 +98,7 @@ class LandmarkFixedLag:
         eligible = np.ones(len(self.smoother.map.state), bool)
         if not self.closed and self._near_start():  # one detection can't tell which old landmark it shows
             eligible = ~self._old()
-        associate_newest(self.smoother, new, eligible, cycle)
+        association.associate_newest(self.smoother, new, eligible, cycle)
         watch.lap("associate")
         created = self._create(new, t)
         watch.lap("create")
@@ -136,7 +125,7 @@ class LandmarkFixedLag:
         rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
         cycles = detections.cycle[rows]
         points_map = detections.points_map(rows, self.smoother.variables)
-        chosen, landmark = associate_created(points_map, cycles, points, self.settings.growth)
+        chosen, landmark = association.associate_created(points_map, cycles, points, self.settings.growth)
         held, landmark = np.unique(landmark, return_inverse=True)
         numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
         detections.take(rows[chosen], numbers)
@@ -174,7 +163,7 @@ class LandmarkFixedLag:
         if len(gone):
             numbers = self.smoother.map.state.numbers
             np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
-            merge(self.smoother, gone, kept)
+            association.merge(self.smoother, gone, kept)
 
     def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
         detections, sizes = self.smoother.map.detections, landmark_counts(self.smoother.map.state.labels)
@@ -209,9 +198,6 @@ class LandmarkFixedLag:
 
     def vehicle_state(self) -> VehicleState:
         return vehicle_state(self.smoother)
-
-
-# --- closing ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

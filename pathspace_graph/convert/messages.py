@@ -70,9 +70,6 @@ def frame_of(message: Any, name: str = "frame_id") -> str:
     return str(frame).lstrip("/")
 
 
-# --- odometry --------------------------------------------------------------------------------------------
-
-
 def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
     """Return the twist [vx, vy, wz] (3,) of a message in m/s, m/s and rad/s, None of one with a pose alone.
 
@@ -117,9 +114,6 @@ def yaw_of(quaternion: Any) -> float:
     """Return the yaw of a quaternion with x, y, z and w (rad)."""
     x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     return float(np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
-
-
-# --- detections ------------------------------------------------------------------------------------------
 
 
 def points_of(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:

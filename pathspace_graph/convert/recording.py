@@ -15,15 +15,8 @@ import numpy as np
 from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
-from pathspace_graph.io.log import (
-    MAX_HOLD,
-    Detections,
-    Log,
-    Odometry,
-    Truth,
-    covariances_of,
-    is_positive_definite,
-)
+from pathspace_graph.io import log as logs
+from pathspace_graph.io.log import Detections, Log, Odometry, Truth, covariances_of
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .messages import Points, points_of, stamp_of, twist_of
@@ -116,9 +109,6 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
     )
 
 
-# --- odometry --------------------------------------------------------------------------------------------
-
-
 def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     t, twists, notes = record.t, record.twists, record.notes
     good = np.isfinite(t) & np.isfinite(twists).all(axis=1)
@@ -149,16 +139,13 @@ def _check_stamps(t: Array, what: str, file: Path) -> None:
         raise InputError(file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}")
 
 
-# --- detections ------------------------------------------------------------------------------------------
-
-
 def _cycles(
     record: Recording, odometry: Odometry, frames: Frames, noise: NoiseSettings, file: Path
 ) -> tuple[Detections, ...]:
     t, notes = record.scan_t, record.notes
     _check_stamps(t, "detections", file)
     notes["messages with detections were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
-    begin, end = float(odometry.t[0]), float(odometry.t[-1]) + MAX_HOLD
+    begin, end = float(odometry.t[0]), float(odometry.t[-1]) + logs.MAX_HOLD
     found: dict[float, list[Points]] = {}
     for index in np.argsort(t, kind="stable"):
         points = usable(record.scans[index], notes)
@@ -175,7 +162,9 @@ def _cycles(
         notes[SHARED_STAMP] += bool(scans)
         scans.append(points)
     if not found and notes[OUTSIDE]:
-        expected = f"expected detections in the time of the odometry, {begin:.9g} s to {end - MAX_HOLD:.9g} s"
+        expected = (
+            f"expected detections in the time of the odometry, {begin:.9g} s to {end - logs.MAX_HOLD:.9g} s"
+        )
         stamps = f"from {t.min():.9g} s to {t.max():.9g} s"
         raise InputError(file, f"{expected}, found them {stamps}: do both have the same clock?")
     if not found:
@@ -224,7 +213,7 @@ def positive_definite(covariances: Array) -> BoolArray:
     xx, yy = covariances[:, 0, 0], covariances[:, 1, 1]
     xy, yx = covariances[:, 0, 1], covariances[:, 1, 0]
     with np.errstate(over="ignore", invalid="ignore"):
-        good = np.isfinite(covariances).all(axis=(1, 2)) & is_positive_definite(xx, xy, yy)
+        good = np.isfinite(covariances).all(axis=(1, 2)) & logs.is_positive_definite(xx, xy, yy)
         good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
         good &= np.maximum(xx, yy) < MAX_RANGE**2
     return np.asarray(good)
@@ -244,8 +233,6 @@ def default_covariances(points: Array, noise: NoiseSettings) -> Array:
     xy = c * s * (along - across)
     return covariances_of(xx, xy, yy)
 
-
-# --- messages as they arrive -------------------------------------------------------------------------------
 
 MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle, the newest ones
 BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexError, OverflowError)

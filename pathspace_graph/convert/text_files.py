@@ -186,9 +186,6 @@ def _points(file: _File) -> Array:
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
 
-# --- JSON lines ------------------------------------------------------------------------------------------
-
-
 def read_json_lines(file: Path, rule: LabelRule) -> Recording:
     """Return what a file of JSON lines has of a drive, in SI units; an InputError names file and line.
 

@@ -117,9 +117,6 @@ def _read(file: Path) -> Drive:
     )
 
 
-# --- the reference ---------------------------------------------------------------------------------------
-
-
 def _reference(drive: Drive, t: Array) -> Truth:
     values = _optimum(drive)
     poses = [values.atPose2(X(index)) for index in range(len(t))]

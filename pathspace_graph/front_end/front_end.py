@@ -185,9 +185,6 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
     return cycles, twists
 
 
-# --- late cycles -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class LateDetections:
     """The detections of a late cycle as they would be seen from a pose of the window."""

@@ -48,9 +48,6 @@ FIRST_CONES: Final = 8.0  # number of cones that `FIRST_SHARE` counts as much as
 LEAST: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
 
 
-# --- errors of the sensor --------------------------------------------------------------------------------
-
-
 @dataclass(eq=False)
 class _Cones:
     """Sightings of cones seen often enough, sorted by cone, with their linear model `p + A b` in the map."""
@@ -153,9 +150,6 @@ def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
     return np.asarray(covariance @ (summed.T @ summed) @ covariance * count / max(count - 1, 1))
 
 
-# --- noise of the detections -----------------------------------------------------------------------------
-
-
 @dataclass(eq=False)
 class _Residuals:
     """What is left of far sightings about nearer ones of the same cone, after the constant errors."""
@@ -249,9 +243,6 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
         misfit = float((weights * (correlations - share * model) ** 2).sum())
         best = min(best, (misfit, share, time))
     return best[1], best[2]
-
-
-# --- all of it -------------------------------------------------------------------------------------------
 
 
 class _Rounds:

@@ -103,8 +103,6 @@ class MotionCheck:
         t, twist = self._reading
         return Newest(self._t, twist if t > -np.inf else None)
 
-    # --- the odometry ------------------------------------------------------------------------------------
-
     def _integrate(self, odometry: Odometry, t: float) -> MeasuredMotion:
         """Return the motion by odometry, whose noise grows where a twist is held for long."""
         if len(odometry.t) == 0:
@@ -131,8 +129,6 @@ class MotionCheck:
             self._rest.end()
             return motion
         return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(detections.t))
-
-    # --- the check ---------------------------------------------------------------------------------------
 
     def _checked(
         self, motion: MeasuredMotion, detections: Detections, variances: Array, may_doubt: bool

@@ -182,9 +182,6 @@ def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Arr
     return joint
 
 
-# --- JSON ------------------------------------------------------------------------------------------------
-
-
 def map_to_json(track: Map) -> dict[str, Any]:
     """Return the content of `map.json` in plain Python types, every number to full precision."""
     boundaries = {
@@ -346,9 +343,6 @@ def _is_covariance(P: Array) -> bool:
         return False
     eigenvalues = np.linalg.eigvalsh(P)
     return bool(eigenvalues[0] >= -_NEGATIVE_TOLERANCE * max(eigenvalues[-1], 0.0))
-
-
-# --- folders ---------------------------------------------------------------------------------------------
 
 
 def read_map(folder: Path | str) -> Map:

@@ -69,9 +69,6 @@ def _values(file: Path, line: str, number: int) -> list[float]:
     return values
 
 
-# --- cycles and the whole run ----------------------------------------------------------------------------
-
-
 NoiseSource = Literal["stated", "measured", "assumed"]  # by the log, by the drive, by default
 
 CYCLES_FILE: Final = "cycles.csv"

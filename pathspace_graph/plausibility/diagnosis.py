@@ -56,12 +56,15 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-# --- measured noise --------------------------------------------------------------------------------------
-
 REFERENCE: Final = 10.0  # range at which the noise of detections is told (m)
 CLEAR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is told
 WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
 """Size beyond which it is told (rad, m, s, -, m)."""
+TOLD: Final = {
+    "latency": ("stamps {:.0f} ms {}", 1e3, ("late", "early")),
+    "yaw": ("turned {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
+    "lateral": ("{:.2f} m too far to the {}", 1.0, ("left", "right")),
+}
 STAYING: Final = 0.1  # share of the variance from which errors that stay with a cone are told
 
 
@@ -96,8 +99,8 @@ def size_lines(noise: RunNoise) -> list[str]:
     if noise.size is None or noise.measured is None:
         return []
     share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
-    other = "ranges" if noise.size == "odometry" else "odometry"
-    whose = "the odometry's" if noise.size == "odometry" else "the ranges'"
+    of_odometry = "the odometry's", "ranges"
+    whose, other = of_odometry if noise.size == "odometry" else ("the ranges'", "odometry")
     advice = f"--calibration.trust {other} turns it round"
     return [f"ranges and speeds disagree by {share:.0f} %: the map's size is {whose} ({advice})"]
 
@@ -105,15 +108,12 @@ def size_lines(noise: RunNoise) -> list[str]:
 def _errors(measured: MeasuredNoise) -> list[str]:
     errors = zip(SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True)
     clear = {name: value for name, value, sigma in errors if abs(value) > max(CLEAR * sigma, WORTH[name])}
-    side = {name: "left" if value > 0.0 else "right" for name, value in clear.items()}
-    texts, ranges = [], []
-    if "latency" in clear:
-        late = "late" if clear["latency"] > 0.0 else "early"
-        texts.append(f"stamps {1e3 * abs(clear['latency']):.0f} ms {late}")
-    if "yaw" in clear:
-        texts.append(f"turned {np.rad2deg(abs(clear['yaw'])):.1f} degrees to the {side['yaw']}")
-    if "lateral" in clear:
-        texts.append(f"{abs(clear['lateral']):.2f} m too far to the {side['lateral']}")
+    texts = [
+        text.format(unit * abs(clear[name]), words[clear[name] < 0.0])
+        for name, (text, unit, words) in TOLD.items()
+        if name in clear
+    ]
+    ranges = []
     if "range_scale" in clear:
         ranges.append(f"{clear['range_scale']:+.1%}".replace("%", " %"))
     if "range_bias" in clear:

@@ -115,9 +115,6 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     return _settled(samples[LEFT], samples[RIGHT], line, pose, step, sides)
 
 
-# --- samples of the boundaries ---------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class _Samples:
     """A boundary at n places, map frame; stations count from beside the vehicle."""
@@ -181,9 +178,6 @@ def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Arra
     return position, (m + x * (2.0 * bend + 3.0 * x * twist)) / h, (2.0 * bend + 6.0 * x * twist) / h**2
 
 
-# --- the first line --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class _Line:
     points: Array
@@ -220,9 +214,6 @@ def _from_beside(line: _Line, position: Array, distance: float, step: float) -> 
     at = begin + step * np.arange(count + 1)
     x, y, u, v = (np.interp(at, lengths, values) for values in (*line.points.T, line.left, line.right))
     return _Line(np.column_stack([x, y]), u, v)
-
-
-# --- on both boundaries ----------------------------------------------------------------------------------
 
 
 def _settled(

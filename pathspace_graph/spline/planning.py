@@ -120,9 +120,6 @@ def _square(speed: float | None) -> float:
     return speed**2
 
 
-# --- the sampled centre line -----------------------------------------------------------------------------
-
-
 LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
 MOST_POINTS: Final = 200_000  # largest number of points of a line, which bounds the memory
 _FEWEST: Final = 4  # smallest number of points of a line
@@ -251,9 +248,6 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
             np.minimum.at(width, i[meet], _SHORT * np.abs(a[meet]))
             np.minimum.at(width, j[meet], _SHORT * np.abs(b[meet]))
     return [left, right]
-
-
-# --- standard deviations ---------------------------------------------------------------------------------
 
 
 def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: Array | None) -> list[Array]:
