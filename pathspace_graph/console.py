@@ -93,15 +93,11 @@ class Steps:
         if self._total is not None:
             remaining = time_remaining(time.monotonic() - self._begin, self._done, self._total)
         self._display.update(self._task, completed=self._done, total=self._total, remaining=remaining)
-        if self._is_a_line_due():
-            text = f"{self._description}: {self._done} of {self._total}, {remaining}"
-            self._display.console.print(text)
-
-    def _is_a_line_due(self) -> bool:
-        if not self._lines or not self._total or self._display.console.is_terminal:
-            return False
-        interval = -(-self._total // self._lines)
-        return self._done % interval == 0 or self._done == self._total
+        if self._lines and self._total and not self._display.console.is_terminal:
+            interval = -(-self._total // self._lines)
+            if self._done % interval == 0 or self._done == self._total:
+                text = f"{self._description}: {self._done} of {self._total}, {remaining}"
+                self._display.console.print(text)
 
 
 def time_remaining(elapsed: float, done: int, total: int) -> str:

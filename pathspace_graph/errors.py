@@ -9,17 +9,11 @@ from typing import Any, Final, Self
 
 
 class PathspaceError(Exception):
-    """Base of all errors that a user can mend.
-
-    Its text is one line that says what was expected and what was found.
-    """
+    """Base of all errors that a user can mend: one line of what was expected and what was found."""
 
 
 class InputError(PathspaceError):
-    """A missing or wrong file of a user.
-
-    The text names the file, the row (1 is the first line) and what was expected.
-    """
+    """A missing or wrong file; the text names it, the row (1 is the first line) and what was expected."""
 
     def __init__(self, file: Path | str, message: str, row: int | None = None) -> None:
         self.file = Path(file)
@@ -30,7 +24,7 @@ class InputError(PathspaceError):
 
 
 class ReadingError(PathspaceError):
-    """A perception cycle that no estimator can use; the estimator is as it was before.
+    """A perception cycle that no estimator can use, and that changes nothing.
 
     The text names the field, the row (0 is the first one), what was expected and what was found.
     """
@@ -64,10 +58,7 @@ class SettingsError(PathspaceError):
 
 
 class SolveError(PathspaceError):
-    """An estimate that cannot be computed, though nothing is wrong with the input as such.
-
-    The text says what failed; the command line's exit code is 3.
-    """
+    """An estimate that cannot be computed, though nothing is wrong with the input; exit code 3."""
 
 
 class SingularSystemError(SolveError):

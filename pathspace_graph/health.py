@@ -23,38 +23,26 @@ class Health:
 
     LENGTHS: ClassVar = {"reason": 1}
 
-    condition: str = ""
-    """Good, degraded or lost; empty for an estimator without a monitor."""
-    reason: str = ""
-    """Why the condition is not good."""
+    condition: str = ""  # good, degraded or lost; empty without a monitor
+    reason: str = ""  # why the condition is not good
 
 
 @dataclass(frozen=True)
 class Evidence:
     """What a cycle's detections say about the estimate, before they change it."""
 
-    t: float
-    """Stamp of the cycle (s)."""
-    offered: int = 0
-    """Number of coloured detections in the view of the curves."""
-    explained: int = 0
-    """Number of them on a curve of their colour."""
+    t: float  # stamp of the cycle (s)
+    offered: int = 0  # coloured detections in the view of the curves
+    explained: int = 0  # those on a curve of their colour
     used: int = 0
-    innovations: float = 0.0
-    """Sum of squared normalized innovations of those in use."""
+    innovations: float = 0.0  # sum of squared normalized innovations of those in use
     closed: bool = False
-    sigma: float = nan
-    """Standard deviation (m) of the position in its worst direction on a closed map, where it is known."""
-    offered_by: tuple[int, int] = (0, 0)
-    """Numbers of offered detections of the left and of the right boundary of a closed map."""
-    explained_by: tuple[int, int] = (0, 0)
-    """Numbers of explained ones."""
-    unmapped: tuple[int, int] = (0, 0)
-    """Numbers of other coloured detections, left and right, beside a gap of a closed map."""
-    rests: bool = False
-    """Whether the vehicle stands, and so has no need of detections."""
-    odometry: str = ""
-    """What is wrong with the odometry since the cycle before; empty where nothing is."""
+    sigma: float = nan  # of the position in its worst direction on a closed map (m)
+    offered_by: tuple[int, int] = (0, 0)  # offered detections, left and right, of a closed map
+    explained_by: tuple[int, int] = (0, 0)  # explained ones
+    unmapped: tuple[int, int] = (0, 0)  # other coloured ones beside a gap of a closed map
+    rests: bool = False  # whether the vehicle stands, and needs no detections
+    odometry: str = ""  # what is wrong with it since the cycle before
 
 
 class HealthMonitor:
@@ -154,12 +142,9 @@ class Stretch:
     """A run of cycles of one condition that is not good."""
 
     health: str
-    begin: float
-    """Stamp of its first cycle (s)."""
-    end: float
-    """Stamp of its last cycle (s)."""
-    reason: str
-    """Reason that its first cycle gives."""
+    begin: float  # stamp of its first cycle (s)
+    end: float  # stamp of its last cycle (s)
+    reason: str  # of its first cycle
 
 
 def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:

@@ -18,8 +18,7 @@ END_TOLERANCE: Final = 5.0  # largest distance before the line at which a last l
 
 
 class LapCounter:
-    """Counter of laps pose by pose: a lap ends where the start line is crossed forward after a lap's length
-    of path.
+    """Counter of laps: one ends where the start line is crossed forward after a lap's length of path.
 
     Poses are [x, y, theta] in the map frame, whose origin and x axis are the start. An online estimate may
     jump when a loop closes, so a pose just behind the line that heads forward ends the lap as well.

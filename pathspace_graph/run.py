@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import cached_property
 from math import nan
@@ -15,7 +15,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.lengths import POSE, times
 
 from .errors import check_type
@@ -58,7 +58,7 @@ class CycleResult(Brief):
 
 @runtime_checkable
 class OnlineEstimator(Protocol):
-    """Interface of every online estimator."""
+    """Interface of every online estimator; `docs/extending.md` lists methods that it may have as well."""
 
     @property
     def settings(self) -> Any:
@@ -96,37 +96,6 @@ class Readings:
     """Whether each detection (k,) was used; otherwise it was gated."""
     feet: Array
     """Foot point (k, 2) of each used detection on its curve or landmark, in m, map frame; NaN for others."""
-
-
-class OptionalMethods(Protocol):
-    """Methods that an online estimator may have as well, each of which is used where it is there."""
-
-    def outline(self) -> Map:
-        """Return a copy of the map as it stands, without covariances, which are empty (0, 0)."""
-
-    def vehicle_state(self) -> VehicleState:
-        """Return the newest pose and the calibration, with their joint covariance."""
-
-    def noise_used(self) -> RunNoise:
-        """Return the noise that is used now, and what was measured so far."""
-
-    def readings(self) -> Readings:
-        """Return the detections of the newest cycle as they were used or gated."""
-
-    def window_poses(self) -> Array:
-        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
-
-    def looked_at(self) -> AbstractContextManager[None]:
-        """Return a context in which nothing that is asked for changes the estimate."""
-
-    def wait(self) -> None:
-        """Wait for the batch whose result the next update may take, however long that takes."""
-
-    def batches(self) -> LapBatches:
-        """Return the cycles in which batches of another process have ended."""
-
-    def smoothed(self, t: Array) -> Array:
-        """Return the corrected poses (n, 3) of the cycles at stamps (n,); NaN after the last of them."""
 
 
 def scale(estimator: OnlineEstimator) -> float:

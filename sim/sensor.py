@@ -116,14 +116,6 @@ class SensorSettings:
     def range_sigmas(self, ranges: FloatArray) -> FloatArray:
         return self.range_sigma + self.range_sigma_growth * ranges
 
-    def range_biases(self, ranges: FloatArray) -> FloatArray:
-        if not self.range_bias or not self.range_bias_at:
-            return np.zeros_like(ranges)
-        return np.interp(ranges, self.range_bias_at, self.range_bias_values)
-
-    def detection_probabilities(self, ranges: FloatArray) -> FloatArray:
-        return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
-
 
 def measure_twists(
     twists: FloatArray, dt: float, noise: OdometryNoise, rng: Generator
@@ -186,10 +178,13 @@ class ConeSensor:
         labels = self._labels[cones]
         flipped = (colour < settings.wrong_colour) & np.isin(labels, BOUNDARIES)
         labels = np.where(flipped, LEFT + RIGHT - labels, labels)
-        hit = chance < settings.detection_probabilities(ranges)
+        probability = settings.detection_probability - settings.detection_falloff * ranges
+        hit = chance < np.clip(probability, 0.0, 1.0)
         overlap = np.digitize(np.abs(bearings), settings.overlap) == 1
         rows = np.stack([hit, hit & overlap & (again < settings.duplicates)])
-        ranges = (1.0 + scale) * ranges + bias + settings.range_biases(ranges)
+        biased = settings.range_bias and len(settings.range_bias_at) > 0
+        systematic = np.interp(ranges, settings.range_bias_at, settings.range_bias_values) if biased else 0.0
+        ranges = (1.0 + scale) * ranges + bias + systematic
         errors = self._errors(np.stack([first, second]), cones)
         ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]
         bearings = bearings + settings.bearing_sigma * errors[:, 1]

@@ -53,10 +53,11 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     driven = put_down(drive(track, settings.laps, settings.vehicle, wander_rng), lap, faults.vehicle)
     odometry, calibration = measure_odometry(driven, lap, settings.odometry, faults.odometry, odometry_rng)
     cycles, associations = _perceive(track, driven, settings, *sensor_rngs)
+    errors = np.array([getattr(faults.sensor, name) for name in SENSOR])
     truth = replace(
         _truth(track, driven, cycles, associations),
         calibration=calibration,
-        sensor=_constant_errors(faults.sensor),
+        sensor=errors if errors.any() else None,
         noise=_noise(settings),
     )
     log = Log(
@@ -68,12 +69,6 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
         truth=truth,
     )
     return scaled(log, settings.scale)
-
-
-def _constant_errors(faults: SensorFaults) -> FloatArray | None:
-    """Return the constant errors (5,) in the order of `io.log:SENSOR`, or None where there are none."""
-    errors = np.array([getattr(faults, name) for name in SENSOR])
-    return errors if errors.any() else None
 
 
 def _noise(settings: SimulationSettings) -> FloatArray | None:

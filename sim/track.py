@@ -24,8 +24,7 @@ class Track:
     start: FloatArray  # pose [x, y, theta] (3,) from which the vehicle starts, in m, m, rad
     name: str
     other_labels: IntArray | None = None  # labels (k,) of the other cones, by default UNKNOWN
-    path: FloatArray | None = None
-    """Points (k, 2) along which the road is driven, if not once along its middle (m)."""
+    path: FloatArray | None = None  # (k, 2) along which the road is driven, if not its middle (m)
 
     @cached_property
     def centre_line(self) -> CentreLine:

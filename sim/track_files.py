@@ -41,11 +41,9 @@ class TrackFormat:
 
     description: str  # name of the format in messages
     suffixes: tuple[str, ...]  # ends of file names (lower case, with the dot)
-    parse: Callable[[Path], Any]
-    """Parser of a file to the content that the next two take; it raises an InputError where it can't."""
+    parse: Callable[[Path], Any]  # from a file to its content, or an InputError
     recognizes: Callable[[Any], bool]
-    read: Callable[[Path, Any], Track]
-    """Reader of the track from the path, which its errors name, and the content."""
+    read: Callable[[Path, Any], Track]  # from the path, for errors, and the content
 
 
 def read_track(path: Path | str) -> Track:
@@ -122,7 +120,10 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     ]
     others = [_pacsim_cones(path, data.get("unknown"), "track.unknown"), *rows]
     other, kinds = (np.concatenate(parts) for parts in zip(*others, strict=True))
-    labels = np.array([_pacsim_label(kind) for kind in kinds.tolist()], int)
+    orange = (BIG_ORANGE if "big" in kind else SMALL_ORANGE for kind in kinds.tolist())
+    labels = np.array(
+        [one if ORANGE in kind else UNKNOWN for one, kind in zip(orange, kinds, strict=True)], int
+    )
     no_boundary = np.isin(labels, POINTS) | (np.arange(len(labels)) < len(others[0][0]))
     left, right = (
         _without_repeats(points[[ORANGE not in kind for kind in kinds.tolist()]], closed)
@@ -150,11 +151,6 @@ def _pacsim_cones(path: Path, cones: object, key: str) -> tuple[FloatArray, NDAr
         points.append(_vector(path, _get(path, cone, "position", f"{key}[{k}]."), 2, f"{key}[{k}].position"))
         kinds.append(str(cone.get("class", "")))
     return np.array(points).reshape(-1, 2), np.array(kinds, str)
-
-
-def _pacsim_label(kind: str) -> int:
-    orange = BIG_ORANGE if "big" in kind else SMALL_ORANGE
-    return orange if ORANGE in kind else UNKNOWN
 
 
 def _fssim(path: Path, data: Mapping[str, Any]) -> Track:

@@ -185,19 +185,12 @@ def _straight(
         return begin[None]
     along = np.arange(0.0, length, curves.STEP)
     direction = (end - begin) / length
-    offset = _element(along, length, settings, rng)
-    return begin + along[:, None] * direction + offset[:, None] * left_normals(direction)
-
-
-def _element(
-    along: FloatArray, length: float, settings: TrackGeneratorSettings, rng: Generator
-) -> FloatArray:
-    dice = rng.random()
+    dice, offset = rng.random(), np.zeros_like(along)
     if dice < settings.slalom_probability:
-        return _slalom(along, length, rng)
-    if dice - settings.slalom_probability < settings.chicane_probability:
-        return _chicane(along, length, rng)
-    return np.zeros_like(along)
+        offset = _slalom(along, length, rng)
+    elif dice - settings.slalom_probability < settings.chicane_probability:
+        offset = _chicane(along, length, rng)
+    return begin + along[:, None] * direction + offset[:, None] * left_normals(direction)
 
 
 def _slalom(along: FloatArray, length: float, rng: Generator) -> FloatArray:

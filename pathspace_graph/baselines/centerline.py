@@ -230,9 +230,9 @@ def ribbon_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r
 
 @log_at_scale
 class CenterlineBatch:
-    """Maps a whole log as a ribbon: all poses and one ribbon, by GTSAM's own optimizer.
+    """Maps a whole log as a ribbon by GTSAM's optimizer, from the batch of two boundaries.
 
-    The start is the batch of two boundaries, whose map is the result where there is no line between them.
+    The map is theirs where there is no line between them.
     """
 
     def __init__(

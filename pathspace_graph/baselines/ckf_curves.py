@@ -30,8 +30,7 @@ class CurveState:
     def __init__(self, belief: Belief, settings: MapperSettings) -> None:
         self.settings = settings
         self.belief = belief  # mean and covariance of x
-        self.curves: dict[int, BSpline] = {}
-        """Curves by label. Only the number of their control points is current; see `spline`."""
+        self.curves: dict[int, BSpline] = {}  # by label; control points: only their number is current
         self.pose_u: dict[int, float] = {}  # parameter of the vehicle's foot point on each curve, not wrapped
 
     @property

@@ -37,20 +37,14 @@ from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 
 REACH: Final = 9.0  # a curve is extended up to this far ahead of the vehicle (m along the predicted path)
 SIGMA_MATCH: Final = 0.6  # of a detection in the registration (m), which is worse than online
-PATIENCE: Final = 30.0
-"""Once this length of the beginning has been driven again (m), it closes the loop, however uncertain the
-position is: `SIGMA_PATIENCE` (m) replaces `closing.sigma_max`."""
-SIGMA_PATIENCE: Final = 1000.0
+PATIENCE: Final = 30.0  # length of the beginning (m) driven again that closes the loop, however uncertain:
+SIGMA_PATIENCE: Final = 1000.0  # replaces `closing.sigma_max` (m) then
 SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the loop closes (m)
 TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
 
 class _Filter:
-    """What both filters share.
-
-    A cycle that cannot be used, or that is late, is a ReadingError and changes nothing: a filter has no
-    earlier pose that could take its detections.
-    """
+    """What both filters share; a late cycle is a ReadingError, since no earlier pose could take it."""
 
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
@@ -61,6 +55,11 @@ class _Filter:
         self.front_end = FrontEnd(self.settings, noise)
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
         """State `x = [pose | calibration | control points or landmarks]`."""
+        self._begin()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Make what only this filter has."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         """Process one perception cycle: the twists since the last one, and the detections of now."""
@@ -93,10 +92,7 @@ class _Filter:
 class CkfMapper(_Filter):
     """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points."""
 
-    def __init__(
-        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
-    ) -> None:
-        super().__init__(settings, odometry_sigma)
+    def _begin(self) -> None:
         self.state = CurveState(self.belief, self.settings)
         self.path = DrivenPath()
         self.expansion = Expansion(self.settings)
@@ -254,10 +250,7 @@ class LandmarkCkf(_Filter):
     the odometry is calibrated. Landmarks are never merged, and the loop never closes, so ghosts stay.
     """
 
-    def __init__(
-        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
-    ) -> None:
-        super().__init__(settings, odometry_sigma)
+    def _begin(self) -> None:
         self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """Tracks by label that are not landmarks yet."""

@@ -300,8 +300,7 @@ class LandmarkSolution:
     trajectory: Array  # (n, 3) smoothed poses (x, y, theta) in m and rad, map frame; theta is not wrapped
     landmark_ids: Ints  # (m,) the associations' numbers of all landmarks that were detected, ascending
     landmarks: Array  # (m, 2) positions of the landmarks in m, map frame
-    covariance: Array | None
-    """(2m, 2m) Joint covariance of the landmarks in m^2, or None if it was not requested."""
+    covariance: Array | None  # (2m, 2m) of the landmarks in m^2, if it was requested
     error: float  # half the sum of the squared whitened residuals
 
 

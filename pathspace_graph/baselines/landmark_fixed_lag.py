@@ -88,7 +88,8 @@ class LandmarkFixedLag:
     def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
         detections = self.front_end.use_late(detections, self.smoother.times)
         late = at_nearest_pose(self.smoother, detections, self.settings.motion)
-        new = self.smoother.map.add_late(late)
+        new = self.smoother.map.detections.append(late.detections, late.cycle, late.twist)
+        self.smoother.map.correct()
         self._use(new, detections.t, watch, late.cycle)
         watch.lap("update")
         used = int(self.smoother.map.detections.used[new].sum())

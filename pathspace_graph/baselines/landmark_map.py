@@ -12,7 +12,6 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights, whiteners
 from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.factors.sensor import restored
-from pathspace_graph.front_end.front_end import LateDetections
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import (
@@ -43,8 +42,7 @@ class LandmarkState:
         self.variables = variables or Variables()  # landmarks, calibration and poses by key
         self.numbers: IntArray = np.zeros(0, np.intp)  # (n,) numbers of the landmarks, ascending
         self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
-        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)
-        """(n, 2) Detections with the left and the right label on each landmark."""
+        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)  # (n, 2) detections by label
         self.next_number = 0
 
     def __len__(self) -> int:
@@ -90,8 +88,7 @@ class LandmarkState:
 class LandmarkDetections(DetectionColumns):
     """Detections with the landmark that each of them is associated with."""
 
-    landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Number of each detection's landmark, or UNASSOCIATED or AMBIGUOUS."""
+    landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # or UNASSOCIATED or AMBIGUOUS
 
     @property
     def used(self) -> BoolArray:
@@ -118,22 +115,14 @@ class LandmarkMap:
         self.state = LandmarkState()
         self.variables = self.state.variables
         self.detections = LandmarkDetections()  # detections from the poses in the window
-        self.twist: Array = np.zeros(POSE)
-        """(3,) Twist of the vehicle at the newest detections, in m/s, m/s and rad/s."""
-        self.loop_pairs: IntArray = NO_PAIRS
-        """(k, 2) Numbers of two landmarks each that are held together while the loop closes."""
-        self.merged_into: dict[int, int] = {}
-        """From the number of each landmark that was merged to the number of the one that was kept."""
+        self.twist: Array = np.zeros(POSE)  # (3,) at the newest detections (m/s, m/s, rad/s)
+        self.loop_pairs: IntArray = NO_PAIRS  # (k, 2) numbers, held together while the loop closes
+        self.merged_into: dict[int, int] = {}  # number that was kept by the one that was merged
 
     def add(self, detections: Detections, cycle: int, twist: Array) -> slice:
         """Add the corrected detections of the newest cycle, made at a twist (3,); return their rows."""
         self.twist = twist
         rows = self.detections.append(detections, cycle, twist)
-        self.correct()
-        return rows
-
-    def add_late(self, late: LateDetections) -> slice:
-        rows = self.detections.append(late.detections, late.cycle, late.twist)
         self.correct()
         return rows
 

@@ -27,9 +27,9 @@ ASSUMED: Final = "detections had no covariance that can be used, and were given 
 """Note of covariances that the record does not have."""
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
 SHARED_STAMP: Final = "messages with detections have the stamp of another one, and are one cycle with it"
-MIN_RANGE_OF_BEARING: Final = 1.0
-"""Least range (m) at which a bearing's standard deviation counts across, so that the covariance of a
-detection at the sensor itself is positive definite."""
+MIN_RANGE_OF_BEARING: Final = (
+    1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at the sensor
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +43,8 @@ class Recording:
     source: dict[str, str]  # where the record comes from, in words
     notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, with the number of times
     truth: Truth | None = None  # what is known of the drive, for evaluation only
-    odometry_sigma: Array | None = None
-    """(3,) Standard deviations of a twist (m/s, m/s, rad/s), where the record states them."""
-    mounting: tuple[float, float, float] | None = None
-    """Pose of the sensor in the vehicle frame (m, m, rad), where the record states it."""
+    odometry_sigma: Array | None = None  # (3,) sigmas of a twist (m/s, m/s, rad/s), where they are stated
+    mounting: tuple[float, float, float] | None = None  # sensor's pose (m, m, rad), where it is stated
 
 
 def twists_of(moves: Array) -> Array:
@@ -75,8 +73,9 @@ def windowed(record: Recording, window: Window) -> Recording:
         notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
         scans = [scan.where(one) for scan, one in zip(scans, near, strict=True)]
     scan_t, begin = record.scan_t + window.time_offset, float(np.nanmin(record.t, initial=np.inf))
+    is_cut = window.start > 0.0 or window.end < np.inf  # else stamps that are not finite stay to be counted
     kept, seen = (
-        (t >= begin + window.start) & (t <= begin + window.end) if window.is_cut else np.ones(len(t), bool)
+        (t >= begin + window.start) & (t <= begin + window.end) if is_cut else np.ones(len(t), bool)
         for t in (record.t, scan_t)
     )
     notes["odometry samples outside --start and --end were left out"] += int((~kept).sum())
@@ -288,15 +287,12 @@ class MessageStream:
         except BROKEN as error:
             self.refused[str(error)] += 1
             return None
-        return self._odometry_until(t), cycle
+        rows = [] if t <= self._newest else [row for row in self._twists if row[0] <= t]
+        twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
+        return Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
 
     def use(self, t: float) -> None:
         """Drop the twists that a cycle at t (s) has used, but for the last one, which is held."""
         self._newest = max(self._newest, t)
         while len(self._twists) > 1 and self._twists[1][0] <= self._newest:
             self._twists.popleft()
-
-    def _odometry_until(self, t: float) -> Odometry:
-        rows = [] if t <= self._newest else [row for row in self._twists if row[0] <= t]
-        twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
-        return Odometry(np.array([stamp for stamp, _ in rows]), twists)

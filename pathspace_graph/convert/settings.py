@@ -120,10 +120,6 @@ class Window:
         if not isfinite(self.time_offset):
             raise SettingsError(f"--time-offset: expected a number, found {self.time_offset:g}")
 
-    @property
-    def is_cut(self) -> bool:
-        return self.start > 0.0 or self.end < inf
-
 
 class LabelRule:
     """The labels of numbers, words and colours, and a count of the values that were met.

@@ -46,15 +46,10 @@ MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong u
 
 
 class Columns:
-    """Columns of the quantities: `vx=speed`, `y=-cone_y` with the sign changed, `detections.t=stamp` for one
-    of both files only.
-
-    A quantity that is not named is in the column of its own name.
-    """
+    """Columns of the quantities, by default their own names: `vx=speed`, `y=-cone_y`, `odometry.t=stamp`."""
 
     def __init__(self, pairs: Sequence[str] = ()) -> None:
-        self.named: dict[tuple[str, str], str] = {}
-        """Columns by kind of file and quantity, those whose sign is changed with a minus."""
+        self.named: dict[tuple[str, str], str] = {}  # by kind and quantity, a minus changing the sign
         for pair in pairs:
             key, equals, name = pair.partition("=")
             if not equals or not name.removeprefix("-"):
@@ -68,10 +63,7 @@ class Columns:
 
 
 class Units:
-    """Units of the quantities: `length=mm angle=deg time=ns`, and `speed` and `yaw_rate`.
-
-    A speed is in the unit of length, and a yaw rate in that of angle, for each second, unless it has its own.
-    """
+    """Units of the quantities: `length=mm angle=deg time=ns`; a `speed` and a `yaw_rate` follow these."""
 
     def __init__(self, pairs: Sequence[str] = ()) -> None:
         self.names = {"time": "s", "length": "m", "angle": "rad"}

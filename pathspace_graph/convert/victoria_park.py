@@ -27,9 +27,8 @@ PERIOD: Final = 0.2  # time from pose to pose (s), nearly as the drive had it; t
 SIGMA_ODOMETRY: Final = (0.055, 0.025, 0.08)
 """Standard deviations (m/s, m/s, rad/s) of white noise with the effect of the odometry's errors.
 
-The file claims 0.05, 0.01 and 0.01 from pose to pose. Against the reference, the errors are correlated over a
-hundred poses, and that of the yaw rate has a mean of 0.005 rad/s. The standard deviations here are the rms of
-the errors times the square root of their integrated autocorrelation."""
+The rms of the errors against the reference times the square root of their integrated autocorrelation: the
+file's 0.05, 0.01, 0.01 from pose to pose are white, its errors are correlated over a hundred poses."""
 FIELDS: Final = {"ODOMETRY": 11, "LANDMARK": 7}  # numbers in a row, by its first word
 ANCHOR_SIGMA: Final = 1e-4  # standard deviation of the first pose of the reference (m, m, rad)
 POSES_A_STEP: Final = 10  # of the reference, which no batch finds after the drift of 4 km

@@ -52,10 +52,8 @@ class Reading:
     seen_again: BoolArray  # (m,) whether each of them lies where the cycles just before had one
     orange: Detections  # detections of orange cones, which bound no road
     stated: Array  # (m, 2, 2) covariances of the detections in m^2 as stated, before any noise was measured
-    sensor_doubted: bool = False
-    """Whether the readings so far contradict the prior of the sensor's yaw or latency."""
-    measured: MapperSettings | None = None
-    """Settings with the priors of the calibrations, in a cycle in which they were measured."""
+    sensor_doubted: bool = False  # whether readings contradict the prior of the sensor's yaw or latency
+    measured: MapperSettings | None = None  # with priors of calibrations that were measured in this cycle
     notice: str = ""  # what the labels mean from now on, where that has changed
 
 

@@ -1,8 +1,7 @@
 """The gate of the online estimators: a perception cycle is checked before anything is touched.
 
-A cycle that no estimator can use is a ReadingError, and changes nothing. A single detection that is
-impossible is dropped, and the others are used: a detector may fail for one cone, while a wrong stamp, shape,
-label or twist makes the whole cycle useless.
+A wrong stamp, shape, label or twist makes the whole cycle useless, which is a ReadingError and changes
+nothing. A single detection that is impossible is dropped: a detector may fail for one cone.
 """
 
 from collections.abc import Sequence

@@ -27,8 +27,7 @@ class LogOdometry:
     twists: Array  # (P, 3) twists in force at the cycles, m/s, m/s and rad/s
     calibration_mean: Array  # (2,) prior mean of the calibration: scale error (-), yaw-rate bias (rad/s)
     calibration_sigma: Array  # (2,) its prior standard deviation
-    bias: BiasMeasurement | None = None
-    """Bias of the yaw rate that the vehicle has measured at rest, where it stood."""
+    bias: BiasMeasurement | None = None  # of the yaw rate, measured at rest
 
     def __len__(self) -> int:
         return len(self.stamps)

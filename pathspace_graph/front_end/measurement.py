@@ -54,8 +54,7 @@ class _Cones:
 
     table: Sightings
     begins: IntArray
-    pairs: tuple[IntArray, IntArray]
-    """Ordered pairs of sightings of one cone that are less than `NEAR_TIME` apart, by index."""
+    pairs: tuple[IntArray, IntArray]  # of one cone's sightings less than `NEAR_TIME` apart, by index
     ranges: Array  # (n,) range of the cone as the sensor measures it, without noise (m)
     ray: Array  # (n, 2) unit vector along the ray, map frame
     side: Array
@@ -156,8 +155,7 @@ class _Residuals:
 
     rows: IntArray
     offsets: Array  # (k, 2) along the ray and across it, m
-    reference: Array
-    """(k, 2) Variance of the reference and of the odometry in between, along and across (m^2)."""
+    reference: Array  # (k, 2) variance of reference and odometry, along and across (m^2)
 
 
 def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], odometry: Array) -> _Residuals:

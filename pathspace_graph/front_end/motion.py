@@ -49,10 +49,8 @@ class MotionCheck:
     def __init__(self, sigma: Array, settings: MotionSettings) -> None:
         self.settings = settings
         self.sigma = sigma
-        self.seen_again: BoolArray = np.zeros(0, bool)
-        """(m,) Whether each detection of the newest cycle lies where the cycles before had one."""
-        self.pose: Array = np.zeros(3)
-        """(3,) Newest pose in the frame of the front end, in which the drive began at 0."""
+        self.seen_again: BoolArray = np.zeros(0, bool)  # (m,) of the newest cycle, like `Reading.seen_again`
+        self.pose: Array = np.zeros(3)  # (3,) in the frame of the front end, from 0 on
         self.errors = SensorErrors(settings)  # how much the sensor is turned, and how late its detections are
         self._recent = RecentDetections()
         self._velocity: Array | None = None

@@ -36,8 +36,7 @@ class NoiseLearner:
         self.of_odometry = use == "measured" or (use is None and not known.odometry_stated)
         self.of_detections = use == "measured" or (use is None and not known.detections_stated)
         """Whether the noise of odometry and detections is the measured one."""
-        self.of_sensor = use != "stated"
-        """Whether constant errors of the sensor are measured: stated noise says nothing of them."""
+        self.of_sensor = use != "stated"  # its constant errors: stated noise says nothing of them
         self.measured = known.measured  # what was measured so far, or by an earlier look at the whole drive
         self._cycles: deque[SeenCycle] = deque(maxlen=MOST_CYCLES)
         self._twists = TwistRecord()

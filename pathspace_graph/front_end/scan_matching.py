@@ -1,12 +1,10 @@
 """Scan matching: the detections of a cycle are laid on those of the cycles just before.
 
-Cones stand still, so that the detections tell how the vehicle has moved, in every direction. No cone needs an
-identity: each detection is drawn to the weighted mean of the earlier ones beside it, and the weights sharpen
-from iteration to iteration (EM-ICP; Granger and Pennec 2002).
+No cone needs an identity: each detection is drawn to the weighted mean of the earlier ones beside it, and the
+weights sharpen from iteration to iteration (EM-ICP; Granger and Pennec 2002).
 
-Matches also tell how much the sensor is turned, and how late it is. A sensor that is turned by psi sees each
-motion turned by -psi. Detections that are late by tau lie too far ahead by `tau v`. While the vehicle goes on
-evenly, that is the same in every cycle, and no match shows it, but each change of the velocity does.
+Matches also tell how much the sensor is turned, and how late it is. One turned by psi sees each motion turned
+by -psi. Detections that are late by tau lie too far ahead by `tau v`, which changes of the velocity show.
 """
 
 from collections.abc import Sequence

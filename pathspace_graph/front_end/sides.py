@@ -1,9 +1,8 @@
 """The side of each detection: what is left of the way driven is left, and colours are evidence of it.
 
-A detector may have no colours, and a track may be driven the other way round, with its blue cones on the
-right. The coloured cones beside the path decide together what the colours mean. Where most detections have
-no colour, two rows of cones are followed from beside the vehicle ahead, each cone to the row that it fits
-better. What is in neither of them stays unknown.
+A detector may have no colours, and a track may be driven the other way round. The coloured cones beside the
+path decide together what colours mean. Where most have none, two rows of cones are followed from beside the
+vehicle ahead, each cone to the row that it fits better.
 """
 
 from collections.abc import Mapping
@@ -49,8 +48,7 @@ class SideJudge:
     def __init__(self, settings: SidesSettings) -> None:
         self.settings = settings
         self.swapped = False  # whether the colours of the log so far are on the other sides
-        self.colourless = False
-        """Whether most detections have no colour, so that the way driven tells their sides."""
+        self.colourless = False  # whether most detections have no colour
         self._path: DrivenPath | None = None
         self._cones = NearCones()
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
@@ -201,10 +199,8 @@ class NearCones:
     def __init__(self) -> None:
         self.points: Array = np.zeros((0, 2))  # (n, 2) place of each cone in the frame of the front end, m
         self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
-        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)
-        """(n, 2) Number of detections with the label of the left and of the right boundary."""
-        self.judged: BoolArray = np.zeros(0, bool)
-        """(n,) Whether the colour of the cone has been compared with its side."""
+        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)  # (n, 2) detections by label
+        self.judged: BoolArray = np.zeros(0, bool)  # (n,) whether its colour was compared with its side
         self._last: Array = np.zeros(0)
 
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:

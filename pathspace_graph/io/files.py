@@ -1,8 +1,7 @@
 """Output that appears as a whole or not at all, and never costs an earlier result.
 
-Each step that changes what a path names is one system call. Python announces most of them to audit hooks
-(`sys.addaudithook`); those that it doesn't know announce themselves in the same way, so that a test can end
-the process before any of them.
+Each step that changes what a path names is one system call that audit hooks see (`sys.addaudithook`), so that
+a test can end the process before any of them.
 """
 
 import ctypes

@@ -140,14 +140,11 @@ class VehicleState(Brief):
     """Its covariance (5, 5), or (0, 0)."""
 
     @property
-    def sensor_sigmas(self) -> Array:
-        return np.sqrt(np.diag(self.sensor_covariance))
-
-    @property
     def by_name(self) -> dict[str, tuple[float, float]]:
         """Return each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
         values = [*self.calibration.tolist(), *self.sensor.tolist()]
-        sigmas = [*self.sigmas[len(self.pose) :].tolist(), *self.sensor_sigmas.tolist()]
+        of_sensor = np.sqrt(np.diag(self.sensor_covariance))
+        sigmas = [*self.sigmas[len(self.pose) :].tolist(), *of_sensor.tolist()]
         known = zip([*CALIBRATION, *SENSOR], values, sigmas, strict=False)
         return {name: (value, sigma) for name, value, sigma in known}
 

@@ -72,7 +72,14 @@ def noise_lines(noise: RunNoise | None) -> list[str]:
     """Return a line on what was measured, and another one where ranges and speeds disagree."""
     if noise is None or noise.measured is None or "measured" not in (noise.odometry, noise.detections):
         return []
-    return [measured_line(noise.measured), *size_lines(noise)]
+    lines = [measured_line(noise.measured)]
+    if noise.size is not None:
+        share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
+        of_odometry = "the odometry's", "ranges"
+        whose, other = of_odometry if noise.size == "odometry" else ("the ranges'", "odometry")
+        advice = f"--calibration.trust {other} turns it round"
+        lines.append(f"ranges and speeds disagree by {share:.0f} %: the map's size is {whose} ({advice})")
+    return lines
 
 
 def measured_line(measured: MeasuredNoise) -> str:
@@ -92,17 +99,6 @@ def measured_line(measured: MeasuredNoise) -> str:
         line += f", of which {shares} of the variance stay with a cone for {times}"
     errors = _errors(measured)
     return f"{line}; {', '.join(errors)}" if errors else line
-
-
-def size_lines(noise: RunNoise) -> list[str]:
-    """Return a line where ranges and speeds disagree: by how much, and which of them the map believes."""
-    if noise.size is None or noise.measured is None:
-        return []
-    share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
-    of_odometry = "the odometry's", "ranges"
-    whose, other = of_odometry if noise.size == "odometry" else ("the ranges'", "odometry")
-    advice = f"--calibration.trust {other} turns it round"
-    return [f"ranges and speeds disagree by {share:.0f} %: the map's size is {whose} ({advice})"]
 
 
 def _errors(measured: MeasuredNoise) -> list[str]:

@@ -1,8 +1,7 @@
 """Hypotheses about a log: in which frame its detections are, and what its odometry means.
 
-Static cones must move in the frame of the vehicle as the odometry says. Each hypothesis lays the detections
-of nearby cycles on each other. One that explains far more of them than the log as it is written is the likely
-truth.
+Each lays the detections of nearby cycles on each other, since cones stand still. One that explains far more
+of them than the log as it is written is the likely truth.
 """
 
 from collections.abc import Iterator

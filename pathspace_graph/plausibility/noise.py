@@ -16,9 +16,7 @@ from .hint import Hint, told
 
 NOISE_FACTOR: Final = 1.5  # of measured and stated noise of the odometry, from which it is wrong
 NOISE_AGREEMENT: Final = 1.2  # most between differences of different orders of white noise
-SCATTER_FACTOR: Final = 2.0
-"""Factor between the scatter of detections and their covariances from which these are wrong; it is told
-less well, from a few cones, and with the errors of odometry and stamps in it."""
+SCATTER_FACTOR: Final = 2.0  # of scatter and covariances, which a few cones and odometry tell less well
 NOISE_SHARE: Final = 0.75  # share of the detections from which on wrong covariances are told
 NOISE_CYCLES: Final = 300  # most cycles on which the noise of detections is measured
 TWIST: Final = (("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s"))

@@ -55,8 +55,8 @@ class Placement:
 class Boundary:
     """A B-spline that grows until the loop closes; its control points are graph variables.
 
-    An open boundary has uniform, floating (unclamped) knots whose interval is the spacing of its control
-    points, so the parameter is roughly a length in metres, 0 at the first cone.
+    An open one has uniform, floating (unclamped) knots, so that its parameter is about a length in m from the
+    first cone.
     """
 
     def __init__(
@@ -67,10 +67,8 @@ class Boundary:
         self.gauge = gauge
         self.degree = settings.degree
         self.periodic = periodic
-        self.confirmed_end = 0.0
-        """Parameter up to which confirmed cones support the curve (m); beyond, it is extrapolated."""
-        self.observed: list[Array] = []
-        """Cones (2,) that the curve was extended through, in m, map frame, as they were placed then."""
+        self.confirmed_end = 0.0  # parameter up to which cones support the curve, not extrapolated (m)
+        self.observed: list[Array] = []  # (2,) cones that the curve was extended through, map frame (m)
         self.cone_parameters: list[float] = []  # parameter of each of the `observed` cones on the curve (m)
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
@@ -78,13 +76,11 @@ class Boundary:
         self.tables, knots = tables, tables.knots
         n = len(knots) - self.degree - 1
         self.size = n - self.degree if self.periodic else n  # number of distinct control points
-        self.abscissae = greville(knots, self.degree)[: self.size]
-        """(m,) Greville abscissae of the control points: the parameters about which they act (m)."""
+        self.abscissae = greville(knots, self.degree)[: self.size]  # (m,) where control points act (m)
         following = self.abscissae[1:]
         if self.periodic:
             following = np.append(following, self.abscissae[0] + self.length)
-        self.nominal = following - self.abscissae[: len(following)]
-        """Nominal distance of each control point to the next one (m)."""
+        self.nominal = following - self.abscissae[: len(following)]  # (m) from control point to point
         self.everything = np.arange(self.size)
         self._gauge: Gauge | None = None
 
@@ -259,7 +255,7 @@ def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
     """Return the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
 
-    A closed curve is searched everywhere, an open one on its last `room` metres, whose end is the default.
+    A closed curve is searched everywhere, an open one on its last `room` metres, by default its end.
     """
     low, high = boundary.tables.low, boundary.tables.high
     if not boundary.periodic:

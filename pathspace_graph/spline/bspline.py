@@ -273,10 +273,7 @@ class BSpline:
         return np.concatenate([kept, np.full(self.degree + 1, new_end)])
 
     def extend_to(self, point: Array) -> "BSpline":
-        """Return the curve extended to a point (2,), unchanged on its old domain and clamped at the point.
-
-        The old end is unclamped, and the point becomes the last control point (Hu et al. 2002).
-        """
+        """Return the curve extended to a point (2,), its last control point (Hu et al. 2002)."""
         self._refuse_periodic("extend")
         knots = self.extension_knots(point)
         kept = end_change_matrix(self.knots, self.degree, knots) @ self.control_points
@@ -328,10 +325,7 @@ def end_change_matrix(knots: Array, degree: int, new_knots: Array) -> Array:
 
 
 def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
-    """Return the weights (p + 1,) of a span's control points in the blossom of its polynomial.
-
-    They follow from de Boor's recurrence, with another argument at each level.
-    """
+    """Return the weights (p + 1,) of a span's control points in its blossom, by de Boor's recurrence."""
     weights = np.eye(degree + 1)
     for r, x in enumerate(arguments, start=1):
         lower = knots[span - degree + r : span + 1]

@@ -181,11 +181,9 @@ class Crossing:
 def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPACING) -> CentreCurve:
     """Return the line between two boundaries, on knots about `spacing` (m) apart.
 
-    Samples of both boundaries are paired along the strip between them, always over the shorter diagonal. A
-    ribbon is fitted to the middles of the pairs. Then each sample is moved to the middle between the points
-    where its normal crosses the boundaries, and the ribbon is fitted again. An open line leads from where
-    both boundaries begin to where both end. SettingsError is raised where a boundary is too long, the left
-    one is not on the left, or they cross.
+    Samples of both are paired along the strip between them, always over the shorter diagonal. A ribbon is
+    fitted to the middles, then to the middles between the crossings of its normals with the boundaries. An
+    open line ends where both end. SettingsError where a boundary is too long, or they cross or change sides.
     """
     longest = max(left.length(), right.length())
     if not longest <= MOST_SAMPLES * SAMPLE_STEP:

@@ -188,11 +188,10 @@ def check_length(name: str, length: float) -> None:
 def centre_line(
     left: BSpline, right: BSpline, covariance: Array | None, closed: bool, step: float
 ) -> CentreLine:
-    """Return the centre line between two boundaries at points `step` (m) apart, see `find_line`.
+    """Return the centre line between two boundaries at points about `step` (m) apart, see `find_line`.
 
-    A line has a whole number of steps, as near to `step` as can be. The joint covariance is of the distinct
-    control points of the left and then the right boundary, in the order x0, y0, x1, y1 and so on (m^2). It is
-    propagated to first order. SettingsError is raised where the step is out of its range, and by `find_line`.
+    The joint covariance of the control points of the left and then the right boundary, in the order x0, y0,
+    x1 and so on (m^2), is propagated to first order. SettingsError where the step is out of its range.
     """
     check_length("step", step)
     most, longest = MOST_POINTS * step, max(left.length(), right.length())
