@@ -254,9 +254,7 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
         add_tags(way, WAY_TAGS)
         return way.attrib["id"]
 
-    left, right = (track.curve(label, "lanelet2").spline for label in BOUNDARIES)
-    if left.periodic != right.periodic:
-        raise SettingsError("lanelet2: expected both boundaries closed or both open, found one of each")
+    left, right = (boundary.spline for boundary in track.curves("lanelet2"))
     closed = left.periodic
     line = find_line(left, right, closed)
     cuts = np.linspace(*line.ribbon.domain, _PIECES + 1)[: _PIECES if closed else 0]

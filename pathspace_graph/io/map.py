@@ -148,13 +148,16 @@ class Map:
         independent. A tentative stretch takes part as well. Both boundaries must be splines; otherwise, or
         where they aren't side by side, SettingsError is raised.
         """
-        left, right = (self.curve(label, "a centre line") for label in BOUNDARIES)
-        closed = left.spline.periodic
-        if closed != right.spline.periodic:
-            raise SettingsError(
-                "a centre line: expected both boundaries closed or both open, found one of each"
-            )
-        return centre_line(left.spline, right.spline, self.covariance_of(left, right), closed, step)
+        left, right = self.curves("a centre line")
+        covariance = self.covariance_of(left, right)
+        return centre_line(left.spline, right.spline, covariance, left.spline.periodic, step)
+
+    def curves(self, purpose: str) -> tuple[SplineBoundary, SplineBoundary]:
+        """Return both boundaries, which must be curves, and both closed or both open."""
+        left, right = (self.curve(label, purpose) for label in BOUNDARIES)
+        if left.spline.periodic != right.spline.periodic:
+            raise SettingsError(f"{purpose}: expected both boundaries closed or both open, found one of each")
+        return left, right
 
     def curve(self, label: int, purpose: str) -> SplineBoundary:
         """Return a boundary that is a curve; a SettingsError says for which purpose one was expected."""
