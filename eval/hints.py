@@ -29,8 +29,7 @@ from pathspace_graph.io.files import atomic_folder, check_target
 from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.io.overrides import Overrides, override
 from pathspace_graph.labels import LEFT
-from pathspace_graph.plausibility.judge import hints
-from pathspace_graph.plausibility.reading import read_plausible_log
+from pathspace_graph.plausibility.judge import hints, read_plausible_log
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings

@@ -14,16 +14,14 @@ from typing import Any, Final
 import gtsam
 import numpy as np
 
-Memo = dict[int, Any]
-"""Copies by the `id` of what they are copies of."""
+Memo = dict[int, Any]  # copies by the `id` of what they are copies of
 Copier = Callable[[Any, Memo], Any]
 
 
 class Recovery:
     """Return of an estimator to what it was before its newest call, by a copy and the calls since then."""
 
-    EVERY: Final = 50
-    """Number of calls from one copy to the next, so that its time hardly counts."""
+    EVERY: Final = 50  # number of calls from one copy to the next, so that its time hardly counts
 
     def __init__(self, failures: int = 0) -> None:
         self.failures = failures
@@ -40,8 +38,7 @@ class Recovery:
     def called(self, again: partial[Any], *, is_doubtful: bool = False) -> None:
         """Note a call that has changed the estimator: it is made again after a copy has taken its place.
 
-        From a doubtful call on until the next one that is not, no copy is made, so that `undo` can make all
-        of them in another way.
+        No copy is made after a doubtful call until the next sure one, so that `undo` can change all of them.
         """
         if not is_doubtful:
             self._doubtful = None
@@ -95,7 +92,6 @@ def copied(value: Any, memo: Memo) -> Any:
 
 
 def is_shared(value: object) -> bool:
-    """Return whether a copy may hold the value itself, since nothing in it changes."""
     return all(map(is_shared, value)) if isinstance(value, tuple) else _copier_of(value) is None
 
 

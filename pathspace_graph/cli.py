@@ -87,7 +87,6 @@ def _run(arguments: list[str], level: str) -> None:
 
 
 def overview() -> str:
-    """Return the list of commands."""
     width = max(map(len, COMMANDS)) + 2
     lines = [f"  {name:<{width}}{summary}" for name, (_, _, summary) in COMMANDS.items()]
     return "\n".join(
@@ -102,20 +101,17 @@ def overview() -> str:
 
 
 def parse_command(name: str, arguments: list[str]) -> Any:
-    """Return the command with its options, or None where its help was asked for and printed."""
     options = import_module(".commands.options", __package__)
     return options.parse(command_class(name), f"{PROGRAM} {name}", arguments)
 
 
 def command_class(name: str) -> type[Any]:
-    """Return the dataclass of a command."""
     module, found, _ = COMMANDS[name]
     command: type[Any] = getattr(import_module(f".commands.{module}", __package__), found)
     return command
 
 
 def _refuse(message: str, level: str, code: int = BAD_INPUT) -> int:
-    """Print the traceback of an error if asked, and its one line; return the exit code."""
     if level == "VERBOSE":
         print_exc()
     print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr)

@@ -1,7 +1,5 @@
 """What a command prints: results on standard output, hints and the progress of long work on the other."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,18 +15,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 class Verbosity(IntEnum):
     """How much is printed; hints and errors always are."""
 
-    QUIET = -1
-    """No results and no progress."""
+    QUIET = -1  # no results and no progress
     NORMAL = 0
-    VERBOSE = 1
-    """Progress in lines where there is no terminal, and the traceback of an error."""
+    VERBOSE = 1  # progress in lines where there is no terminal, and the traceback of an error
 
 
 VERBOSITY: Final = ContextVar("verbosity", default=Verbosity.NORMAL)
-FILE_WIDTH: Final = 160
-"""Width of tables where the output is no terminal (characters)."""
-LINES: Final = 20
-"""About the number of lines of progress, where they are printed."""
+FILE_WIDTH: Final = 160  # width of tables where the output is no terminal (characters)
+LINES: Final = 20  # about the number of lines of progress, where they are printed
 
 
 class _Output(Console):
@@ -39,7 +33,6 @@ class _Output(Console):
 
 @contextmanager
 def verbosity(level: str) -> Iterator[None]:
-    """Set the level, by its name, within the context."""
     before = VERBOSITY.set(Verbosity[level])
     try:
         yield
@@ -55,12 +48,10 @@ def output(wide: bool = False) -> Console:
 
 
 def say(*lines: str) -> None:
-    """Print lines of a result, as they are."""
     _print(output(), lines)
 
 
 def note(*lines: str) -> None:
-    """Print lines on standard error, as they are."""
     _print(Console(stderr=True), lines)
 
 
@@ -70,7 +61,7 @@ def _print(console: Console, lines: tuple[str, ...]) -> None:
 
 
 @contextmanager
-def progress(description: str, total: int | None = None, lines: int = 0) -> Iterator[Steps]:
+def progress(description: str, total: int | None = None, lines: int = 0) -> "Iterator[Steps]":
     """Show a bar on a terminal, or a spinner where the total isn't known, and yield what counts the steps.
 
     Without a terminal nothing is shown, unless `lines` asks for about that many lines over the whole work.
@@ -102,15 +93,11 @@ class Steps:
         if self._total is not None:
             remaining = time_remaining(time.monotonic() - self._begin, self._done, self._total)
         self._display.update(self._task, completed=self._done, total=self._total, remaining=remaining)
-        if self._is_a_line_due():
-            text = f"{self._description}: {self._done} of {self._total}, {remaining}"
-            self._display.console.print(text)
-
-    def _is_a_line_due(self) -> bool:
-        if not self._lines or not self._total or self._display.console.is_terminal:
-            return False
-        interval = -(-self._total // self._lines)
-        return self._done % interval == 0 or self._done == self._total
+        if self._lines and self._total and not self._display.console.is_terminal:
+            interval = -(-self._total // self._lines)
+            if self._done % interval == 0 or self._done == self._total:
+                text = f"{self._description}: {self._done} of {self._total}, {remaining}"
+                self._display.console.print(text)
 
 
 def time_remaining(elapsed: float, done: int, total: int) -> str:

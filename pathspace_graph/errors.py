@@ -1,27 +1,19 @@
 """The few exceptions of this library; the command line turns each into one line and exit code 2 or 3."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from math import inf
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 
 class PathspaceError(Exception):
-    """Base of all errors that a user can mend.
-
-    Its text is one line that says what was expected and what was found.
-    """
+    """Base of all errors that a user can mend: one line of what was expected and what was found."""
 
 
 class InputError(PathspaceError):
-    """A missing or wrong file of a user.
-
-    The text names the file, the row (1 is the first line) and what was expected.
-    """
+    """A missing or wrong file; the text names it, the row (1 is the first line) and what was expected."""
 
     def __init__(self, file: Path | str, message: str, row: int | None = None) -> None:
         self.file = Path(file)
@@ -32,7 +24,7 @@ class InputError(PathspaceError):
 
 
 class ReadingError(PathspaceError):
-    """A perception cycle that no estimator can use; the estimator is as it was before.
+    """A perception cycle that no estimator can use, and that changes nothing.
 
     The text names the field, the row (0 is the first one), what was expected and what was found.
     """
@@ -48,11 +40,11 @@ class ReadingError(PathspaceError):
         value = f"{found:g}" if isinstance(found, float) else str(found)
         super().__init__(f"{when}{where}: expected {expected}, found {value}")
 
-    def at(self, t: float) -> ReadingError:
+    def at(self, t: float) -> Self:
         """Return the same error of the cycle with this stamp (s)."""
         return type(self)(self.field, self.expected, self.found, self.row, t)
 
-    def __reduce__(self) -> tuple[type[ReadingError], tuple[object, ...]]:
+    def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
         """Return how to make the error again: it comes back from worker processes."""
         return type(self), (self.field, self.expected, self.found, self.row, self.t)
 
@@ -66,10 +58,7 @@ class SettingsError(PathspaceError):
 
 
 class SolveError(PathspaceError):
-    """An estimate that cannot be computed, though nothing is wrong with the input as such.
-
-    The text says what failed; the command line's exit code is 3.
-    """
+    """An estimate that cannot be computed, though nothing is wrong with the input; exit code 3."""
 
 
 class SingularSystemError(SolveError):

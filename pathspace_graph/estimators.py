@@ -4,7 +4,7 @@ An installed package adds an estimator by an entry point in the group `pathspace
 `pathspace_graph.batch`. The entry point has the estimator's name, and refers to what makes it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final, Literal
@@ -25,29 +25,21 @@ from .run import BatchEstimator, OnlineEstimator
 MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
 MakeBatch = Callable[[MapperSettings, KnownNoise], BatchEstimator]
 
-MapKind = Literal["boundaries", "centerline"]
-"""Kind of map: two boundaries, or one centre line with a width."""
+MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or one centre line with a width
 
-DEFAULT: Final = "fixed-lag"
-"""Online estimator where none is named."""
-DEFAULT_BATCH: Final = "spline"
-"""Batch estimator where none is named."""
-ONLINE_GROUP: Final = "pathspace_graph.online"
-"""Group of entry points that add online estimators."""
-BATCH_GROUP: Final = "pathspace_graph.batch"
-"""Group of entry points that add batch estimators."""
+DEFAULT: Final = "fixed-lag"  # online estimator where none is named
+DEFAULT_BATCH: Final = "spline"  # batch estimator where none is named
+ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add online estimators
+BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
 
 
 def _installed(group: str) -> dict[str, Callable[[MapperSettings, KnownNoise], Any]]:
-    """Return the estimators that other packages add; each is imported when it is made."""
-    return {point.name: _loading(point) for point in entry_points(group=group)}
+    return {point.name: partial(_load, point) for point in entry_points(group=group)}
 
 
-def _loading(point: EntryPoint) -> Callable[[MapperSettings, KnownNoise], Any]:
-    def make(settings: MapperSettings, noise: KnownNoise) -> Any:
-        return point.load()(settings, noise.odometry)
-
-    return make
+def _load(point: EntryPoint, settings: MapperSettings, noise: KnownNoise) -> Any:
+    """Return the estimator of an entry point, made with the sigmas (3,) of a twist (m/s, m/s, rad/s)."""
+    return point.load()(settings, noise.odometry)
 
 
 ONLINE: Final[dict[str, MakeOnline]] = {
@@ -58,8 +50,7 @@ ONLINE: Final[dict[str, MakeOnline]] = {
     "landmark-ckf": LandmarkCkf,
     centerline.ONLINE_NAME: centerline.CenterlineMapper,
 }
-"""Makers of online estimators, from settings and what is known of the noise; one of another package is given
-the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+"""Makers of online estimators, from settings and known noise; see `_load` for other packages."""
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
@@ -67,25 +58,22 @@ BATCH: Final[dict[str, MakeBatch]] = {
     "landmark-batch": LandmarkBatch,
     centerline.NAME: partial(centerline.CenterlineBatch, online=FixedLagMapper),
 }
-"""Makers of batch estimators, from settings and what is known of the noise; one of another package is given
-the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+"""Makers of batch estimators, in the same way."""
 
 
-def check_online(name: str) -> None:
-    """Raise a SettingsError that names the known online estimators, unless the name is one of them."""
-    _check(name, ONLINE, "online")
+def _check(name: str, known: Mapping[str, Any], kind: str) -> None:
+    if name not in known:
+        names = ", ".join(sorted(known))
+        raise SettingsError(f"--estimator: expected a known {kind} estimator ({names}), found '{name}'")
 
 
-def check_batch(name: str) -> None:
-    """Raise a SettingsError that names the known batch estimators, unless the name is one of them."""
-    _check(name, BATCH, "batch")
+check_online: Final = partial(_check, known=ONLINE, kind="online")
+check_batch: Final = partial(_check, known=BATCH, kind="batch")
+"""Raise a SettingsError that names the known estimators, unless the name is one of them."""
 
 
 def for_map(name: str, kind: MapKind) -> str:
-    """Return the estimator that maps a track as asked for, in place of a default one.
-
-    SettingsError is raised where the named estimator has no such map.
-    """
+    """Return the estimator with this kind of map in place of a default one; SettingsError for others."""
     lines = {DEFAULT: centerline.ONLINE_NAME, DEFAULT_BATCH: centerline.NAME}
     if kind == "boundaries" or name in lines.values():
         return name
@@ -95,19 +83,11 @@ def for_map(name: str, kind: MapKind) -> str:
     return lines[name]
 
 
-def _check(name: str, known: dict[str, Any], kind: str) -> None:
-    if name not in known:
-        names = ", ".join(sorted(known))
-        raise SettingsError(f"--estimator: expected a known {kind} estimator ({names}), found '{name}'")
-
-
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
-    """Return a new online estimator for a log, of which it is given the noise only."""
     check_online(name)
     return ONLINE[name](settings, log.noise)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
-    """Return a new batch estimator for a log, of which it is given the noise only."""
     check_batch(name)
     return BATCH[name](settings, log.noise)

@@ -17,25 +17,17 @@ from .errors import InputError, SettingsError
 if TYPE_CHECKING:
     import xarray
 
-OPTIONAL: Final = ("offered", "health", "reason", "dropped")
-"""Columns of `cycles.csv` that may be missing."""
-RESULTS_FILE: Final = "results.csv"
-"""File of a study's metrics, a row for each run and lap."""
-TIMES_FILE: Final = "times.csv"
-"""File of a study's wall times, in the same rows."""
-KEYS: Final = ("study", "track", "seed", "noise", "estimator", "variant", "lap")
-"""Columns that tell the rows of a study apart."""
+OPTIONAL: Final = ("offered", "health", "reason", "dropped")  # columns of `cycles.csv` that may be missing
+RESULTS_FILE: Final = "results.csv"  # file of a study's metrics, a row for each run and lap
+TIMES_FILE: Final = "times.csv"  # file of a study's wall times, in the same rows
+KEYS: Final = ("study", "track", "seed", "noise", "estimator", "variant", "lap")  # which tell rows apart
 TEXTS: Final = ("study", "track", "noise", "estimator", "variant", "failure", "said")
 """Columns of a study that are text, also where it looks like a number."""
-DIMENSIONS: Final = KEYS[1:]
-"""Dimensions of a study's metrics."""
+DIMENSIONS: Final = KEYS[1:]  # dimensions of a study's metrics
 
 
 def read_cycles(folder: Path | str) -> pd.DataFrame:
-    """Return the cycles of a run from the folder of its map, a row for each, with the cycle as its index.
-
-    Times are in s. Columns that the estimator does not write are not there. InputError on a wrong file.
-    """
+    """Return the cycles (s) of a run's folder, with the cycle as index; an InputError on a wrong file."""
     file = Path(folder) / CYCLES_FILE
     with verified(file.parent, file.name):
         table = read_table(file, [name for name in CYCLE_COLUMNS if name not in OPTIONAL])

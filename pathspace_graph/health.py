@@ -23,38 +23,26 @@ class Health:
 
     LENGTHS: ClassVar = {"reason": 1}
 
-    condition: str = ""
-    """Good, degraded or lost; empty for an estimator without a monitor."""
-    reason: str = ""
-    """Why the condition is not good."""
+    condition: str = ""  # good, degraded or lost; empty without a monitor
+    reason: str = ""  # why the condition is not good
 
 
 @dataclass(frozen=True)
 class Evidence:
     """What a cycle's detections say about the estimate, before they change it."""
 
-    t: float
-    """Stamp of the cycle (s)."""
-    offered: int = 0
-    """Number of coloured detections in the view of the curves."""
-    explained: int = 0
-    """Number of them on a curve of their colour."""
+    t: float  # stamp of the cycle (s)
+    offered: int = 0  # coloured detections in the view of the curves
+    explained: int = 0  # those on a curve of their colour
     used: int = 0
-    innovations: float = 0.0
-    """Sum of squared normalized innovations of those in use."""
+    innovations: float = 0.0  # sum of squared normalized innovations of those in use
     closed: bool = False
-    sigma: float = nan
-    """Standard deviation (m) of the position in its worst direction on a closed map, where it is known."""
-    offered_by: tuple[int, int] = (0, 0)
-    """Numbers of offered detections of the left and of the right boundary of a closed map."""
-    explained_by: tuple[int, int] = (0, 0)
-    """Numbers of explained ones."""
-    unmapped: tuple[int, int] = (0, 0)
-    """Numbers of other coloured detections, left and right, beside a gap of a closed map."""
-    rests: bool = False
-    """Whether the vehicle stands, and so has no need of detections."""
-    odometry: str = ""
-    """What is wrong with the odometry since the cycle before; empty where nothing is."""
+    sigma: float = nan  # of the position in its worst direction on a closed map (m)
+    offered_by: tuple[int, int] = (0, 0)  # offered detections, left and right, of a closed map
+    explained_by: tuple[int, int] = (0, 0)  # explained ones
+    unmapped: tuple[int, int] = (0, 0)  # other coloured ones beside a gap of a closed map
+    rests: bool = False  # whether the vehicle stands, and needs no detections
+    odometry: str = ""  # what is wrong with it since the cycle before
 
 
 class HealthMonitor:
@@ -68,12 +56,10 @@ class HealthMonitor:
         self._wrong: int | None = None  # this boundary is wrong, as long as it explains too little
 
     def restart(self) -> None:
-        """Forget the evidence so far, because the map or the pose was replaced."""
         self._recent.clear()
         self._offered, self._last_offered, self._wrong = 0, None, None
 
     def update(self, evidence: Evidence) -> Health:
-        """Return the health at a cycle."""
         if self._recent and self._recent[-1].closed != evidence.closed:
             self.restart()
         self._remember(evidence)
@@ -99,10 +85,9 @@ class HealthMonitor:
         return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
 
     def _wrong_side(self) -> str:
-        """Return which boundary is wrong, where the other one explains its detections, or an empty string.
+        """Return which boundary is wrong, where the other one explains its detections.
 
-        The map is wrong then: a lost vehicle has both boundaries beside it. A boundary stays wrong while too
-        little of the other one is mapped to say anything.
+        It stays so while too little of the other one is mapped to say anything.
         """
         holds = [self._holds(label) for label in BOUNDARIES]
         if True in holds:
@@ -112,7 +97,6 @@ class HealthMonitor:
         return "" if self._wrong is None else f"the {NAMES[self._wrong]} boundary is not where the map has it"
 
     def _holds(self, label: int) -> bool | None:
-        """Return whether a boundary explains its detections, or None if there are too few of them."""
         offered = sum(one.offered_by[label] for one in self._recent)
         explained = sum(one.explained_by[label] for one in self._recent)
         if offered < self.settings.min_offered / len(BOUNDARIES):
@@ -120,7 +104,6 @@ class HealthMonitor:
         return explained >= self.settings.share_degraded * offered
 
     def _remember(self, evidence: Evidence) -> None:
-        """Add the evidence of a cycle, and drop what is too old and not needed for `min_offered`."""
         recent = self._recent
         recent.append(evidence)
         self._offered += evidence.offered
@@ -132,7 +115,6 @@ class HealthMonitor:
             self._offered -= recent.popleft().offered
 
     def _judge(self, newest: Evidence, share: float, innovation: float, most: float) -> Health:
-        """Return the health by the share of explained detections, and by the innovation and its limit."""
         settings = self.settings
         lost = settings.share_lost if newest.closed else 0.0  # on an open map it goes on by dead reckoning
         degraded = settings.share_degraded if newest.closed else settings.open_degraded
@@ -155,24 +137,17 @@ class HealthMonitor:
         return Health(GOOD)
 
 
-# --- a whole run -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Stretch:
     """A run of cycles of one condition that is not good."""
 
     health: str
-    begin: float
-    """Stamp of its first cycle (s)."""
-    end: float
-    """Stamp of its last cycle (s)."""
-    reason: str
-    """Reason that its first cycle gives."""
+    begin: float  # stamp of its first cycle (s)
+    end: float  # stamp of its last cycle (s)
+    reason: str  # of its first cycle
 
 
 def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
-    """Return the stretches of a run that were not good, from the stamps and the health of its cycles."""
     found = []
     for condition, group in groupby(zip(t, healths, strict=True), key=lambda cycle: cycle[1].condition):
         cycles = list(group)
@@ -182,6 +157,5 @@ def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
 
 
 def counts(healths: Sequence[Health]) -> dict[str, int]:
-    """Return the number of cycles of each condition."""
     number = Counter(health.condition for health in healths)
     return {condition: number[condition] for condition in CONDITIONS}

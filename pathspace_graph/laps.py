@@ -1,6 +1,6 @@
 """Laps: they are counted online from poses, in the same way for an estimate and for the truth."""
 
-from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,34 +8,23 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class LapSettings:
-    """What counts as passing the start line, the y axis of the map frame at the first pose."""
-
-    min_path: float = 25.0
-    """Least length of a lap (m along the path); jitter or an overlap may cross the line sooner."""
-    min_distance: float = 7.0
-    """Least distance from the start that a lap leads to (m)."""
-    gate_half_width: float = 5.0
-    """Half the length of the start line (m), with room for the racing line and for the drift of one lap."""
-    gate_depth: float = 10.0
-    """Distance past the line at which a crossing is still noticed (m), where an estimate jumped."""
-    max_heading: float = np.pi / 3
-    """Largest difference of the heading from the start's where the line is crossed (rad)."""
-    end_tolerance: float = 5.0
-    """Largest distance before the line at which a last lap counts as complete (m)."""
+# what counts as passing the start line, the y axis of the map frame at the first pose
+MIN_PATH: Final = 25.0  # least length of a lap (m along the path); jitter may cross the line sooner
+MIN_DISTANCE: Final = 7.0  # least distance from the start that a lap leads to (m)
+GATE_HALF_WIDTH: Final = 5.0  # of the start line (m), with room for the racing line and a lap's drift
+GATE_DEPTH: Final = 10.0  # distance past the line (m) at which a crossing is noticed where an estimate jumped
+MAX_HEADING: Final = np.pi / 3  # largest difference of the heading from the start's at the line (rad)
+END_TOLERANCE: Final = 5.0  # largest distance before the line at which a last lap is complete (m)
 
 
 class LapCounter:
-    """Counter of laps pose by pose: a lap ends where the start line is crossed forward after a lap's length
-    of path.
+    """Counter of laps: one ends where the start line is crossed forward after a lap's length of path.
 
     Poses are [x, y, theta] in the map frame, whose origin and x axis are the start. An online estimate may
     jump when a loop closes, so a pose just behind the line that heads forward ends the lap as well.
     """
 
-    def __init__(self, settings: LapSettings | None = None) -> None:
-        self.settings = settings or LapSettings()
+    def __init__(self) -> None:
         self.lap = 1
         """Current lap, counted from 1."""
         self._path = 0.0
@@ -56,11 +45,11 @@ class LapCounter:
 
     @property
     def last_lap_is_complete(self) -> bool:
-        """Say whether the current lap has come back to within `end_tolerance` of the start line."""
+        """Say whether the current lap has come back to within `END_TOLERANCE` of the start line."""
         if self._last is None or not self._has_driven_a_lap():
             return False
         x, y, theta = self._last
-        return self._heads_forward(theta) and float(np.hypot(x, y)) <= self.settings.end_tolerance
+        return self._heads_forward(theta) and float(np.hypot(x, y)) <= END_TOLERANCE
 
     @property
     def completed(self) -> int:
@@ -68,10 +57,10 @@ class LapCounter:
         return self.lap - 1 + int(self.last_lap_is_complete)
 
     def _has_driven_a_lap(self) -> bool:
-        return self._path >= self.settings.min_path and self._farthest >= self.settings.min_distance
+        return self._path >= MIN_PATH and self._farthest >= MIN_DISTANCE
 
     def _heads_forward(self, theta: float) -> bool:
-        return bool(np.cos(theta) > np.cos(self.settings.max_heading))
+        return bool(np.cos(theta) > np.cos(MAX_HEADING))
 
     def _passes_the_line(self, x: float, y: float, theta: float) -> bool:
         assert self._last is not None
@@ -79,17 +68,13 @@ class LapCounter:
             return False
         last_x, last_y, _ = self._last
         crossing_y = last_y + (y - last_y) * last_x / (last_x - x) if last_x < 0.0 else np.inf
-        behind = x <= self.settings.gate_depth and abs(y) <= self.settings.gate_half_width
-        return bool(behind or abs(crossing_y) <= self.settings.gate_half_width)
+        behind = x <= GATE_DEPTH and abs(y) <= GATE_HALF_WIDTH
+        return bool(behind or abs(crossing_y) <= GATE_HALF_WIDTH)
 
 
-def lap_end_indices(poses: Array, settings: LapSettings | None = None) -> NDArray[np.intp]:
-    """Return the index of the pose (k,) at which each complete lap ends, of poses (N, 3) in the map frame.
-
-    A last lap that ends within `end_tolerance` of the line is complete, and ends with the last pose. A lap
-    that the log breaks off is not listed.
-    """
-    counter = LapCounter(settings)
+def lap_end_indices(poses: Array) -> NDArray[np.intp]:
+    """Return the index of the pose (k,) at which each complete lap ends, of poses (N, 3), map frame."""
+    counter = LapCounter()
     laps = np.array([counter.update(pose) for pose in poses], dtype=int)
     ends = np.flatnonzero(np.diff(laps)) + 1
     if counter.last_lap_is_complete:

@@ -9,8 +9,7 @@ import numpy as np
 
 T = TypeVar("T")
 
-POSE: Final = (1, 1, 0)
-"""Powers of the length in a pose, or in a twist."""
+POSE: Final = (1, 1, 0)  # powers of the length in a pose, or in a twist
 _METRES: Final = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?(?:e[+-]?\d+)?)(?=(?: to [\d.e+-]+)? m\b)")
 
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import cached_property
 from math import nan
@@ -15,7 +15,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoise, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.lengths import POSE, times
 
 from .errors import check_type
@@ -58,7 +58,7 @@ class CycleResult(Brief):
 
 @runtime_checkable
 class OnlineEstimator(Protocol):
-    """Interface of every online estimator."""
+    """Interface of every online estimator; `docs/extending.md` lists methods that it may have as well."""
 
     @property
     def settings(self) -> Any:
@@ -98,37 +98,6 @@ class Readings:
     """Foot point (k, 2) of each used detection on its curve or landmark, in m, map frame; NaN for others."""
 
 
-class OptionalMethods(Protocol):
-    """Methods that an online estimator may have as well, each of which is used where it is there."""
-
-    def outline(self) -> Map:
-        """Return a copy of the map as it stands, without covariances, which are empty (0, 0)."""
-
-    def vehicle_state(self) -> VehicleState:
-        """Return the newest pose and the calibration, with their joint covariance."""
-
-    def noise_used(self) -> RunNoise:
-        """Return the noise that is used now, and what was measured so far."""
-
-    def readings(self) -> Readings:
-        """Return the detections of the newest cycle as they were used or gated."""
-
-    def window_poses(self) -> Array:
-        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
-
-    def looked_at(self) -> AbstractContextManager[None]:
-        """Return a context in which nothing that is asked for changes the estimate."""
-
-    def wait(self) -> None:
-        """Wait for the batch whose result the next update may take, however long that takes."""
-
-    def batches(self) -> LapBatches:
-        """Return the cycles in which batches of another process have ended."""
-
-    def smoothed(self, t: Array) -> Array:
-        """Return the corrected poses (n, 3) of the cycles at stamps (n,); NaN after the last of them."""
-
-
 def scale(estimator: OnlineEstimator) -> float:
     """Return the scale of the scene as an estimator knows it; 1 where it takes every scene as it is."""
     return float(getattr(estimator, "scale", 1.0))
@@ -163,7 +132,6 @@ class ObservedCycle:
 
     @cached_property
     def record(self) -> CycleRecord:
-        """Return the cycle as a row of `cycles.csv` has it."""
         result = self.result
         same = ("readings", "closed", "notice", "dropped", "late", "refused")
         return CycleRecord(
@@ -221,7 +189,6 @@ class Stopwatch:
 
     @property
     def spent(self) -> float:
-        """Return the time (s) of all stages so far."""
         return sum(self.laps.values())
 
     def lap(self, name: str) -> None:
@@ -234,8 +201,7 @@ class Stopwatch:
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
     """Yield each perception cycle with the twists since the cycle before it, none later than its stamp.
 
-    The rows tile the time without a gap, row i being in force during [t_i, t_(i+1)). The first row begins at
-    the stamp of the cycle before with the twist that was held then. The last row is held until the cycle.
+    The first row begins at the cycle before with the twist held then; the last is held until this one.
     """
     since = float(log.odometry.t[0])
     for detections in log.cycles:
@@ -244,10 +210,7 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
 
 
 def timed_wait(estimator: OnlineEstimator) -> float:
-    """Wait for what the next update may take from another process; return the wall time (s) of that.
-
-    So the update itself waits for nothing, and a replay depends on no other process's speed.
-    """
+    """Wait for what the next update may take from another process; return the wall time (s) of that."""
     if not hasattr(estimator, "wait"):
         return 0.0
     begin = time.perf_counter()
@@ -258,7 +221,6 @@ def timed_wait(estimator: OnlineEstimator) -> float:
 def timed_update(
     estimator: OnlineEstimator, odometry: Odometry, detections: Detections
 ) -> tuple[CycleResult, float, float]:
-    """Do one update; return the estimate, and the wall time and the thread's processor time (s) of it."""
     begin, worked = time.perf_counter(), time.thread_time()
     estimate = estimator.update(odometry, detections)
     return estimate, time.perf_counter() - begin, time.thread_time() - worked
@@ -276,11 +238,9 @@ def run_online(
 ) -> RunResult:
     """Feed a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
 
-    The truth of the log is not read. For each of the `snapshot_times` (s, ascending) the map is kept as it
-    stood after the last cycle that isn't later. Each of the `observers` is shown each cycle, outside of its
-    time. `on_cycle` is an observer that takes the record of a cycle only, `observer` one that takes its
-    result and the outline of the map. BLAS has one thread, since its threads stall small solves. Results of
-    another process are waited for between cycles.
+    Maps are kept as they stood at the `snapshot_times` (s, ascending). The `observers` are shown each cycle,
+    outside of its time; `on_cycle` takes its record only, `observer` its result and the map's outline. BLAS
+    has one thread, and results of another process are waited for between cycles.
     """
     check_type("log", log, Log)
     check_type("estimator", estimator, OnlineEstimator)
@@ -297,8 +257,6 @@ def run_online(
 
 
 class _Run:
-    """Results of a run in progress."""
-
     def __init__(
         self, estimator: OnlineEstimator, snapshot_times: list[float], observers: Sequence[Observer]
     ) -> None:
@@ -313,7 +271,6 @@ class _Run:
         self._records: list[CycleRecord] = []
 
     def cycle(self, odometry: Odometry, detections: Detections) -> None:
-        """Run and time one update, record it, and show it to the observers."""
         self._take_snapshots(before=detections.t)
         self._waited += timed_wait(self._estimator)
         result, seconds, processor = timed_update(self._estimator, odometry, detections)
@@ -332,7 +289,6 @@ class _Run:
             self._observing += time.perf_counter() - begin
 
     def result(self, name: str) -> RunResult:
-        """Return the results after the last cycle."""
         self._take_snapshots(before=float("inf"))
         estimator, records, track = self._estimator, self._records, self._estimator.map()
         if self._laps.last_lap_is_complete:

@@ -26,26 +26,16 @@ from .run import settings_dict
 
 C = TypeVar("C", bound=type[Any])
 
-WIDTH: Final = 3.5
-"""Distance of a cone from the nearest one of the other side on a track of Formula Student, m, median."""
-GAP: Final = 3.2
-"""Distance of a cone from the nearest one of its row there, m, median."""
-SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Possible scales: what is within a factor of 1.7 of one is mapped as well with it."""
-NEAREST: Final = 5
-"""Number of the nearest cones of each side that tell the scale."""
-FEWEST: Final = 3
-"""Number of cones of each side that a cycle needs."""
-SAME: Final = 3.0
-"""Largest distance (sigmas) of two detections of one cone."""
-FARTHEST: Final = 1e4
-"""Largest distance of a cone (m), in a scene of any scale."""
-MOVED: Final = 0.1
-"""Share of a gap by which the vehicle moves until the next cycle counts."""
-JUDGED: Final = (1, 5, 20)
-"""Numbers of cycles that count after which the scale is judged; it is final after the last."""
-PATIENCE: Final = 200
-"""Number of cycles after which it is final in any case."""
+WIDTH: Final = 3.5  # m from a cone to the nearest one of the other side in Formula Student, median
+GAP: Final = 3.2  # distance of a cone from the nearest one of its row there, m, median
+SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)  # within a factor of 1.7 of one, maps are as good
+NEAREST: Final = 5  # number of the nearest cones of each side that tell the scale
+FEWEST: Final = 3  # number of cones of each side that a cycle needs
+SAME: Final = 3.0  # largest distance (sigmas) of two detections of one cone
+FARTHEST: Final = 1e4  # largest distance of a cone (m), in a scene of any scale
+MOVED: Final = 0.1  # share of a gap by which the vehicle moves until the next cycle counts
+JUDGED: Final = (1, 5, 20)  # cycles that count after which the scale is judged, the last time finally
+PATIENCE: Final = 200  # number of cycles after which it is final in any case
 
 
 class SceneScale:
@@ -56,17 +46,14 @@ class SceneScale:
     """
 
     def __init__(self, scale: float | None = None) -> None:
-        self.value = 1.0 if scale is None else scale
-        """Scale as far as it is known."""
-        self.is_final = scale is not None
-        """Whether the value changes no more."""
+        self.value = 1.0 if scale is None else scale  # scale as far as it is known
+        self.is_final = scale is not None  # whether the value changes no more
         self._widths: list[float] = []
         self._gaps: list[float] = []
         self._driven = np.inf  # since the last cycle that counted
         self._cycles = self._counted = 0
 
     def see(self, odometry: Odometry, detections: Detections) -> None:
-        """Take a cycle into account."""
         if self.is_final:
             return
         self._cycles += 1
@@ -95,10 +82,7 @@ def scale_of(log: Log) -> float:
 
 
 def width_and_gap(detections: Detections) -> tuple[float, float]:
-    """Return the width of the road and the gap of its rows (m) in a cycle; NaN where they aren't seen.
-
-    Without labels, what is to the left of the vehicle is the left side.
-    """
+    """Return the width of the road and the gap of its rows (m) in a cycle; NaN where they aren't seen."""
     usable = (np.abs(detections.points_vehicle) < FARTHEST).all(axis=1)  # the gate drops the others
     points, labels = detections.points_vehicle[usable], detections.labels[usable]
     sides = labels if (labels != UNKNOWN).any() else np.where(points[:, 1] > 0.0, LEFT, RIGHT)
@@ -113,7 +97,6 @@ def width_and_gap(detections: Detections) -> tuple[float, float]:
 
 
 def _nearest_cones(points: Array, covariances: Array) -> Array:
-    """Return the nearest of points (m, 2), vehicle frame, one for each cone."""
     chosen: list[int] = []
     for k in np.argsort(np.hypot(*points.T)).tolist():
         apart = ((points[chosen] - points[k]) ** 2).sum(axis=1)
@@ -126,7 +109,6 @@ def _nearest_cones(points: Array, covariances: Array) -> Array:
 
 
 def _nearest(widths: list[float], gaps: list[float]) -> float:
-    """Return the scale that is nearest to what widths and gaps (m) say, by ratio."""
     ratios = np.log10([np.median(widths) / WIDTH, np.median(gaps) / GAP])
     if ratios[0] * ratios[1] <= 0.0:
         return 1.0
@@ -147,8 +129,7 @@ ANSWERS: Final = (
 class FrontDoor:
     """The scale of an estimator and, until that is final, what it takes to begin anew."""
 
-    constant: ClassVar = True
-    """An estimator that goes back to what it was before an update keeps it."""
+    constant: ClassVar = True  # an estimator that goes back to what it was before an update keeps it
 
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Any = None, *others: Any, **named: Any
@@ -185,7 +166,6 @@ class FrontDoor:
 
 
 def noise_at(noise: Array | KnownNoise | None, scale: float) -> Array | KnownNoise | None:
-    """Return the noise of an estimator's odometry as it is at scale 1."""
     if noise is None or isinstance(noise, KnownNoise):
         return scaled(noise, 1.0 / scale)
     try:
@@ -195,7 +175,6 @@ def noise_at(noise: Array | KnownNoise | None, scale: float) -> Array | KnownNoi
 
 
 def in_scene(error: ReadingError, scale: float) -> ReadingError:
-    """Return an error of a cycle at scale 1 with the lengths of the scene."""
     expected, found = times(error.expected, 1, scale), error.found
     if expected != error.expected and isinstance(found, float):
         found = found * scale

@@ -96,7 +96,6 @@ def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
 
 
 def write(path: Path | str, structure: Structure, numbers: Bytes) -> None:
-    """Write a structure and the memory of its arrays; an earlier file is kept as a backup."""
     text = json.dumps({"format": FORMAT, **structure}, allow_nan=False, separators=(",", ":")).encode()
     with atomic_file(path) as temporary:
         temporary.write_bytes(archive(text, numbers))
@@ -130,9 +129,6 @@ def read(file: Path) -> tuple[Structure, Bytes]:
     return structure, numbers
 
 
-# --- the types -------------------------------------------------------------------------------------------
-
-
 def known_classes() -> dict[str, type]:
     """Return every class of the rooms' modules that are loaded, by its name without the package's own."""
     rooms = tuple(PACKAGE + room for room in ROOMS)
@@ -147,10 +143,7 @@ def known_classes() -> dict[str, type]:
 
 @cache
 def layout(kind: type) -> dict[str, str]:
-    """Return the names of the attributes that the code of a class sets, those of fields with their types.
-
-    A program whose class has another layout than the one in the file refuses the file.
-    """
+    """Return the attributes that the code of a class sets, with their types; another layout is refused."""
     members = [member for base in kind.__mro__ for member in vars(base).values()]
     functions = [getattr(member, "fget", None) or getattr(member, "__func__", member) for member in members]
     functions += [unwrap(function) for function in functions if hasattr(function, "__wrapped__")]
@@ -213,9 +206,6 @@ TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]
 _MAKERS: Final = {kind.__name__: make for kind, (_, make) in TYPES.items()}
 
 
-# --- from objects to a structure -------------------------------------------------------------------------
-
-
 class Encoder:
     """Walk of the objects that can be reached from a root; each of them becomes one node."""
 
@@ -269,10 +259,7 @@ class Encoder:
 
 
 def _lay_out(arrays: list[tuple[NDArray[Any], list[Any]]]) -> Bytes:
-    """Return the memory of all arrays, and note in the node of each where it begins.
-
-    Arrays that overlap in memory overlap here as well. Bytes that belong to no array are zero.
-    """
+    """Return the memory of all arrays, which overlap as before, and note in each node where it begins."""
     bounds, end = [_bounds(array) for array, _ in arrays], 0
     for group in _overlapping(bounds):
         begin, low = -(-end // _ALIGNMENT) * _ALIGNMENT, min(bounds[i][0] for i in group)
@@ -286,7 +273,6 @@ def _lay_out(arrays: list[tuple[NDArray[Any], list[Any]]]) -> Bytes:
 
 
 def _bounds(array: NDArray[Any]) -> tuple[int, int]:
-    """Return the address of the first byte of an array's memory, and of the one after its last."""
     begin = int(array.__array_interface__["data"][0])
     if array.size == 0:
         return begin, begin
@@ -314,9 +300,6 @@ def _view(numbers: Bytes, node: list[Any]) -> NDArray[Any]:
     if math.prod(shape) * np.dtype(dtype).itemsize > len(numbers):
         raise ValueError(f"expected an array inside of {len(numbers)} bytes, found {shown(shape)}")
     return np.empty(shape, dtype) if 0 in shape else np.ndarray(shape, dtype, numbers, offset, strides)
-
-
-# --- from a structure to objects -------------------------------------------------------------------------
 
 
 class Decoder:

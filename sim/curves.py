@@ -29,7 +29,6 @@ def along_polyline(at: FloatArray, s: FloatArray, points: FloatArray) -> FloatAr
 
 
 def unit(vectors: FloatArray) -> FloatArray:
-    """Return the vectors (n, 2) scaled to length 1."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
@@ -49,45 +48,33 @@ def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(cross / np.linalg.norm(first, axis=1) ** 3)
 
 
-STEP: Final = 0.25
-"""Distance of the samples of a curve that is fitted (m)."""
-KNOT_STEP: Final = 0.5
-"""Distance of the knots of the finished curve (m)."""
-SMOOTHING: Final = 1.0
-"""Standard deviation of the smoothing Gaussian (m), which cuts a corner of radius R by its square / 2R."""
-CENTRINGS: Final = 4
-"""Times that the curve is moved to equal distances from both rows and smoothed."""
-NEIGHBOURS: Final = 3
-"""Cones to both sides of a sample's own one, up to which its distance to a row is measured."""
-START_CANDIDATES: Final = 4
-"""Cones of each row nearest to the start that are tried as the first pair of the matching."""
+STEP: Final = 0.25  # distance of the samples of a curve that is fitted (m)
+KNOT_STEP: Final = 0.5  # distance of the knots of the finished curve (m)
+SMOOTHING: Final = 1.0  # sigma of the Gaussian (m), which cuts a corner of radius R by its square / 2R
+CENTRINGS: Final = 4  # times that the curve is moved to equal distances from both rows and smoothed
+NEIGHBOURS: Final = 3  # cones to both sides of a sample's, up to which its distance to a row is measured
+START_CANDIDATES: Final = 4  # cones of each row nearest to the start, tried as the first pair
 
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
     """A twice differentiable curve `c(s)` by arc length `s`, periodic where the track is closed."""
 
-    spline: CubicSpline
-    """Points (2,) in m by s, which is the arc length to about 0.1 %."""
-    length: float
-    """Length of the curve, or of one lap (m)."""
+    spline: CubicSpline  # points (2,) in m by s, which is the arc length to about 0.1 %
+    length: float  # length of the curve, or of one lap (m)
     closed: bool
-    clearance: FloatArray
-    """Distance to the nearer row of cones at the spline's knots (k,) in m."""
+    clearance: FloatArray  # distance to the nearer row of cones at the spline's knots (k,) in m
 
     def points(self, s: FloatArray) -> FloatArray:
         return np.asarray(self.spline(s))
 
     def tangents(self, s: FloatArray) -> FloatArray:
-        """Return the unit tangents (n, 2) in the direction of travel."""
         return unit(np.asarray(self.spline(s, 1)))
 
     def curvatures(self, s: FloatArray) -> FloatArray:
-        """Return the signed curvature (n,) in 1/m, positive to the left."""
         return curvature(np.asarray(self.spline(s, 1)), np.asarray(self.spline(s, 2)))
 
     def clearances(self, s: FloatArray) -> FloatArray:
-        """Return the distance to the nearer row of cones (n,) in m."""
         period = self.length if self.closed else None
         return np.interp(s, self.spline.x, self.clearance, period=period)
 
@@ -102,8 +89,7 @@ class CentreLine:
 def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> CentreLine:
     """Return the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
 
-    The rows are matched from `near` on by the triangulation of least total squared width that runs along
-    both. So their counts and spacings may differ, and other parts of the track may be near.
+    The rows are matched from `near` on by the triangulation of least total squared width along both.
     """
     rungs = match_rows(left, right, closed, near)
     middles = (left[rungs[:, 0]] + right[rungs[:, 1]]) / 2
@@ -142,7 +128,6 @@ def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArr
 
 
 def _match(left: FloatArray, right: FloatArray) -> tuple[float, IntArray]:
-    """Return the least total squared distance and its pairs, by dynamic programming."""
     width = np.sum((left[:, None] - right[None]) ** 2, axis=-1)
     total = np.empty_like(width)
     total[0] = np.cumsum(width[0])
@@ -179,7 +164,6 @@ def _smooth(curve: FloatArray, closed: bool) -> FloatArray:
 
 
 def _normals(curve: FloatArray, closed: bool) -> FloatArray:
-    """Return the unit normals (n, 2) to the left of a sampled curve."""
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     return left_normals(unit(along if closed else np.gradient(curve, axis=0)))
 

@@ -10,12 +10,9 @@ from scipy.spatial import Delaunay, QhullError
 
 from .curves import FloatArray, IntArray, direction, left_normals, ring
 
-RUNG_MAX: Final = 12.0
-"""Largest distance of a left and a right cone of one lane (m)."""
-GATE_REACH: Final = 12.0
-"""Distance from the start within which gate cones stand in for missing boundary cones (m)."""
-INSERTION_DETOUR: Final = 5.0
-"""Growth of a row up to which a cone joins it that the walk missed, as at an outer corner (m)."""
+RUNG_MAX: Final = 12.0  # largest distance of a left and a right cone of one lane (m)
+GATE_REACH: Final = 12.0  # from the start, within which gate cones stand in for missing ones (m)
+INSERTION_DETOUR: Final = 5.0  # growth of a row up to which a missed cone joins it (m)
 
 Rung = tuple[int, int]
 Apexes = Mapping[Rung, Sequence[int]]
@@ -35,9 +32,8 @@ def driving_order(
 ) -> DrivingOrder | None:
     """Order cones (n, 2), (m, 2) of both boundaries along the lane that the start [x, y, theta] stands in.
 
-    The Delaunay triangles that join both boundaries are the lane. Each shares with the next a rung from a
-    left to a right cone, so walking them gives both rows in order, whatever else is near. Gate cones stand in
-    for missing boundary cones, unless the walk goes round only without them. None where no lane is found.
+    The lane is the Delaunay triangles that join both boundaries, each of which shares a rung with the next.
+    Gate cones stand in for missing ones, unless the walk goes round only without them. None without a lane.
     """
     order = _order(left, right, gate, start)
     if order is not None and order.closed:
@@ -65,7 +61,6 @@ def _order(left: FloatArray, right: FloatArray, gate: FloatArray, start: FloatAr
 
 
 def _apexes(points: FloatArray) -> Apexes:
-    """Return the third corners of the triangles on each edge (i < j)."""
     apexes: dict[Rung, list[int]] = defaultdict(list)
     try:
         triangles = Delaunay(points).simplices.tolist()
@@ -96,7 +91,6 @@ def _first_rung(points: FloatArray, split: int, apexes: Apexes, start: FloatArra
 def _walk(
     points: FloatArray, split: int, apexes: Apexes, first: Rung, forward: bool
 ) -> tuple[list[Rung], bool]:
-    """Return the rungs from the first one on, and whether they come back to it."""
     rungs = {first: None}  # in order, without repeats
     i, j = first
     while (apex := _next_apex(points, apexes[i, j], (i, j), forward)) is not None:

@@ -107,16 +107,12 @@ class Faults:
 
 
 def time_at(driven: Drive, distance: float) -> float:
-    """Return the stamp (s) at which the vehicle has driven so far (m); it is infinite if it never has."""
     reached = np.flatnonzero(arc_lengths(driven.poses[:, :2]) >= distance)
     return float(driven.t[reached[0]]) if len(reached) else np.inf
 
 
 def _is_within(t: FloatArray, begin: float, time: float) -> NDArray[np.bool_]:
     return np.asarray((t >= begin) & (t < begin + time))
-
-
-# --- the vehicle -----------------------------------------------------------------------------------------
 
 
 def turned_round(track: Track) -> Track:
@@ -128,11 +124,7 @@ def turned_round(track: Track) -> Track:
 
 
 def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
-    """Return the drive without the stretch that the vehicle is carried over; a lap is `lap` m long.
-
-    From one stamp to the next the vehicle is `put_down` m farther along its path. Nothing else changes, so
-    the twists do not integrate to the poses there.
-    """
+    """Return the drive without the stretch that the vehicle is carried over; a lap is `lap` m long."""
     if not faults.put_down:
         return driven
     s = arc_lengths(driven.poses[:, :2])
@@ -140,9 +132,6 @@ def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
     kept = (s < begin) | (s >= begin + faults.put_down)
     count = int(kept.sum())
     return Drive(driven.t[:count], driven.poses[kept], driven.twists[kept])
-
-
-# --- the odometry ----------------------------------------------------------------------------------------
 
 
 def measure_odometry(
@@ -167,9 +156,6 @@ def _slipping(driven: Drive, faults: OdometryFaults) -> FloatArray:
     slips = (since < faults.slip_time) & (driven.t >= faults.slip_every)
     factors = 1.0 + faults.slip * slips[:, None] * np.array([1.0, 1.0, 0.0])
     return np.asarray(driven.twists * factors)
-
-
-# --- the sensor ------------------------------------------------------------------------------------------
 
 
 def colours(track: Track, wrong_way: bool) -> IntArray:
@@ -198,10 +184,7 @@ class FaultySensor:
         self._unseen = np.flatnonzero(sides == NAMES.index(faults.blind_side))
 
     def detect(self, t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
-        """Return a perception cycle from a pose [x, y, theta], and the true cone of each detection (m,).
-
-        The pose is the vehicle's at the time of the image, which a late sensor stamps with a later `t`.
-        """
+        """Return a cycle from the pose at the time of the image, and the true cone of each detection."""
         faults = self._faults
         detections, cones = self._sensor.detect(
             t, mounted(pose, faults), faults.range_scale, faults.range_bias

@@ -18,37 +18,28 @@ from .curves import FloatArray
 
 Mistake = Callable[[Log], Log]
 
-DEGREE: Final = float(np.pi / 180.0)
-"""A degree in radians."""
+DEGREE: Final = float(np.pi / 180.0)  # a degree in radians
 
 
 def with_cycles(log: Log, change: Callable[[Detections], dict[str, Any]]) -> Log:
-    """Return the log with some fields of each cycle replaced."""
     return replace(log, cycles=tuple(replace(cycle, **change(cycle)) for cycle in log.cycles))
 
 
 def with_points(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
-    """Return the log with other detections (m, 2), as they are in the vehicle frame."""
     return with_cycles(log, lambda cycle: {"points_vehicle": change(cycle.points_vehicle)})
 
 
 def with_covariances(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
-    """Return the log with other covariances (m, 2, 2)."""
     return with_cycles(log, lambda cycle: {"covariances": change(cycle.covariances)})
 
 
 def with_twists(log: Log, factors: FloatArray | tuple[float, float, float]) -> Log:
-    """Return the log with its twists times these factors."""
     return replace(log, odometry=replace(log.odometry, twist=log.odometry.twist * factors))
 
 
 def with_stamps(log: Log, odometry: float = 1.0, detections: float = 1.0) -> Log:
-    """Return the log with its stamps times these factors."""
     log = with_cycles(log, lambda cycle: {"t": cycle.t * detections})
     return replace(log, odometry=replace(log.odometry, t=log.odometry.t * odometry))
-
-
-# --- frames ----------------------------------------------------------------------------------------------
 
 
 def turned(log: Log, to_vehicle: FloatArray) -> Log:
@@ -68,15 +59,11 @@ def y_to_the_right(log: Log) -> Log:
 
 
 def swapped(log: Log) -> Log:
-    """Return the log with the columns x and y of the detections swapped."""
     return turned(log, np.array([[0.0, 1.0], [1.0, 0.0]]))
 
 
 def camera(log: Log, height: float = 0.6, sigma: float = 0.02) -> Log:
-    """Return the log with x to the right and y down of a camera at a height (m); z ahead is lost.
-
-    The cones are not all equally low, by a standard deviation (m).
-    """
+    """Return the log with x to the right and y down of a camera at a height (m); z ahead is lost."""
     rng = np.random.default_rng(0)
     return with_points(
         log, lambda points: np.column_stack([-points[:, 1], rng.normal(height, sigma, len(points))])
@@ -94,9 +81,6 @@ def bearings_as_degrees(log: Log) -> Log:
     return with_points(log, wrong)
 
 
-# --- what needs the vehicle's path -----------------------------------------------------------------------
-
-
 def dead_reckoned(log: Log) -> FloatArray:
     """Return poses (N, 3) at the odometry's stamps, by the odometry alone."""
     twist, dt = log.odometry.twist, np.diff(log.odometry.t)
@@ -108,12 +92,10 @@ def dead_reckoned(log: Log) -> FloatArray:
 
 
 def pose_as_twist(log: Log) -> Log:
-    """Return the log with x, y and heading of the vehicle where vx, vy and wz should be."""
     return replace(log, odometry=replace(log.odometry, twist=dead_reckoned(log)))
 
 
 def speeds_in_the_map(log: Log) -> Log:
-    """Return the log with speeds along the axes of the map."""
     c, s = np.cos(dead_reckoned(log)[:, 2]), np.sin(dead_reckoned(log)[:, 2])
     vx, vy, wz = log.odometry.twist.T
     twist = np.column_stack([c * vx - s * vy, s * vx + c * vy, wz])
@@ -121,7 +103,6 @@ def speeds_in_the_map(log: Log) -> Log:
 
 
 def detections_in_the_map(log: Log) -> Log:
-    """Return the log with detections in the map frame, by the odometry."""
     poses, t = dead_reckoned(log), log.odometry.t
 
     def moved(cycle: Detections) -> dict[str, Any]:

@@ -13,10 +13,8 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from .curves import FloatArray, IntArray
 
-FALSE_POSITIVE: Final = -1
-"""Association of a detection that is of no cone."""
-CAMERAS: Final = 2
-"""Cameras that may see a cone at once."""
+FALSE_POSITIVE: Final = -1  # association of a detection that is of no cone
+CAMERAS: Final = 2  # cameras that may see a cone at once
 
 
 @dataclass(frozen=True)
@@ -43,10 +41,9 @@ class OdometryNoise:
         check_numbers(self, "odometry", ("slow_time",), "a positive number")
 
     def drift_sigmas(self, dt: float) -> FloatArray:
-        """Return the standard deviations (3,) of white noise that drifts as much, of readings `dt` s apart.
+        """Return the standard deviations (3,) of white noise that drifts as much, `dt` s apart.
 
-        It has the spectrum of the noise at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, where
-        `rho = exp(-dt / slow_time)`.
+        The spectrum at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, `rho = exp(-dt / slow_time)`.
         """
         rho = np.exp(-dt / self.slow_time)
         return np.asarray(np.hypot(self.white, np.sqrt((1.0 + rho) / (1.0 - rho)) * np.array(self.slow)))
@@ -119,22 +116,11 @@ class SensorSettings:
     def range_sigmas(self, ranges: FloatArray) -> FloatArray:
         return self.range_sigma + self.range_sigma_growth * ranges
 
-    def range_biases(self, ranges: FloatArray) -> FloatArray:
-        if not self.range_bias or not self.range_bias_at:
-            return np.zeros_like(ranges)
-        return np.interp(ranges, self.range_bias_at, self.range_bias_values)
-
-    def detection_probabilities(self, ranges: FloatArray) -> FloatArray:
-        return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
-
 
 def measure_twists(
     twists: FloatArray, dt: float, noise: OdometryNoise, rng: Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return measured twists (N, 3), and the scale error (-) and the bias (rad/s) that they have (2,).
-
-    They are `dt` s apart: `(1 + scale) [vx, vy]` and `wz + bias`, each plus white noise and a slow error.
-    """
+    """Return `(1 + scale) [vx, vy]`, `wz + bias` (N, 3), `dt` s apart, with noise, and [scale, bias]."""
     scale = noise.scale * rng.standard_normal()
     bias = noise.gyro_bias * rng.standard_normal()
     white = rng.standard_normal(twists.shape) * np.array(noise.white)
@@ -146,10 +132,7 @@ def measure_twists(
 
 
 def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatArray:
-    """Return stationary first-order Gauss-Markov processes of unit variance along the first axis.
-
-    `step` is that from sample to sample by the correlation time, so neighbours correlate by `exp(-step)`.
-    """
+    """Return Gauss-Markov processes of unit variance along axis 0; neighbours correlate by `exp(-step)`."""
     rho = np.exp(-step)
     drawn = rng.standard_normal(shape)
     drawn[1:] *= np.sqrt(1.0 - rho**2)
@@ -157,8 +140,6 @@ def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatAr
 
 
 class ConeSensor:
-    """Detect the cones of one log, some of which it never sees."""
-
     def __init__(self, cones: FloatArray, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
         blind_rng, self._cone_rng, self._false_rng, self._slow_rng, self._second_rng, self._drop_rng = (
             rng.spawn(6)
@@ -172,9 +153,9 @@ class ConeSensor:
     def detect(
         self, t: float, pose: FloatArray, scale: float = 0.0, bias: float = 0.0
     ) -> tuple[Detections, IntArray]:
-        """Return a perception cycle from a pose [x, y, theta], and the true cone of each detection (m,).
+        """Return a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
 
-        A range r reads `(1 + scale) r + bias`, beside its systematic and its random error.
+        The second result is the true cone of each detection (m,).
         """
         parts = zip(self._detect_cones(pose, scale, bias), self._false_positives(), strict=True)
         ranges, bearings, labels, cones = (np.concatenate(part) for part in parts)
@@ -197,10 +178,13 @@ class ConeSensor:
         labels = self._labels[cones]
         flipped = (colour < settings.wrong_colour) & np.isin(labels, BOUNDARIES)
         labels = np.where(flipped, LEFT + RIGHT - labels, labels)
-        hit = chance < settings.detection_probabilities(ranges)
+        probability = settings.detection_probability - settings.detection_falloff * ranges
+        hit = chance < np.clip(probability, 0.0, 1.0)
         overlap = np.digitize(np.abs(bearings), settings.overlap) == 1
         rows = np.stack([hit, hit & overlap & (again < settings.duplicates)])
-        ranges = (1.0 + scale) * ranges + bias + settings.range_biases(ranges)
+        biased = settings.range_bias and len(settings.range_bias_at) > 0
+        systematic = np.interp(ranges, settings.range_bias_at, settings.range_bias_values) if biased else 0.0
+        ranges = (1.0 + scale) * ranges + bias + systematic
         errors = self._errors(np.stack([first, second]), cones)
         ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]
         bearings = bearings + settings.bearing_sigma * errors[:, 1]
@@ -208,7 +192,7 @@ class ConeSensor:
         return ranges[rows], bearings[rows], labels[index], cones[index]
 
     def _errors(self, white: FloatArray, cones: IntArray) -> FloatArray:
-        """Return errors (2, 2, m) of unit variance by camera, range or bearing, and cone, from white noise.
+        """Return errors (2, 2, m) of unit variance by camera, range or bearing, and cone.
 
         Each cone's slow errors are Gauss-Markov processes that go on while it is not seen.
         """
@@ -231,7 +215,6 @@ class ConeSensor:
 
 
 def _polar(cones: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return range and bearing (n,) of points in the map frame, seen from a pose."""
     step = cones - pose[:2]
     bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
     return np.hypot(step[:, 0], step[:, 1]), np.asarray((bearings + np.pi) % (2 * np.pi) - np.pi)

@@ -41,9 +41,8 @@ class SimulationSettings:
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     """Return the log of a drive; a seed gives the same log to the byte.
 
-    Wander, odometry, sensor and colours that are lost have random streams of their own, so that a setting of
-    one does not shift the others. A cycle in which nothing is detected is not in the log, since the file
-    format has no row for it.
+    Wander, odometry, sensor and lost colours have random streams of their own, so that a setting of one does
+    not shift the others. A cycle in which nothing is detected is not in the log.
     """
     if seed < 0:
         raise SettingsError(f"seed: expected at least 0, found {seed}")
@@ -54,10 +53,11 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     driven = put_down(drive(track, settings.laps, settings.vehicle, wander_rng), lap, faults.vehicle)
     odometry, calibration = measure_odometry(driven, lap, settings.odometry, faults.odometry, odometry_rng)
     cycles, associations = _perceive(track, driven, settings, *sensor_rngs)
+    errors = np.array([getattr(faults.sensor, name) for name in SENSOR])
     truth = replace(
         _truth(track, driven, cycles, associations),
         calibration=calibration,
-        sensor=_constant_errors(faults.sensor),
+        sensor=errors if errors.any() else None,
         noise=_noise(settings),
     )
     log = Log(
@@ -71,12 +71,6 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     return scaled(log, settings.scale)
 
 
-def _constant_errors(faults: SensorFaults) -> FloatArray | None:
-    """Return the constant errors (5,) in the order of `io.log:SENSOR`, or None where there are none."""
-    errors = np.array([getattr(faults, name) for name in SENSOR])
-    return errors if errors.any() else None
-
-
 def _noise(settings: SimulationSettings) -> FloatArray | None:
     """Return the noise (6,) in the order of `io.log:NOISE`, or None where all of it is white."""
     odometry, sensor = settings.odometry, settings.sensor
@@ -87,7 +81,6 @@ def _noise(settings: SimulationSettings) -> FloatArray | None:
 
 
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
-    """Return what the log says of its making, with its faults and slow errors where it has any."""
     source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
     source |= {"scale": str(settings.scale)} if settings.scale != 1.0 else {}
     for group in ("odometry", "sensor"):
@@ -101,7 +94,6 @@ def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, 
 def _perceive(
     track: Track, driven: Drive, settings: SimulationSettings, sensor_rng: Generator, colour_rng: Generator
 ) -> tuple[list[Detections], IntArray]:
-    """Return the perception cycles that are not empty, and the true cone of each detection."""
     faults, rate, lap = settings.faults, settings.sensor.rate, track.centre_line.length
     cones = ConeSensor(track.cones, colours(track, faults.vehicle.wrong_way), settings.sensor, sensor_rng)
     sensor = FaultySensor(cones, track.cone_labels, driven, lap, faults.sensor, colour_rng)
@@ -180,11 +172,9 @@ Third differences of the readings gave the white noise. The slow errors and the 
 240 m in 90 s ends 1 m and 0.02 rad off by dead reckoning: the three laps ended 0.8, 0.8 and 1.9 m, and 0.01
 to 0.03 rad off. The correlation time is assumed.
 """
-INS_RATE: Final = 40.0
-"""Rate of the INS (Hz)."""
+INS_RATE: Final = 40.0  # rate of the INS (Hz)
 
-PLAIN: Final = "plain"
-"""Name of the preset that changes nothing."""
+PLAIN: Final = "plain"  # name of the preset that changes nothing
 
 
 def _camera(settings: SimulationSettings) -> SimulationSettings:

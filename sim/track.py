@@ -9,53 +9,36 @@ import numpy as np
 
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
-from .curves import (
-    STEP,
-    CentreLine,
-    FloatArray,
-    IntArray,
-    along_path,
-    direction,
-    fit_centre_line,
-    left_normals,
-)
+from . import curves
+from .curves import CentreLine, FloatArray, IntArray, direction, left_normals
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
     """Cones of a track, in a frame of its own."""
 
-    left: FloatArray
-    """Cones of the left boundary in driving order (n, 2) in m."""
-    right: FloatArray
-    """Cones of the right boundary in driving order (m, 2) in m."""
-    other: FloatArray
-    """Cones of no boundary, such as those of a gate (k, 2) in m."""
-    closed: bool
-    """Whether the last cones are followed by the first."""
-    start: FloatArray
-    """Pose [x, y, theta] (3,) from which the vehicle starts, in m, m, rad."""
+    left: FloatArray  # cones of the left boundary in driving order (n, 2) in m
+    right: FloatArray  # cones of the right boundary in driving order (m, 2) in m
+    other: FloatArray  # cones of no boundary, such as those of a gate (k, 2) in m
+    closed: bool  # whether the last cones are followed by the first
+    start: FloatArray  # pose [x, y, theta] (3,) from which the vehicle starts, in m, m, rad
     name: str
-    other_labels: IntArray | None = None
-    """Labels (k,) of the other cones, by default UNKNOWN."""
-    path: FloatArray | None = None
-    """Points (k, 2) along which the road is driven, if not once along its middle (m)."""
+    other_labels: IntArray | None = None  # labels (k,) of the other cones, by default UNKNOWN
+    path: FloatArray | None = None  # (k, 2) along which the road is driven, if not its middle (m)
 
     @cached_property
     def centre_line(self) -> CentreLine:
         """The smooth curve halfway between the boundaries, or along the path, track frame."""
         if self.path is not None:
-            return along_path(self.path, np.vstack([self.left, self.right]), self.closed)
-        return fit_centre_line(self.left, self.right, self.closed, self.start[:2])
+            return curves.along_path(self.path, np.vstack([self.left, self.right]), self.closed)
+        return curves.fit_centre_line(self.left, self.right, self.closed, self.start[:2])
 
     @property
     def cones(self) -> FloatArray:
-        """All cones (M, 2) in m: left, right, other."""
         return np.vstack([self.left, self.right, self.other])
 
     @property
     def cone_labels(self) -> IntArray:
-        """Labels (M,) of `cones`."""
         other = np.full(len(self.other), UNKNOWN) if self.other_labels is None else self.other_labels
         return np.concatenate([np.repeat([LEFT, RIGHT], [len(self.left), len(self.right)]), other])
 
@@ -71,32 +54,23 @@ def to_map_frame(track: Track) -> Track:
     return replace(track, **moved, start=np.zeros(3))
 
 
-LANE: Final = 3.0
-"""Width of the road in both events (m)."""
-CIRCLES: Final = 18.25
-"""Distance of the centres of the skidpad's circles (m)."""
-INNER: Final = 15.25 / 2
-"""Radius of the circle of inner cones (m)."""
+LANE: Final = 3.0  # width of the road in both events (m)
+CIRCLES: Final = 18.25  # distance of the centres of the skidpad's circles (m)
+INNER: Final = 15.25 / 2  # radius of the circle of inner cones (m)
 INNER_CONES: Final = 16
 OUTER_CONES: Final = 13
-APPROACH: Final = 15.0
-"""Length of the lanes into and out of the circles (m)."""
-ROUNDS: Final = 2
-"""Rounds in each circle, the right one first."""
+APPROACH: Final = 15.0  # length of the lanes into and out of the circles (m)
+ROUNDS: Final = 2  # rounds in each circle, the right one first
 
-STRETCH: Final = 75.0
-"""Length of the acceleration event (m)."""
-BRAKING: Final = 75.0
-"""Length of the road after its finish line, on which vehicles brake (m)."""
-SPACING: Final = 5.0
-"""Distance of the cones along it (m)."""
+STRETCH: Final = 75.0  # length of the acceleration event (m)
+BRAKING: Final = 75.0  # length of the road after its finish line, on which vehicles brake (m)
+SPACING: Final = 5.0  # distance of the cones along it (m)
 
 
 def skidpad() -> Track:
     """Return the two circles, entered and left along x between them: two rounds right, two rounds left.
 
-    Inner and outer cones have the colour of their side as each circle is driven. The cones of the lanes into
-    and out of the circles are orange.
+    Cones have the colour of their side as each circle is driven; those of the lanes are orange.
     """
     middle, outer = CIRCLES / 2, INNER + LANE
     # the outer rows leave the lanes free
@@ -107,7 +81,7 @@ def skidpad() -> Track:
     mirrored = np.array([1.0, -1.0])
     x = np.arange(-APPROACH, -LANE - 2.0, LANE)
     lanes = [(side * at, y) for at in x for side in (1, -1) for y in (-LANE / 2, LANE / 2)]
-    rounds = np.arange(0.0, ROUNDS * 2 * np.pi, STEP / middle)
+    rounds = np.arange(0.0, ROUNDS * 2 * np.pi, curves.STEP / middle)
     path = [
         _line(-APPROACH, 0.0),
         _circle(middle, rounds) + below,
@@ -127,13 +101,11 @@ def skidpad() -> Track:
 
 
 def _circle(radius: float, angles: FloatArray) -> FloatArray:
-    """Return points (n, 2) of a circle about the origin, from its top on clockwise."""
     return radius * np.column_stack([np.sin(angles), np.cos(angles)])
 
 
 def _line(begin: float, end: float) -> FloatArray:
-    """Return points (n, 2) along the x axis, the end left out."""
-    return np.arange(begin, end, STEP)[:, None] * [1.0, 0.0]
+    return np.arange(begin, end, curves.STEP)[:, None] * [1.0, 0.0]
 
 
 def acceleration() -> Track:

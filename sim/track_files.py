@@ -11,18 +11,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.parsing import (
-    MAX_CONES,
-    MAX_COORDINATE,
-    MAX_TRACK_BYTES,
-    MAX_TRACK_LENGTH,
-    MAX_TRACK_WIDTH,
-    Table,
-    parse_yaml,
-    read_table,
-    read_text,
-    shown,
-)
+from pathspace_graph.io import parsing as limits
+from pathspace_graph.io.parsing import Table, parse_yaml, read_table, read_text, shown
 from pathspace_graph.labels import BIG_ORANGE, POINTS, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
@@ -30,28 +20,17 @@ from .curves import FloatArray, along_polyline, arc_lengths, direction, left_nor
 from .driving_order import driving_order
 from .track import Track
 
-MIN_CONES: Final = 3
-"""Least number of cones of a boundary."""
-DUPLICATE_DISTANCE: Final = 0.3
-"""Distance below which two surveyed cones of one colour are one (m)."""
-REPEAT_DISTANCE: Final = 0.01
-"""Distance below which a cone of an ordered row is the one before again (m)."""
-MAX_UNPLACED: Final = 0.2
-"""Largest share of stray cones, which belong to no lane."""
-MAX_START_DISTANCE: Final = 10.0
-"""Largest distance of the start from the middle of the track (m)."""
-CONE_SPACING: Final = 5.0
-"""Largest distance of cones along a circuit that is given by its widths (m)."""
-ORANGE: Final = "orange"
-"""Part of PacSim's classes of cones of no boundary."""
-INVISIBLE: Final = "invisible"
-"""PacSim's class of cones that are not detected."""
-MIN_CLEARANCE: Final = 0.2
-"""Least distance of the middle of a road from a cone, as a share of the usual one."""
-WIDTH_STEP: Final = 0.5
-"""Distance of samples of a circuit (m)."""
-TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
-"""Columns of the centre line and of the distances of the boundaries from it."""
+MIN_CONES: Final = 3  # least number of cones of a boundary
+DUPLICATE_DISTANCE: Final = 0.3  # distance below which two surveyed cones of one colour are one (m)
+REPEAT_DISTANCE: Final = 0.01  # distance below which a cone of an ordered row is the one before again (m)
+MAX_UNPLACED: Final = 0.2  # largest share of stray cones, which belong to no lane
+MAX_START_DISTANCE: Final = 10.0  # largest distance of the start from the middle of the track (m)
+CONE_SPACING: Final = 5.0  # largest distance of cones along a circuit that is given by its widths (m)
+ORANGE: Final = "orange"  # part of PacSim's classes of cones of no boundary
+INVISIBLE: Final = "invisible"  # PacSim's class of cones that are not detected
+MIN_CLEARANCE: Final = 0.2  # least distance of the middle of a road from a cone, as a share of the usual one
+WIDTH_STEP: Final = 0.5  # distance of samples of a circuit (m)
+TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # centre line and widths
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
 """EUFS tags of cones of no boundary; further tags, such as midpoint, are no cones."""
 
@@ -60,23 +39,15 @@ EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
 class TrackFormat:
     """A kind of track file: how it is recognized, and what reads it."""
 
-    description: str
-    """Name of the format in messages."""
-    suffixes: tuple[str, ...]
-    """Ends of file names (lower case, with the dot)."""
-    parse: Callable[[Path], Any]
-    """Parser of a file to the content that the next two take; it raises an InputError where it can't."""
+    description: str  # name of the format in messages
+    suffixes: tuple[str, ...]  # ends of file names (lower case, with the dot)
+    parse: Callable[[Path], Any]  # from a file to its content, or an InputError
     recognizes: Callable[[Any], bool]
-    read: Callable[[Path, Any], Track]
-    """Reader of the track from the path, which its errors name, and the content."""
+    read: Callable[[Path, Any], Track]  # from the path, for errors, and the content
 
 
 def read_track(path: Path | str) -> Track:
-    """Return the track in a file of a known format: its cones in driving order, in the file's own frame.
-
-    Raises an InputError that names the row or the key where the file is missing, of no known format or
-    malformed.
-    """
+    """Return the track in a file, with its cones in driving order; an InputError names the row or the key."""
     path = Path(path)
     if not path.is_file():
         raise InputError(path, f"expected a track file, found {'a folder' if path.is_dir() else 'none'}")
@@ -112,10 +83,9 @@ def _check(path: Path, track: Track) -> None:
 
 
 def _check_size(path: Path, row: FloatArray, name: str) -> None:
-    """Raise an InputError where a row of points (n, 2) has too many or is too long."""
     length = float(arc_lengths(row)[-1]) if len(row) else 0.0
-    if len(row) > MAX_CONES or length > MAX_TRACK_LENGTH:
-        expected = f"expected at most {MAX_CONES} cones over {MAX_TRACK_LENGTH:g} m as {name}"
+    if len(row) > limits.MAX_CONES or length > limits.MAX_TRACK_LENGTH:
+        expected = f"expected at most {limits.MAX_CONES} cones over {limits.MAX_TRACK_LENGTH:g} m as {name}"
         raise InputError(path, f"{expected}, found {len(row)} over {length:g} m")
 
 
@@ -123,7 +93,7 @@ def _check_size(path: Path, row: FloatArray, name: str) -> None:
 
 
 def _parse_yaml(path: Path) -> Any:
-    return parse_yaml(read_text(path, "YAML", MAX_TRACK_BYTES), path)
+    return parse_yaml(read_text(path, "YAML", limits.MAX_TRACK_BYTES), path)
 
 
 def _is_pacsim(data: Any) -> bool:
@@ -150,7 +120,10 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     ]
     others = [_pacsim_cones(path, data.get("unknown"), "track.unknown"), *rows]
     other, kinds = (np.concatenate(parts) for parts in zip(*others, strict=True))
-    labels = np.array([_pacsim_label(kind) for kind in kinds.tolist()], int)
+    orange = (BIG_ORANGE if "big" in kind else SMALL_ORANGE for kind in kinds.tolist())
+    labels = np.array(
+        [one if ORANGE in kind else UNKNOWN for one, kind in zip(orange, kinds, strict=True)], int
+    )
     no_boundary = np.isin(labels, POINTS) | (np.arange(len(labels)) < len(others[0][0]))
     left, right = (
         _without_repeats(points[[ORANGE not in kind for kind in kinds.tolist()]], closed)
@@ -163,7 +136,6 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
 
 
 def _with_hidden(track: Track, hidden: FloatArray) -> Track:
-    """Return the track without the cones (k, 2) that nobody sees; they still say where its middle is."""
     line = track.centre_line
     left, right = (
         row[~(row[:, None] == hidden).all(axis=2).any(axis=1)] for row in (track.left, track.right)
@@ -179,11 +151,6 @@ def _pacsim_cones(path: Path, cones: object, key: str) -> tuple[FloatArray, NDAr
         points.append(_vector(path, _get(path, cone, "position", f"{key}[{k}]."), 2, f"{key}[{k}].position"))
         kinds.append(str(cone.get("class", "")))
     return np.array(points).reshape(-1, 2), np.array(kinds, str)
-
-
-def _pacsim_label(kind: str) -> int:
-    orange = BIG_ORANGE if "big" in kind else SMALL_ORANGE
-    return orange if ORANGE in kind else UNKNOWN
 
 
 def _fssim(path: Path, data: Mapping[str, Any]) -> Track:
@@ -213,8 +180,8 @@ def _list(path: Path, value: object, key: str) -> list[Any]:
         return []
     if not isinstance(value, list):
         raise InputError(path, f"expected a list at {key}, found {shown(value)}")
-    if len(value) > MAX_CONES:
-        raise InputError(path, f"expected at most {MAX_CONES} cones at {key}, found {len(value)}")
+    if len(value) > limits.MAX_CONES:
+        raise InputError(path, f"expected at most {limits.MAX_CONES} cones at {key}, found {len(value)}")
     return value
 
 
@@ -229,14 +196,13 @@ def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
         raise InputError(path, f"expected {size} numbers at {key}, found {shown(value)}") from None
     if not np.isfinite(vector).all():
         raise InputError(path, f"expected finite numbers at {key}, found {shown(value)}")
-    if np.abs(vector).max() > MAX_COORDINATE:
-        expected = f"expected numbers of at most {MAX_COORDINATE:g} in size at {key}"
+    if np.abs(vector).max() > limits.MAX_COORDINATE:
+        expected = f"expected numbers of at most {limits.MAX_COORDINATE:g} in size at {key}"
         raise InputError(path, f"{expected}, found {shown(value)}")
     return vector
 
 
 def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
-    """Remove cones that repeat the one before, and on a closed row a last one that repeats the first."""
     if not len(row):
         return row
     row = row[np.append(True, np.linalg.norm(np.diff(row, axis=0), axis=1) > REPEAT_DISTANCE)]
@@ -249,7 +215,7 @@ def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
 
 
 def _parse_csv(path: Path) -> Table:
-    return read_table(path, (), comment="#", most=MAX_TRACK_BYTES)
+    return read_table(path, (), comment="#", most=limits.MAX_TRACK_BYTES)
 
 
 def _is_tum(table: Table) -> bool:
@@ -264,8 +230,8 @@ def _eufs(path: Path, _: Table) -> Track:
     table = read_table(path, ("tag", "x", "y"))
     tags = np.array([tag.strip().lower() for tag in table.columns["tag"]])
     points = table.stack(("x", "y"))
-    if len(points) > 2 * MAX_CONES:
-        raise InputError(path, f"expected at most {2 * MAX_CONES} cones, found {len(points)}")
+    if len(points) > 2 * limits.MAX_CONES:
+        raise InputError(path, f"expected at most {2 * limits.MAX_CONES} cones, found {len(points)}")
     left, right = (_without_duplicates(points[tags == tag]) for tag in ("blue", "yellow"))
     others = [_without_duplicates(points[tags == tag]) for tag in EUFS_OTHER]
     gate = points[tags == "big_orange"]
@@ -335,8 +301,8 @@ def _tum_circuit(path: Path) -> FloatArray:
     circuit = table.stack(TUM_COLUMNS)
     widths = circuit[:, 2:]
     table.require(np.asarray(widths.min(axis=1) > 0), "expected widths above 0")
-    widest = f"expected widths of at most {MAX_TRACK_WIDTH:g} m"
-    table.require(np.asarray(widths.max(axis=1) <= MAX_TRACK_WIDTH), widest)
+    widest = f"expected widths of at most {limits.MAX_TRACK_WIDTH:g} m"
+    table.require(np.asarray(widths.max(axis=1) <= limits.MAX_TRACK_WIDTH), widest)
     _check_size(path, circuit[:, :2], "the middle of the track")
     moved = np.asarray(np.diff(arc_lengths(circuit[:, :2])) > REPEAT_DISTANCE)
     table.require(np.append(True, moved)[: len(circuit)], "expected a point other than the one before")
@@ -348,7 +314,6 @@ def _tum_circuit(path: Path) -> FloatArray:
 
 
 def _spaced(boundary: FloatArray) -> FloatArray:
-    """Return cones at equal gaps along a closed polyline (n, 2)."""
     polyline = ring(boundary)
     s = arc_lengths(polyline)
     at = np.linspace(0.0, s[-1], math.ceil(s[-1] / CONE_SPACING), endpoint=False)

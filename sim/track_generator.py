@@ -12,29 +12,15 @@ from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError, check_numbers
 
-from .curves import (
-    SMOOTHING,
-    STEP,
-    FloatArray,
-    along_polyline,
-    arc_lengths,
-    curvature,
-    left_normals,
-    ring,
-    unit,
-)
+from . import curves
+from .curves import FloatArray, arc_lengths, left_normals, ring, unit
 from .track import Track
 
-MAX_ATTEMPTS: Final = 500
-"""Attempts that may fail; two in three keep the default rules, and contradicting settings fail them all."""
-STRAIGHT_RADIUS: Final = 150.0
-"""Radius above which a stretch is straight (m)."""
-CORNER_RADIUS: Final = 8.0
-"""Radius at which cones stand twice as close as on straights (m)."""
-CORNER_BLUR: Final = 2.0
-"""Standard deviation of the Gaussian by which corners draw cones closer before and after them (m)."""
-MIN_CONE_GAP: Final = 1.0
-"""Least distance of cones along a row (m)."""
+MAX_ATTEMPTS: Final = 500  # two in three keep the default rules; contradicting ones fail them all
+STRAIGHT_RADIUS: Final = 150.0  # radius above which a stretch is straight (m)
+CORNER_RADIUS: Final = 8.0  # radius at which cones stand twice as close as on straights (m)
+CORNER_BLUR: Final = 2.0  # sigma (m) by which corners draw cones closer before and after
+MIN_CONE_GAP: Final = 1.0  # least distance of cones along a row (m)
 
 
 @dataclass(frozen=True)
@@ -82,10 +68,7 @@ class TrackGeneratorSettings:
 
 
 def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = None) -> Track:
-    """Return a random closed track that keeps the rules and starts on its longest straight.
-
-    Layouts are drawn until one keeps every rule; a SettingsError is raised where none does.
-    """
+    """Return a random closed track that keeps the rules and starts on its longest straight."""
     settings = settings or TrackGeneratorSettings()
     for _ in range(MAX_ATTEMPTS):
         width = rng.uniform(*settings.width)
@@ -104,7 +87,6 @@ class _Layout(NamedTuple):
 
 
 def _least_radius(width: float, settings: TrackGeneratorSettings) -> float:
-    """Return the least radius of the centre line in m."""
     return (settings.hairpin_diameter - width) / 2
 
 
@@ -155,7 +137,6 @@ def _with_hairpin(layout: _Layout, leg: float, least: float, rng: Generator) -> 
 
 
 def _rounded(layout: _Layout, least: float) -> _Layout | None:
-    """Cut the radii to what the sides have room for; return None where one is less than the least."""
     half_turn = np.abs(_turns(layout.corners)) / 2
     before = np.linalg.norm(layout.corners - np.roll(layout.corners, 1, axis=0), axis=1)
     # both corners of a side may take half of it
@@ -165,7 +146,6 @@ def _rounded(layout: _Layout, least: float) -> _Layout | None:
 
 
 def _turns(corners: FloatArray) -> FloatArray:
-    """Return the signed change of direction at each corner (n,) in rad."""
     before = corners - np.roll(corners, 1, axis=0)
     after = np.roll(before, -1, axis=0)
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
@@ -185,12 +165,12 @@ def _curve(layout: _Layout, settings: TrackGeneratorSettings, rng: Generator) ->
         pieces.append(_straight(corners[k] + direction * tangent[k], end, settings, rng))
         pieces.append(_arc(end, direction, radii[following], turns[following]))
     curve = _evenly(np.vstack(pieces))
-    return np.asarray(gaussian_filter1d(curve, SMOOTHING / STEP, axis=0, mode="wrap"))
+    return np.asarray(gaussian_filter1d(curve, curves.SMOOTHING / curves.STEP, axis=0, mode="wrap"))
 
 
 def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -> FloatArray:
     """Return samples of an arc from `begin` on, first along `direction`."""
-    angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / STEP), 1), endpoint=False)
+    angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / curves.STEP), 1), endpoint=False)
     normal = left_normals(direction) * np.sign(turn)
     forward, sideways = np.sin(np.abs(angles))[:, None], 1 - np.cos(angles)[:, None]
     return np.asarray(begin + radius * (forward * direction + sideways * normal))
@@ -201,24 +181,16 @@ def _straight(
 ) -> FloatArray:
     """Return samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
     length = float(np.linalg.norm(end - begin))
-    if length < STEP:
+    if length < curves.STEP:
         return begin[None]
-    along = np.arange(0.0, length, STEP)
+    along = np.arange(0.0, length, curves.STEP)
     direction = (end - begin) / length
-    offset = _element(along, length, settings, rng)
-    return begin + along[:, None] * direction + offset[:, None] * left_normals(direction)
-
-
-def _element(
-    along: FloatArray, length: float, settings: TrackGeneratorSettings, rng: Generator
-) -> FloatArray:
-    """Return the lateral offset (n,) of a slalom, a chicane or nothing, on a straight of this length."""
-    dice = rng.random()
+    dice, offset = rng.random(), np.zeros_like(along)
     if dice < settings.slalom_probability:
-        return _slalom(along, length, rng)
-    if dice - settings.slalom_probability < settings.chicane_probability:
-        return _chicane(along, length, rng)
-    return np.zeros_like(along)
+        offset = _slalom(along, length, rng)
+    elif dice - settings.slalom_probability < settings.chicane_probability:
+        offset = _chicane(along, length, rng)
+    return begin + along[:, None] * direction + offset[:, None] * left_normals(direction)
 
 
 def _slalom(along: FloatArray, length: float, rng: Generator) -> FloatArray:
@@ -250,10 +222,11 @@ def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
 
 
 def _evenly(points: FloatArray) -> FloatArray:
-    """Return samples (n, 2) of a closed polyline at equal distances of about STEP."""
     polyline = ring(points)
     s = arc_lengths(polyline)
-    return along_polyline(np.linspace(0.0, s[-1], int(s[-1] / STEP), endpoint=False), s, polyline)
+    return curves.along_polyline(
+        np.linspace(0.0, s[-1], int(s[-1] / curves.STEP), endpoint=False), s, polyline
+    )
 
 
 def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettings) -> bool:
@@ -261,19 +234,17 @@ def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettin
     return bool(
         settings.lap_length[0] <= arc_lengths(ring(curve))[-1] <= settings.lap_length[1]
         and bend.max() * _least_radius(width, settings) <= 1
-        and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * STEP <= settings.straight_max
+        and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * curves.STEP <= settings.straight_max
         and _is_separate(curve, width + settings.separation)
     )
 
 
 def _curvature(curve: FloatArray) -> FloatArray:
-    """Return the signed curvature (n,) in 1/m of an evenly sampled closed curve."""
     after, before = np.roll(curve, -1, axis=0), np.roll(curve, 1, axis=0)
-    return curvature((after - before) / 2, after - 2 * curve + before)
+    return curves.curvature((after - before) / 2, after - 2 * curve + before)
 
 
 def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return start and length of the longest run of good samples on a ring."""
     bad = np.flatnonzero(~good)
     if not len(bad):
         return 0, len(good)
@@ -286,7 +257,7 @@ def _is_separate(curve: FloatArray, distance: float) -> bool:
     """Return whether samples nearer than `distance` are of one stretch, apart by less than half a circle."""
     pairs = cKDTree(curve).query_pairs(distance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
-    apart = np.minimum(apart, len(curve) - apart) * STEP
+    apart = np.minimum(apart, len(curve) - apart) * curves.STEP
     return bool((apart < np.pi * distance / 2).all())
 
 
@@ -297,7 +268,7 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     normals = left_normals(unit(along))
     crowding = 1 + CORNER_RADIUS * gaussian_filter1d(
-        np.abs(_curvature(curve)), CORNER_BLUR / STEP, mode="wrap"
+        np.abs(_curvature(curve)), CORNER_BLUR / curves.STEP, mode="wrap"
     )
     rows = [curve + side * normals * width / 2 for side in (1.0, -1.0)]
     gap = _straight_gap(rows, crowding, settings)
@@ -307,13 +278,10 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
 
 
 def _density(gap: float, crowding: FloatArray, settings: TrackGeneratorSettings) -> FloatArray:
-    """Return the number of cones per metre (n,) along a row for this gap on straights."""
     return 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, settings.cone_gap_max)
 
 
 def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackGeneratorSettings) -> float:
-    """Return the gap on straights, before it is limited, that gives the wanted number of cones."""
-
     def excess(gap: float) -> float:
         density = _density(gap, crowding, settings)
         return float(sum(_cumulative(row, density)[-1] for row in rows)) - settings.cones
@@ -337,4 +305,4 @@ def _place_cones(row: FloatArray, density: FloatArray, rng: Generator) -> FloatA
     total = _cumulative(row, density)
     count = int(np.ceil(total[-1]))
     at = (np.arange(count) + rng.random()) * total[-1] / count
-    return along_polyline(at, total, ring(row))
+    return curves.along_polyline(at, total, ring(row))

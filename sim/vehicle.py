@@ -12,12 +12,9 @@ from pathspace_graph.errors import SettingsError, check_numbers
 from .curves import CentreLine, FloatArray, arc_lengths, curvature, direction, left_normals
 from .track import Track
 
-PATH_STEP: Final = 0.25
-"""Distance of the samples of the driven path (m)."""
-WAVES: Final = 8
-"""Number of sines whose sum is the wander."""
-MIN_PATH: Final = 10
-"""Least number of samples of a path."""
+PATH_STEP: Final = 0.25  # distance of the samples of the driven path (m)
+WAVES: Final = 8  # number of sines whose sum is the wander
+MIN_PATH: Final = 10  # least number of samples of a path
 
 
 @dataclass(frozen=True)
@@ -64,14 +61,9 @@ class VehicleSettings:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What the vehicle truly did."""
-
-    t: FloatArray
-    """Stamps (N,) in s, from 0."""
-    poses: FloatArray
-    """True poses [x, y, theta] (N, 3), map frame, from (0, 0, 0); theta is not wrapped."""
-    twists: FloatArray
-    """True body twists [vx, vy, wz] (N, 3), each held until the next stamp."""
+    t: FloatArray  # stamps (N,) in s, from 0
+    poses: FloatArray  # true poses [x, y, theta] (N, 3), map frame, from (0, 0, 0); theta is not wrapped
+    twists: FloatArray  # true body twists [vx, vy, wz] (N, 3), each held until the next stamp
 
 
 def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> Drive:
@@ -87,10 +79,7 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
 
 
 def integrate(twists: FloatArray, dt: float) -> FloatArray:
-    """Integrate body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from (0, 0, 0), not wrapped.
-
-    Over one step the vehicle moves by `V(wz dt) [vx, vy] dt` in its own frame, the exponential map of SE(2).
-    """
+    """Integrate body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from 0 by SE(2)'s exp."""
     theta = np.concatenate([[0.0], np.cumsum(twists[:, 2] * dt)])
     a, b = _exponential(twists[:, 2] * dt)
     dx = (a * twists[:, 0] - b * twists[:, 1]) * dt
@@ -148,7 +137,6 @@ def _settling(
 
 
 def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng: Generator) -> FloatArray:
-    """Return the lateral wander (n,) in m: a sum of sines of random phases, from 0 on."""
     shortest, longest = settings.wander_wavelengths
     wavenumbers = 2 * np.pi * rng.uniform(1 / longest, 1 / shortest, WAVES)
     phases = rng.uniform(0.0, 2 * np.pi, WAVES)
@@ -174,7 +162,6 @@ def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
 
 
 def _stations(path: CubicSpline, speeds: FloatArray, rate: float) -> FloatArray:
-    """Return the arc lengths at the stamps k / rate, with constant acceleration between knots."""
     s = path.x
     durations = 2 * np.diff(s) / (speeds[1:] + speeds[:-1])
     knots_t = np.concatenate([[0.0], np.cumsum(durations)])

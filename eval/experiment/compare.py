@@ -20,7 +20,7 @@ from pathspace_graph.io.files import is_temporary
 from pathspace_graph.io.log import LOG_FILE
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import BatchRun, RunResult
-from pathspace_graph.plausibility.reading import read_plausible_log
+from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 

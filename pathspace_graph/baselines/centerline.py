@@ -1,7 +1,7 @@
 """One centre line with a width: as the batch of a log, and from the posterior of the online mapper."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import gtsam
@@ -34,22 +34,15 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, settings_dict
 from pathspace_graph.scale import at_scale, log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import SIDE, CentreCurve, Ribbon, find_line
 
 NAME: Final = "centerline"
-ONLINE_NAME: Final = "centerline-fixed-lag"
-"""Names of the estimators on the command line."""
-ROOM: Final = 4.0
-"""Distance along the line within which a foot point is searched for (m)."""
-RIBBON_LETTER: Final = "a"
-"""Letter of the keys of a ribbon's control points, which hold `Point3` (x, y, h)."""
-ROUNDS: Final = 2
-"""Optimizations; before each, the control points are held beside the poses anew."""
-MAX_ITERATIONS: Final = 15
-"""Most iterations of one of them."""
-TOLERANCE: Final = 1e-5
-"""Share by which an iteration lowers the error at least, or it is the last one."""
+ONLINE_NAME: Final = "centerline-fixed-lag"  # names of the estimators on the command line
+ROOM: Final = 4.0  # distance along the line within which a foot point is searched for (m)
+RIBBON_LETTER: Final = "a"  # letter of the keys of a ribbon's control points, which hold `Point3` (x, y, h)
+ROUNDS: Final = 2  # optimizations; before each, the control points are held beside the poses anew
+MAX_ITERATIONS: Final = 15  # most iterations of one of them
+TOLERANCE: Final = 1e-5  # share by which an iteration lowers the error at least, or it is the last one
 
 
 # --- the map of a ribbon, and the ribbon of a map --------------------------------------------------------
@@ -58,43 +51,29 @@ TOLERANCE: Final = 1e-5
 def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
     """Return the edges of a ribbon as a map, with the covariance (3m, 3m) of its control points, if known.
 
-    `sigma_shape` (m) is added to each control point: what the edges cannot follow of the cones. `until` has
-    the parameter up to which an edge is confirmed, where it is open.
+    `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.
     """
-    edges = {label: ribbon.edge_spline(label) for label in BOUNDARIES}
-    if covariance is None:
-        none = {b: _boundary(spline, NO_COVARIANCE, until.get(b)) for b, (spline, _) in edges.items()}
-        return Map(ribbon.periodic, none)
-    by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
-    joint = by_ribbon @ covariance @ by_ribbon.T
-    joint = 0.5 * (joint + joint.T)
-    boundaries, at = {}, 0
-    for label, (spline, jacobian) in edges.items():
-        block = slice(at, at := at + len(jacobian))
-        own = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
-        boundaries[label] = _boundary(spline, own, until.get(label))
-    return Map(ribbon.periodic, boundaries, joint_covariance(joint, boundaries))
+    edges, joint, at = {label: ribbon.edge_spline(label) for label in BOUNDARIES}, None, 0
+    blocks = dict.fromkeys(BOUNDARIES, NO_COVARIANCE)
+    if covariance is not None:
+        by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
+        joint = by_ribbon @ covariance @ by_ribbon.T
+        joint = 0.5 * (joint + joint.T)
+        for label, (_, jacobian) in edges.items():
+            block = slice(at, at := at + len(jacobian))
+            blocks[label] = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
+    boundaries = {
+        label: SplineBoundary(spline, blocks[label], until.get(label, spline.domain[1]))
+        for label, (spline, _) in edges.items()
+    }
+    return Map(ribbon.periodic, boundaries, None if joint is None else joint_covariance(joint, boundaries))
 
 
-def _boundary(spline: BSpline, covariance: Array, until: float | None) -> SplineBoundary:
-    return SplineBoundary(spline, covariance, spline.domain[1] if until is None else until)
+def ribbon_of(track: Map, settings: MapperSettings) -> tuple[Ribbon, Array | None, dict[int, float]]:
+    """Return the ribbon between the boundaries of a map, or raise a SettingsError.
 
-
-@dataclass(frozen=True, eq=False)
-class FittedRibbon:
-    """A ribbon that was fitted to the boundaries of a map."""
-
-    ribbon: Ribbon
-    covariance: Array | None
-    """Covariance (3m, 3m) of its control points; None where that of the map is not known."""
-    until: dict[int, float]
-    """Parameter up to which an open edge is confirmed, by label."""
-
-
-def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
-    """Return the ribbon between the boundaries of a map, with the covariance that follows from theirs.
-
-    SettingsError is raised where the map has no two boundaries side by side.
+    With it come its covariance (3m, 3m), if that of the map is known, and the parameter up to which each open
+    edge is confirmed.
     """
     curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
     P = track.covariance_of(*curves.values())
@@ -104,18 +83,16 @@ def ribbon_of(track: Map, settings: MapperSettings) -> FittedRibbon:
         if not left.periodic:
             end = np.array([min(curve.confirmed_until, curve.spline.domain[1])])
             until[label] = float(line.ribbon_parameters(side, end)[0])
-    covariance = None if P is None else line.by_boundaries @ P @ line.by_boundaries.T
-    return FittedRibbon(line.ribbon, covariance, until)
+    return line.ribbon, None if P is None else line.by_boundaries @ P @ line.by_boundaries.T, until
 
 
 @at_scale
 class CenterlineMapper:
     """Maps a track online as a ribbon.
 
-    The fixed-lag smoother holds what all detections so far say, as a joint Gaussian of both boundaries. The
-    ribbon is estimated from it whenever the map is asked for, so that every detection counts as much as it
-    does there, and a cycle takes the same time. Where there is no line between the boundaries, the map is
-    theirs. What isn't described is that of `FixedLagMapper`.
+    The fixed-lag smoother holds what all detections say as a joint Gaussian of both boundaries, from which
+    the ribbon is estimated whenever the map is asked for. Where there is no line between the boundaries, the
+    map is theirs. What isn't described is that of `FixedLagMapper`.
     """
 
     def __init__(
@@ -141,19 +118,17 @@ class CenterlineMapper:
         return self.boundaries.vehicle_state()
 
     def map(self) -> Map:
-        """Return the edges of the ribbon, with their joint covariance."""
         return self._edges(self.boundaries.map())
 
     def outline(self) -> Map:
-        """Return the edges without covariances."""
         return self._edges(self.boundaries.outline())
 
     def _edges(self, track: Map) -> Map:
         try:
-            fitted = ribbon_of(track, self.settings)
+            ribbon, covariance, until = ribbon_of(track, self.settings)
         except SettingsError:
             return track
-        edges = map_of(fitted.ribbon, fitted.covariance, self.settings.spline.sigma_shape, fitted.until)
+        edges = map_of(ribbon, covariance, self.settings.spline.sigma_shape, until)
         return replace(edges, points=track.points)
 
 
@@ -161,7 +136,6 @@ class CenterlineMapper:
 
 
 def ribbon_keys(ribbon: Ribbon) -> list[int]:
-    """Return the keys of the distinct control points of a ribbon."""
     return [int(gtsam.symbol(RIBBON_LETTER, j)) for j in range(ribbon.size)]
 
 
@@ -197,10 +171,9 @@ def edge_factors(
 
 
 def shape_factors(ribbon: Ribbon, poses: Array, settings: MapperSettings) -> Iterator[gtsam.CustomFactor]:
-    """Yield the weak priors of the control points, each in the frame of the nearest pose of poses (n, 3).
+    """Yield the weak priors of the control points, each in the frame of the nearest of poses (n, 3).
 
-    Those of the line are the priors of a boundary (`CurveGauge`), and second differences of the width are
-    small as well.
+    Those of a boundary (`CurveGauge`), and small second differences of the width.
     """
     points, keys = ribbon.distinct_control_points[:, :2], np.array(ribbon_keys(ribbon))
     cycle = ((points[:, None] - poses[:, :2]) ** 2).sum(axis=2).argmin(axis=1)
@@ -229,8 +202,6 @@ Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 def _of_line(terms: Terms) -> Terms:
-    """Return terms of the control points (1, 3) of a ribbon, from those of points of a line."""
-
     def of_line(points: Array, pose: Array) -> tuple[Array, Array, Array]:
         residual, by_points, by_pose = terms(points[:, :2], pose)
         return residual, np.column_stack([by_points, np.zeros(1)]), by_pose
@@ -251,7 +222,6 @@ def _with_width(terms: Terms, weights: Array) -> Terms:
 
 
 def ribbon_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ribbon: Ribbon) -> Array:
-    """Return the joint covariance (3m, 3m) of the control points, all other variables marginalized out."""
     keys = np.array(ribbon_keys(ribbon))
     marginal = sparse_marginal(graph.linearize(values), keys)
     information, _ = marginal.hessian(gtsam.Ordering(keys.tolist()))
@@ -260,10 +230,9 @@ def ribbon_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, r
 
 @log_at_scale
 class CenterlineBatch:
-    """Maps a whole log as a ribbon: all poses and one ribbon, by GTSAM's own optimizer.
+    """Maps a whole log as a ribbon by GTSAM's optimizer, from the batch of two boundaries.
 
-    The start, with the sides of the detections, is the batch of two boundaries. Where there is no line
-    between them, since one was never seen or they cross, their map is the result.
+    The map is theirs where there is no line between them.
     """
 
     def __init__(
@@ -272,25 +241,14 @@ class CenterlineBatch:
         odometry_sigma: Array | KnownNoise | None = None,
         online: Callable[[MapperSettings, KnownNoise], CurveMapper] | None = None,
     ) -> None:
-        """Keep the settings and what `BatchMapper` takes."""
         self.settings = settings or MapperSettings()
         self._boundaries = BatchMapper(self.settings, odometry_sigma, online)
 
     def solve(self, log: Log) -> BatchRun:
-        """Return the optimum over a whole log."""
         start = self._boundaries.solve(log)
-        run = BatchRun(
-            estimator=NAME,
-            settings=settings_dict(self.settings),
-            map=start.map,
-            trajectory_t=start.trajectory_t,
-            trajectory=start.trajectory,
-            cycles=start.cycles,
-            laps=start.laps,
-            converged=start.converged,
-            cost=start.cost,
-            noise=start.noise,
-        )
+        names = ("map", "trajectory_t", "trajectory", "cycles", "laps", "converged", "cost", "noise")
+        shared = {name: getattr(start, name) for name in names}
+        run = BatchRun(estimator=NAME, settings=settings_dict(self.settings), **shared)
         with threadpool_limits(limits=1), solving("the batch"):
             try:
                 return self._optimized(start, run)
@@ -332,7 +290,6 @@ class CenterlineBatch:
 
 
 def _poses(values: gtsam.Values, count: int) -> Array:
-    """Return the poses (n, 3), with headings that do not jump."""
     poses = np.array([pose_array(values.atPose2(pose_key(k))) for k in range(count)])
     poses[:, 2] = np.unwrap(poses[:, 2])
     return poses

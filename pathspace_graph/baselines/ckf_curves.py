@@ -12,28 +12,16 @@ from pathspace_graph.factors.se2 import rotated, rotation, to_map
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping import path
 from pathspace_graph.mapping.belief import Belief, point_columns
-from pathspace_graph.mapping.path import (
-    CARRIED_TO,
-    END_BEHIND,
-    MIN_CARRY,
-    MIN_LATERAL,
-    SIDES,
-    STATION_MARGIN,
-    STRANDED,
-    Candidates,
-    End,
-    PathAhead,
-    chain,
-)
+from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.settings.batch import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
-SIGMA_START: Final = 0.3
-"""Standard deviation (m) of each control point of a new curve, beyond that of its first detections."""
+SIGMA_START: Final = 0.3  # of a new curve's control points (m), beyond that of its detections
 
 
 class CurveState:
@@ -41,12 +29,9 @@ class CurveState:
 
     def __init__(self, belief: Belief, settings: MapperSettings) -> None:
         self.settings = settings
-        self.belief = belief
-        """Mean and covariance of x."""
-        self.curves: dict[int, BSpline] = {}
-        """Curves by label. Only the number of their control points is current; see `spline`."""
-        self.pose_u: dict[int, float] = {}
-        """Parameter of the vehicle's foot point on each curve, not wrapped."""
+        self.belief = belief  # mean and covariance of x
+        self.curves: dict[int, BSpline] = {}  # by label; control points: only their number is current
+        self.pose_u: dict[int, float] = {}  # parameter of the vehicle's foot point on each curve, not wrapped
 
     @property
     def pose(self) -> Array:
@@ -72,7 +57,6 @@ class CurveState:
         return self.belief.covariance[np.ix_(columns, columns)]
 
     def spline(self, label: int) -> BSpline:
-        """Return a curve with its current control points."""
         return self.curves[label].with_points(self.control_points(label).copy())
 
     def foot_points(self, label: int, points: Array, low: Array, high: Array) -> FootPoints:
@@ -116,10 +100,7 @@ class CurveState:
         self.pose_u[label] = 0.0
 
     def extend(self, label: int, detection: Array, covariance: Array) -> None:
-        """Extend a curve to a detection (2,), vehicle frame: unclamp, insert, clamp (Hu et al. 2002).
-
-        The new control point has the uncertainty of the detection (2, 2) and of the pose.
-        """
+        """Extend a curve to a detection (2,), vehicle frame: unclamp, insert, clamp (Hu et al. 2002)."""
         belief, spline, p = self.belief, self.spline(label), self.curves[label].degree
         belief.add_points(detection[None], covariance[None])
         knots = spline.extension_knots(belief.points[-1])
@@ -131,7 +112,6 @@ class CurveState:
         self._limit_bending(label, p + 1)
 
     def _limit_bending(self, label: int, count: int) -> None:
-        """Apply a prior of little bending to a curve's last `count` control points."""
         curve = self.curves[label]
         last = np.arange(curve.size - count, curve.size)
         abscissae = greville(curve.knots, curve.degree)[last]
@@ -148,7 +128,6 @@ class CurveState:
         self.belief.reorder(np.insert(order, end - added, np.arange(count - added, count)))
 
     def replace(self, label: int, curve: BSpline, matrix: Array, sigma: float) -> None:
-        """Replace a curve by one with `matrix` (k, n) times its control points, plus noise of sigma (m)."""
         start = self.offset(label)
         stop = start + self.curves[label].size
         self.belief.transform_points(start, stop, matrix, np.full(len(matrix), sigma))
@@ -162,21 +141,17 @@ class CurveState:
         return boundary
 
 
-STRETCH: Final = 12.0
-"""An extension is at most this long (m), so a longer one takes several."""
-SIGMA_CARRY: Final = 1.0
-"""Standard deviation (m) of the control point that carries on a stranded end along the path."""
-RECENT: Final = 40
-"""A confirmed track is compared with this many of the last cones, not with those of the lap's beginning."""
-AT_END: Final = 1e-6
-"""A foot point within this distance (m) of the end's parameter is at the end."""
+STRETCH: Final = 12.0  # an extension is at most this long (m), so a longer one takes several
+SIGMA_CARRY: Final = 1.0  # of the control point that carries on a stranded end (m)
+RECENT: Final = 40  # last cones with which a confirmed track is compared
+AT_END: Final = 1e-6  # a foot point within this distance (m) of the end's parameter is at the end
 
 
 class Expansion:
     """What was detected beyond the curves, which expands them.
 
     A detection expands a curve only if it belongs to a confirmed track that comes next along the path. An end
-    that the vehicle has passed is extended beside the path, as in the other estimators.
+    that the vehicle has passed is extended beside the path.
     """
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -222,7 +197,6 @@ class Expansion:
     def _candidates(
         self, state: CurveState, label: int, detections: Detections, rows: IntArray, path_ahead: PathAhead
     ) -> Candidates:
-        """Return the detections `rows` of confirmed tracks that come next along the path."""
         settings, tentative = self.settings.growth, self.tentative[label]
         points = to_map(detections.points_vehicle[rows], state.pose[None])
         confirmed = tentative.points[self._undisputed(label, tentative.confirmed())]
@@ -238,7 +212,6 @@ class Expansion:
         return found.where(chain(found, end))
 
     def _undisputed(self, label: int, indices: IntArray) -> IntArray:
-        """Return the tracks that do not have more detections with another label around them."""
         tracks = self.tentative[label]
         votes = tracks.counts[indices].astype(np.float64)
         for other in (self.tentative[b] for b in BOUNDARIES if b != label):
@@ -248,11 +221,10 @@ class Expansion:
         return indices[votes >= 0.0]
 
     def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> BoolArray:
-        """Return which candidates (m,) meet the paper's three conditions, and lie ahead of the end."""
         high, control_points = state.curves[label].domain[1], state.control_points(label)
         low, _ = state.visible_range(label, len(found.points))
         foot = state.foot_points(label, found.points, np.minimum(low, high), np.full(len(low), high))
-        ahead = found.stations > end.station + STATION_MARGIN
+        ahead = found.stations > end.station + path.STATION_MARGIN
         return ahead & beyond_end(found.points, foot.u, high, control_points, self.settings.ckf)
 
     def _extend(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> bool:
@@ -272,7 +244,6 @@ class Expansion:
         return True
 
     def _covariances(self, detections: Detections, rows: IntArray) -> Array:
-        """Return the covariances (k, 2, 2) of detections as points of the curve, vehicle frame."""
         model = self.settings.ckf.sigma_model**2 * np.eye(2)
         return np.asarray(detections.covariances[rows] + model)
 
@@ -280,12 +251,12 @@ class Expansion:
         """Extend a curve whose end the vehicle has passed beside the path, nearly as far as the vehicle."""
         settings = self.settings.growth
         end = _end(state, label, path_ahead, END_BEHIND)
-        if end.station >= path_ahead.driven - STRANDED:
+        if end.station >= path_ahead.driven - path.STRANDED:
             return False
-        side = SIDES[label] * max(end.side, MIN_LATERAL)
-        point = path_ahead.beside(path_ahead.driven - CARRIED_TO, side)
+        side = SIDES[label] * max(end.side, path.MIN_LATERAL)
+        point = path_ahead.beside(path_ahead.driven - path.CARRIED_TO, side)
         distance = float(np.hypot(*(point - end.position)))
-        if not MIN_CARRY <= distance <= settings.max_unseen - self._carried[label]:
+        if not path.MIN_CARRY <= distance <= settings.max_unseen - self._carried[label]:
             return False
         self._carried[label] += distance
         point_vehicle = (point - state.pose[:2]) @ rotation(state.pose[2])
@@ -298,8 +269,8 @@ def beyond_end(
 ) -> BoolArray:
     """Return which points (m, 2) with foot points at u (m,) meet the paper's three conditions (m,).
 
-    The foot point is the end of the curve, at the parameter `high`; the point is farther from `C_n` than the
-    growth threshold, and farther from `C_{n-1}` than the separation.
+    The foot point is the end `high`; the point is farther from `C_n` than the growth threshold, and farther
+    from `C_{n-1}` than the separation.
     """
     at_end = u >= high - AT_END
     far = np.hypot(*(points - control_points[-1]).T) > settings.threshold

@@ -22,30 +22,20 @@ from pathspace_graph.settings.batch import CkfSettings
 
 from .ckf_curves import CurveState
 
-RANK: Final = 1e-9
-"""Singular values of the gain below this share of the largest one count as zero."""
-LEAST_BASIS: Final = 1e-3
-"""A control point is updated where its basis values at the detections add up to at least this."""
-
-
-# --- classification --------------------------------------------------------------------------------------
+RANK: Final = 1e-9  # singular values of the gain below this share of the largest one count as zero
+LEAST_BASIS: Final = 1e-3  # least sum of a control point's basis values for its update
 
 
 @dataclass(frozen=True, eq=False)
 class OnCurve:
     """The detections of a cycle that update a curve."""
 
-    rows: IntArray
-    """(m,) Rows of the cycle's detections."""
-    basis: Array
-    """(m, n) The curve's n basis functions at the foot points: the paper's B."""
-    tangents: Array
-    """(m, 2) Unit tangents at the foot points, map frame."""
-    distances: Array
-    """(m,) Squared Mahalanobis distances across the curve."""
+    rows: IntArray  # (m,) rows of the cycle's detections
+    basis: Array  # (m, n) the curve's n basis functions at the foot points: the paper's B
+    tangents: Array  # (m, 2) unit tangents at the foot points, map frame
+    distances: Array  # (m,) squared Mahalanobis distances across the curve
 
     def where(self, chosen: BoolArray) -> "OnCurve":
-        """Return the detections whose entry in `chosen` (m,) is set."""
         return OnCurve(self.rows[chosen], self.basis[chosen], self.tangents[chosen], self.distances[chosen])
 
 
@@ -62,7 +52,7 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     """Return the detections within the gate of a curve: `d^2 < chi^2 (n' K n + sigma^2 + g' Sigma g)`.
 
     d is the signed distance across the curve, n its normal, K the covariance of the detection, sigma^2 the
-    variances of the settings, and g the derivative of d by pose and control points. Sigma is their joint
+    variances of the settings, g the derivative of d by pose and control points, and Sigma their joint
     covariance. The foot point is in the stretch that the vehicle sees, and is not at an end of it.
     """
     gate, curve = state.settings.gate, state.curves[label]
@@ -91,23 +81,15 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     return OnCurve(rows, basis, foot.tangent_unit, squared).where(passes)
 
 
-# --- the fit of S_z --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class SplineMeasurement:
     """S_z on r control points, in the frame of the detections."""
 
-    points: Array
-    """(r, 2) Control points of S_z, in m."""
-    covariance: Array
-    """(2 r, 2 r) Their covariance over x0, y0, x1, y1 and so on, in m^2."""
-    gain: Array
-    """(r, m) G, the derivative of S_z by the detections."""
-    taken: Array
-    """(r, r) G B, the derivative of S_z by control points whose curve the detections lie on."""
-    known: Array
-    """(r, 2) Control points C_mu before the fit."""
+    points: Array  # (r, 2) control points of S_z, in m
+    covariance: Array  # (2 r, 2 r) their covariance over x0, y0, x1, y1 and so on, in m^2
+    gain: Array  # (r, m) G, the derivative of S_z by the detections
+    taken: Array  # (r, r) G B, the derivative of S_z by control points whose curve the detections lie on
+    known: Array  # (r, 2) control points C_mu before the fit
 
     def refitted(self, points: Array) -> Array:
         """Return `C_mu + G B (C - C_mu)`: the S_z of detections on curves with control points (k, r, 2)."""
@@ -135,8 +117,7 @@ def fit_detections(
 ) -> SplineMeasurement:
     """Fit S_z to detections (m, 2) with covariances (m, 2, 2): a cubature transform of the ridge regression.
 
-    basis (m, r) is evaluated at their foot points. known (r, 2) holds the control points in the frame of the
-    detections.
+    basis (m, r) is evaluated at their foot points, known (r, 2) are the control points in their frame.
     """
     m, r = basis.shape
     gain = ridge_gain(basis, settings)
@@ -152,21 +133,14 @@ def fit_detections(
     return SplineMeasurement(fitted.mean.reshape(r, 2), fitted.covariance, gain, gain @ basis, known)
 
 
-# --- the update ------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class CurveBlock:
     """The block of the measurement that is the S_z of one curve."""
 
-    columns: IntArray
-    """(2 r,) Entries of the state that are the measured control points."""
-    fitted: SplineMeasurement
-    """S_z in the vehicle frame."""
-    combinations: Array
-    """(2 r, q) Linear combinations of the coordinates of S_z that are measured."""
-    by_sensor: Array
-    """(2 r, 5) Derivative of S_z by the calibration of the sensor, as it corrects detections."""
+    columns: IntArray  # (2 r,) entries of the state that are the measured control points
+    fitted: SplineMeasurement  # S_z in the vehicle frame
+    combinations: Array  # (2 r, q) linear combinations of the coordinates of S_z that are measured
+    by_sensor: Array  # (2 r, 5) derivative of S_z by the calibration of the sensor, as it corrects detections
 
 
 def update(state: CurveState, detections: Detections, found: dict[int, OnCurve]) -> None:

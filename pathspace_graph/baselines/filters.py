@@ -1,5 +1,6 @@
 """The paper's filters: that of splines, which closes its loop, and its landmark baseline (paper: Results)."""
 
+from abc import abstractmethod
 from dataclasses import replace
 from typing import Final
 
@@ -15,18 +16,12 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.mapping import registration
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.motion import MeasuredMotion, known_noise
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import (
-    BEGINNING,
-    BEGINNING_SHARE,
-    WINDOW,
-    Motion,
-    near_start,
-    register,
-)
+from pathspace_graph.mapping.registration import Motion, near_start
 from pathspace_graph.mapping.seam import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Stopwatch
@@ -40,44 +35,56 @@ from .ckf_update import OnCurve, classify, update
 from .landmark_association import ROUGH, Association, Gates, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 
-REACH: Final = 9.0
-"""A curve is extended up to this far ahead of the vehicle (m along the predicted path)."""
-SIGMA_MATCH: Final = 0.6
-"""Sigma (m) of a detection in the registration with the early segment, which is worse than online."""
-PATIENCE: Final = 30.0
-"""Once this length of the beginning has been driven again (m), it closes the loop, however uncertain the
-position is: `SIGMA_PATIENCE` (m) replaces `closing.sigma_max`."""
-SIGMA_PATIENCE: Final = 1000.0
-SIGMA_TIE: Final = 0.15
-"""Standard deviation (m) of the distance between the ends of a curve where the loop closes."""
-TIE_REACH: Final = 1.0
-"""Points of the end that stay farther from the beginning than this (m) are no correspondences."""
+REACH: Final = 9.0  # a curve is extended up to this far ahead of the vehicle (m along the predicted path)
+SIGMA_MATCH: Final = 0.6  # of a detection in the registration (m), which is worse than online
+PATIENCE: Final = 30.0  # length of the beginning (m) driven again that closes the loop, however uncertain:
+SIGMA_PATIENCE: Final = 1000.0  # replaces `closing.sigma_max` (m) then
+SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the loop closes (m)
+TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
 
 class _Filter:
-    """What both filters share.
-
-    A cycle that cannot be used is a ReadingError and changes nothing. So is one that is late, since a filter
-    has no earlier pose that could take its detections.
-    """
+    """What both filters share; a late cycle is a ReadingError, since no earlier pose could take it."""
 
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
-        """Keep the settings, and the standard deviation (3,) of a twist (m/s, m/s, rad/s)."""
         self.settings = settings or MapperSettings()
         noise = known_noise(odometry_sigma)
         self.odometry_sigma = noise.odometry
         self.front_end = FrontEnd(self.settings, noise)
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
         """State `x = [pose | calibration | control points or landmarks]`."""
+        self._begin()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Make what only this filter has."""
+
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        """Process one perception cycle: the twists since the last one, and the detections of now."""
+        watch = Stopwatch()
+        cycle = self.front_end.admit(odometry, detections)
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
+        self.belief.follow(reading.motion)
+        self._locate(reading.motion)
+        detections = self.belief.corrected(reading.detections)
+        watch.lap("predict")
+        used, sizes, closed = self._use(detections, watch)
+        pose = self.belief.pose.copy()
+        return cycle.counted(CycleResult(detections.t, pose, sizes, used, closed, watch.laps))
+
+    def _locate(self, motion: MeasuredMotion) -> None:
+        """Take the newest pose into account."""
+
+    @abstractmethod
+    def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
+        """Map a cycle; return how many detections were used, the sizes, and whether the loop has closed."""
 
     def noise_used(self) -> RunNoise:
-        """Return the noise that is used now, and what was measured so far."""
         return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
-        """Return the newest pose and the calibration, with their joint covariance."""
         return self.belief.vehicle_state()
 
 
@@ -85,10 +92,7 @@ class _Filter:
 class CkfMapper(_Filter):
     """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points."""
 
-    def __init__(
-        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
-    ) -> None:
-        super().__init__(settings, odometry_sigma)
+    def _begin(self) -> None:
         self.state = CurveState(self.belief, self.settings)
         self.path = DrivenPath()
         self.expansion = Expansion(self.settings)
@@ -96,14 +100,7 @@ class CkfMapper(_Filter):
         self._recent: list[tuple[Array, Detections]] = []
         self._last_check = 0.0
 
-    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Process one perception cycle: the twists since the last one, and the detections of now."""
-        watch = Stopwatch()
-        cycle = self.front_end.admit(odometry, detections)
-        reading = self.front_end.update(cycle.odometry, cycle.detections)
-        self._predict(reading.motion)
-        detections = self.state.belief.corrected(reading.detections)
-        watch.lap("predict")
+    def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
         found = classify(self.state, detections)
         watch.lap("classify")
         found = self._expand(detections, found)
@@ -112,18 +109,15 @@ class CkfMapper(_Filter):
         watch.lap("update")
         self._close(detections)
         watch.lap("close")
-        used = sum(len(on.rows) for on in found.values())
-        return cycle.counted(self._result(detections.t, used, watch.laps))
+        sizes = [self.state.curves[label].size if label in self.state.curves else 0 for label in BOUNDARIES]
+        return sum(len(on.rows) for on in found.values()), (sizes[LEFT], sizes[RIGHT]), self.closed
 
-    def _predict(self, motion: MeasuredMotion) -> None:
-        """Predict the pose by the motion since the last cycle, and locate it on the curves."""
-        self.state.belief.follow(motion)
+    def _locate(self, motion: MeasuredMotion) -> None:
         self.state.locate_vehicle()
         self.path.update(self.state.pose.copy())
         self.path.steer(motion.twists)
 
     def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
-        """Expand the curves; then detections on the new stretch update it with the rest."""
         if self.closed:
             return found
         self.expansion.observe(self.state, detections)
@@ -140,7 +134,7 @@ class CkfMapper(_Filter):
         if self.closed:
             return
         self._recent.append((state.pose.copy(), detections))
-        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - WINDOW]
+        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - registration.WINDOW]
         if len(state.curves) == 0 or not near_start(self.path, state.pose, settings):
             return
         if self.path.length - self._last_check < settings.check_interval:
@@ -151,13 +145,7 @@ class CkfMapper(_Filter):
             simplify(state, self.expansion.observed)
             self.closed = True
 
-    def _result(self, t: float, used: int, stages: dict[str, float]) -> CycleResult:
-        curves = self.state.curves
-        left, right = (curves[label].size if label in curves else 0 for label in (LEFT, RIGHT))
-        return CycleResult(t, self.state.pose.copy(), (left, right), used, self.closed, stages)
-
     def map(self) -> Map:
-        """Return the map as it stands, with the joint covariance of each boundary's control points."""
         state = self.state
         curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
         keys = [state.columns(b, np.arange(curve.size)) for b, curve in sorted(state.curves.items())]
@@ -165,12 +153,8 @@ class CkfMapper(_Filter):
         return Map(self.closed, curves, state.belief.covariance[np.ix_(columns, columns)])
 
     def outline(self) -> Map:
-        """Return a copy of the present map without covariances."""
         curves = {b: SplineBoundary(self.state.spline(b), NO_COVARIANCE) for b in self.state.curves}
         return Map(self.closed, curves)
-
-
-# --- closing and simplification --------------------------------------------------------------------------
 
 
 def associate_early_segment(
@@ -182,12 +166,11 @@ def associate_early_segment(
     )
     covariance = state.belief.covariance[:POSE, :POSE]
     times = [detections.t for _, detections in cycles]
-    found = register(_recent(state, cycles), times, covariance, beginning, closing)
+    found = registration.register(_recent(state, cycles), times, covariance, beginning, closing)
     return None if found is None else found.motion
 
 
 def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveMap:
-    """Return the curves, the newest poses and their detections as the registration takes them."""
     track = CurveMap(state.settings)
     for label in state.curves:
         track.state.add_boundary(label, state.boundary(label), state.control_points(label))
@@ -203,7 +186,7 @@ def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
 
     `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where the motion moves S(u), near the end, on S(w), with
     the normal n. Along the tangent all k correspondences are one result of the registration, so each has
-    sqrt(k) times its sigma. Returns False, and does nothing, if an end has not reached its beginning yet.
+    sqrt(k) times its sigma. False, and nothing is done, if an end has not reached its beginning yet.
     """
     overlaps = {label: _overlap(state, label, motion) for label in state.curves}
     if not all(len(u) for u, _ in overlaps.values()):
@@ -229,10 +212,10 @@ def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Arra
     """Return parameters (k,) near the end of a curve, and those (k,) of the points they are moved on."""
     spline = state.spline(label)
     high = spline.domain[1]
-    u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
+    u = np.arange(max(high - registration.BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
     moved = motion.apply(spline.evaluate(u))
     zero = np.zeros(len(u))
-    beginning = min(BEGINNING, BEGINNING_SHARE * high)
+    beginning = min(registration.BEGINNING, registration.BEGINNING_SHARE * high)
     foot = state.foot_points(label, moved, zero, zero + beginning)
     on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
     return u[on], foot.u[on]
@@ -256,53 +239,32 @@ def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
         state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 
-# --- the baseline ----------------------------------------------------------------------------------------
-
-
 @at_scale
 class LandmarkCkf(_Filter):
     """Maps cones as points: predict, associate, update, create.
 
     The paper describes its baseline as "a similarly structured state and overall implementation style", with
-    the Mahalanobis distance as the cost of the assignment (section Results). Where it leaves something open,
-    the choice makes the baseline no weaker than it has to be: the gates are those of the landmark graph, a
-    detection is associated only with a landmark of its own label, a track becomes a landmark after
-    `ckf.sightings` detections (with 1, every detection beyond the gate creates one, as in the description),
-    and the calibration of the odometry is in its state too.
-
-    Landmarks are never merged, and the loop never closes. So ghosts stay, as the paper says of its baseline.
+    the Mahalanobis distance as the cost of the assignment (section Results). What it leaves open makes the
+    baseline no weaker than it has to be: the gates are those of the landmark graph, a detection is associated
+    only with a landmark of its own label, a track becomes a landmark after `ckf.sightings` detections, and
+    the odometry is calibrated. Landmarks are never merged, and the loop never closes, so ghosts stay.
     """
 
-    def __init__(
-        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
-    ) -> None:
-        super().__init__(settings, odometry_sigma)
-        self.labels: IntArray = np.zeros(0, np.intp)
-        """(n,) Labels of the landmarks."""
+    def _begin(self) -> None:
+        self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """Tracks by label that are not landmarks yet."""
 
-    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Process one perception cycle: the twists since the last one, and the detections of now."""
-        watch = Stopwatch()
-        cycle = self.front_end.admit(odometry, detections)
-        reading = self.front_end.update(cycle.odometry, cycle.detections)
-        self.belief.follow(reading.motion)
-        detections = self.belief.corrected(reading.detections)
-        watch.lap("predict")
+    def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
         found = self._associate(detections)
         watch.lap("associate")
         self._update(detections, found.landmark)
         watch.lap("update")
         self._create(detections, found.new)
         watch.lap("create")
-        used, sizes = int((found.landmark != UNASSOCIATED).sum()), landmark_counts(self.labels)
-        return cycle.counted(
-            CycleResult(detections.t, self.belief.pose.copy(), sizes, used, False, watch.laps)
-        )
+        return int((found.landmark != UNASSOCIATED).sum()), landmark_counts(self.labels), False
 
     def _associate(self, detections: Detections) -> Association:
-        """Assign the detections to the nearby landmarks, by the joint covariance of pose and landmarks."""
         points = to_map(detections.points_vehicle, self.belief.pose[None])
         nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH)[1])
         predicted, covariances = self._predict(nearby)
@@ -315,7 +277,6 @@ class LandmarkCkf(_Filter):
         return Association(landmark, found.new)
 
     def _predict(self, landmarks: IntArray) -> tuple[Array, Array]:
-        """Return where landmarks (k,) should be detected (k, 2) and covariances (k, 2, 2), vehicle frame."""
         k = len(landmarks)
         if k == 0:
             return np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
@@ -324,7 +285,6 @@ class LandmarkCkf(_Filter):
         return predicted.mean.reshape(k, POINT), blocks[np.arange(k), :, np.arange(k)]
 
     def _update(self, detections: Detections, landmark: IntArray) -> None:
-        """Make one Kalman update with all associated detections."""
         rows = np.flatnonzero(landmark != UNASSOCIATED)
         if len(rows) == 0:
             return
@@ -354,9 +314,7 @@ class LandmarkCkf(_Filter):
             self.labels = np.concatenate([self.labels, detections.labels[rows]])
 
     def map(self) -> Map:
-        """Return the map as it stands, with the joint covariance of each boundary's landmarks."""
         return point_map(self.belief.points, self.labels, self.belief.covariance[HEAD:, HEAD:], False)
 
     def outline(self) -> Map:
-        """Return a copy of the present map without covariances."""
         return point_map(self.belief.points, self.labels, None, False)

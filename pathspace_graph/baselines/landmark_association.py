@@ -13,7 +13,6 @@ from scipy.optimize import linear_sum_assignment
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
-from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.labels import UNKNOWN
@@ -24,30 +23,24 @@ from pathspace_graph.settings.online import GrowthSettings
 
 from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother, LandmarkState, two_rows
 
-ROUGH: Final = 5.0
-"""A landmark farther from every detection of a cycle than this (m) is not tested at all."""
-HELD_MARGIN: Final = 1e-9
-"""Cost of a held pair below the match gate, as a share: exactly at the gate, round-off would decide."""
+ROUGH: Final = 5.0  # a landmark farther from every detection of a cycle than this (m) is not tested at all
+HELD_MARGIN: Final = 1e-9  # of a held pair below the match gate, where round-off would decide
 
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """The landmark of each of the m detections of one perception cycle."""
+    """Landmark of each of the m detections of one perception cycle."""
 
-    landmark: IntArray
-    """(m,) Column of each detection's landmark, or UNASSOCIATED."""
-    new: BoolArray
-    """(m,) Set where a detection lies beyond the create gate of every compatible landmark."""
+    landmark: IntArray  # (m,) column of each detection's landmark, or UNASSOCIATED
+    new: BoolArray  # (m,) set where a detection lies beyond the create gate of every compatible landmark
 
 
 @dataclass(frozen=True)
 class Gates:
     """Two gates on squared Mahalanobis distances with two degrees of freedom."""
 
-    match: float
-    """A detection may be associated with a landmark below this distance."""
-    create: float
-    """It may create a landmark if it is above this distance from every compatible landmark."""
+    match: float  # a detection may be associated with a landmark below this distance
+    create: float  # it may create a landmark if it is above this distance from every compatible landmark
 
     @staticmethod
     @cache
@@ -56,14 +49,10 @@ class Gates:
         return Gates(chi2_quantile(settings.match, POINT), chi2_quantile(settings.create, POINT))
 
 
-# --- the assignment --------------------------------------------------------------------------------------
-
-
 def associate(cost: Array, gates: Gates) -> Association:
     """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
-    cost (m, n) holds the squared Mahalanobis distances of all m detections of a cycle to n landmarks. It is
-    infinite where the labels are not compatible. Both m and n may be zero.
+    cost (m, n) holds squared Mahalanobis distances of detections to landmarks, infinite for other labels.
     """
     landmark = np.full(len(cost), UNASSOCIATED, np.intp)
     rows, columns = linear_sum_assignment(np.minimum(cost, gates.match))
@@ -82,19 +71,14 @@ def squared_mahalanobis(innovations: Array, covariances: Array) -> Array:
 def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_covariances: Array) -> Array:
     """Return the squared Mahalanobis distances (m, n) with `S_ij = H_j Sigma H_j' + K_i`, vehicle frame.
 
-    points (m, 2) and covariances K (m, 2, 2) are those of the detections. predicted (n, 2) and
-    predicted_covariances `H Sigma H'` (n, 2, 2) are those of the landmarks. Sigma is the joint covariance of
-    pose and landmark, so it contains the cross terms.
+    Of detections (m, 2) with covariances K (m, 2, 2), and landmarks (n, 2) with `H Sigma H'` (n, 2, 2).
     """
     innovations = predicted[None] - points[:, None]
     return squared_mahalanobis(innovations, predicted_covariances[None] + covariances[:, None])
 
 
 def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates) -> Array:
-    """Return the costs, where pairs that are `held` already stay in the match gate up to the create gate.
-
-    Else detections at the edge would change for ever, and cuts would favour those measured too far away.
-    """
+    """Return the costs, where `held` pairs stay in the match gate up to the create gate, lest they flip."""
     inside = (1.0 - HELD_MARGIN) * gates.match
     return np.where(held & (cost < gates.create), np.minimum(cost, inside), cost)
 
@@ -104,21 +88,17 @@ def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
     return np.asarray((labels[:, None] == landmark_labels[None]) | (labels == UNKNOWN)[:, None])
 
 
-# --- online ----------------------------------------------------------------------------------------------
-
-
 def associate_newest(
     smoother: LandmarkSmoother, new: slice, eligible: BoolArray, cycle: int | None = None
 ) -> None:
-    """Associate the rows `new` of the newest pose, or late ones of a `cycle`, with landmarks.
+    """Associate the rows `new` of the newest pose, or late ones of a `cycle`, with eligible (n,) landmarks.
 
-    Only landmarks whose entry in `eligible` (n,) is set take part. A detection between the gates becomes
-    AMBIGUOUS, and so does one in the match gate of a landmark with another label, for whose own label it
-    votes.
+    A detection between the gates becomes AMBIGUOUS, and so does one in the match gate of a landmark with
+    another label, for whose own label it votes.
     """
     detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings.landmark
     rows = np.arange(new.start, new.stop)
-    points = to_map(detections.point[rows], smoother.variables.poses_at(detections.cycle[rows]))
+    points = detections.points_map(rows, smoother.variables)
     near = nearest_within(state.landmarks, points, ROUGH)[1]
     landmarks = np.flatnonzero(near & eligible)
     gates, numbers = Gates.of(settings), state.numbers[landmarks]
@@ -135,10 +115,10 @@ def associate_newest(
 
 
 def predict(smoother: LandmarkSmoother, landmarks: IntArray, cycle: int | None = None) -> tuple[Array, Array]:
-    """Return where landmarks (k,), by position, should be detected from the pose of a cycle, vehicle frame.
+    """Return where landmarks (k,), by position, should be detected from the newest or a given cycle's pose.
 
-    It is the newest pose by default. The places (k, 2) are in m. Their covariances `H_j Sigma H_j'` (k, 2, 2)
-    have the joint covariance Sigma of pose and landmark in the last step, zero before the first step.
+    The places (k, 2) are in m, vehicle frame. Their covariances `H_j Sigma H_j'` (k, 2, 2) have the joint
+    covariance Sigma of pose and landmark in the last step, zero before the first step.
     """
     state, k = smoother.map.state, len(landmarks)
     cycles = np.full(k, smoother.next_cycle - 1 if cycle is None else cycle)
@@ -156,10 +136,9 @@ def predict(smoother: LandmarkSmoother, landmarks: IntArray, cycle: int | None =
 def associate_created(
     points: Array, cycles: IntArray, landmarks: Array, settings: GrowthSettings
 ) -> tuple[IntArray, IntArray]:
-    """Return the rows of the detections that belong to new landmarks (k, 2), and the landmark of each.
+    """Return the rows of detections (m, 2) that belong to new landmarks (k, 2), and the landmark of each.
 
-    points (m, 2), map frame, are the detections of cycles (m,). One belongs to the nearest landmark within
-    the merge radius, and only the nearest detection of each cycle does.
+    One belongs to the nearest landmark within the merge radius, and only the nearest of each cycle (m,) does.
     """
     if len(points) == 0 or len(landmarks) == 0:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -169,9 +148,6 @@ def associate_created(
     _, first = np.unique(np.column_stack([cycles[rows], nearest[rows]]), axis=0, return_index=True)
     chosen = rows[first]
     return chosen, nearest[chosen]
-
-
-# --- merging ---------------------------------------------------------------------------------------------
 
 
 def find_duplicates(
@@ -203,8 +179,7 @@ def compatible_pairs(
 ) -> IntArray:
     """Return the indices of the pairs (k,) that are one cone, by the gate on their Mahalanobis distance.
 
-    offset (k, 2) and covariances (k, 2, 2) are those of the differences. The nearest pair is taken first, and
-    each landmark is in one pair at most.
+    The nearest pair is taken first, and each landmark is in one pair at most.
     """
     distance = squared_mahalanobis(offset, covariances + SIGMA_MERGE**2 * np.eye(POINT))
     taken: set[int] = set()

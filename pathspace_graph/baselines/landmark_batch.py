@@ -1,8 +1,6 @@
 """The Hungarian landmark graph over a whole log: all poses and landmarks at once, associations refreshed.
 
-With oracle associations, the true landmark of every detection is given. No estimator can know them. The limit
-of a run is computed from this solution. It is the batch's own system with the same calibration of the
-odometry, but without robust weights, since there are no outliers.
+With oracle associations it gives the limit of a run, without robust weights, since there are no outliers.
 """
 
 from dataclasses import dataclass, replace
@@ -14,17 +12,18 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.batch.association import insert_drive
 from pathspace_graph.errors import solving
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, huber_loss
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.residuals import landmark_residuals
-from pathspace_graph.factors.se2 import rotated, to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.front_end import is_orange, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph, owners
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import POINT, POSE, indices, pose_keys
+from pathspace_graph.graph.variables import POINT, POSE, indices
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun, RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
@@ -35,31 +34,17 @@ from pathspace_graph.run import settings_dict, split_odometry
 from pathspace_graph.scale import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .landmark_association import (
-    ROUGH,
-    Gates,
-    associate,
-    associate_created,
-    compatible,
-    find_duplicates,
-    hysteresis_costs,
-    squared_mahalanobis,
-)
+from . import landmark_association as association
+from .landmark_association import Gates, find_duplicates
 from .landmark_fixed_lag import LandmarkFixedLag
 from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
 
 Ints = NDArray[np.int64]
-
-NAME: Final = "landmark-batch"
-"""The estimator's name on the command line."""
-MAX_ROUNDS: Final = 10
-"""All detections are associated anew at most this number of times."""
-SETTLED: Final = 1e-3
-"""Largest share of the detections that changed their landmark in the last round."""
-MAX_STEPS: Final = 80
-"""Most steps of a round's optimization."""
-TOLERANCE: Final = 1e-6
-"""It ends where |cost_before - cost_after| is at most this share of the cost."""
+NAME: Final = "landmark-batch"  # the estimator's name on the command line
+MAX_ROUNDS: Final = 10  # all detections are associated anew at most this number of times
+SETTLED: Final = 1e-3  # largest share of the detections that changed their landmark in the last round
+MAX_STEPS: Final = 80  # most steps of a round's optimization
+TOLERANCE: Final = 1e-6  # it ends where |cost_before - cost_after| is at most this share of the cost
 
 
 @log_at_scale
@@ -73,7 +58,6 @@ class LandmarkBatch:
         self.noise = known_noise(odometry_sigma)
 
     def solve(self, log: Log) -> BatchRun:
-        """Solve a log: associate, optimize, merge and remove landmarks, until the associations stay."""
         with threadpool_limits(limits=1), solving("the batch"):
             return self._solve(log)
 
@@ -89,11 +73,10 @@ class LandmarkBatch:
         return self._result(system, state, converged)
 
     def _refresh(self, system: "LandmarkSystem", state: LandmarkState) -> int:
-        """Associate anew, merge and remove landmarks; return how many associations have changed."""
-        detections, problem = system.detections, system.eliminated(state)
-        before, known = detections.landmark.copy(), len(state)
-        Reassociation(state, detections, problem, self.settings, system.chain.stamps).run()
-        gone, kept = find_duplicates(state, known, problem.joint, self.settings)
+        detections, before, known = system.detections, system.detections.landmark.copy(), len(state)
+        again = Reassociation(state, system, self.settings)
+        again.run()
+        gone, kept = find_duplicates(state, known, again.problem.joint, self.settings)
         detections.merge(state.numbers[gone], state.numbers[kept])
         remove_rare(state, detections, self.settings.growth.sightings)
         return int((before != detections.landmark).sum())
@@ -115,9 +98,6 @@ class LandmarkBatch:
         )
 
 
-# --- the problem -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class LandmarkSystem:
     """Minimizes `1/2 |odometry|^2 + sum rho(associated detections) + 1/2 |calibration, first pose|^2`.
@@ -125,13 +105,10 @@ class LandmarkSystem:
     The associations are constant, and a detection without a landmark costs nothing.
     """
 
-    detections: LandmarkDetections
-    """Detections of the whole log."""
-    chain: LogOdometry
-    """Odometry of the whole log."""
+    detections: LandmarkDetections  # detections of the whole log
+    chain: LogOdometry  # odometry of the whole log
     settings: MapperSettings
-    noise: RunNoise
-    """Noise that is used."""
+    noise: RunNoise  # noise that is used
 
     @classmethod
     def of_log(cls, log: Log, settings: MapperSettings, noise: KnownNoise) -> "LandmarkSystem":
@@ -147,12 +124,10 @@ class LandmarkSystem:
         return half_square(drive) + float(losses.sum())
 
     def rows(self, state: LandmarkState) -> list[Rows]:
-        """Return the Gauss-Newton rows at a state, where each row of a detection has its Huber weight."""
         drive = self.chain.rows_at(state.variables, self.settings.calibration)
         return [*drive, self._detection_rows(state, self.settings.gate.huber)]
 
     def eliminated(self, state: LandmarkState) -> Elimination:
-        """Return the linear problem at a state, with the poses eliminated."""
         return Elimination(linear_graph(self.rows(state), state.variables), state.variables.layout)
 
     def _detection_rows(self, state: LandmarkState, huber: float) -> Rows:
@@ -180,12 +155,6 @@ class LandmarkSystem:
         self.detections.correct(variables.sensor)
 
 
-def insert_drive(state: LandmarkState, calibration: Array, poses: Array) -> None:
-    """Make the calibration, (2,) or (7,), and the poses (P, 3) of the whole log variables of a state."""
-    state.variables.insert_calibrations(calibration)
-    state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
-
-
 def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[LandmarkSystem, LandmarkState]:
     """Return the last map of the online run, with each pose and association as it left the window."""
     online, detections = LandmarkFixedLag(system.settings, noise), system.detections
@@ -206,42 +175,27 @@ def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[L
     state = LandmarkState()
     state.add(track.state.landmarks, track.state.labels, track.state.numbers)
     state.votes, state.next_number = track.state.votes, track.state.next_number
-    insert_drive(state, smoother.variables.calibrations, poses)
+    insert_drive(state.variables, smoother.variables.calibrations, poses)
     sigma = np.array(online.believed.odometry.sigmas_calibration)
     chain = replace(system.chain, calibration_sigma=sigma)  # as the online run believed in the end
     return replace(system, settings=online.believed, chain=chain), state
 
 
-# --- associations between two rounds ---------------------------------------------------------------------
-
-
 class Reassociation:
     """Repeats the Hungarian assignment of every cycle, and creates landmarks from unassociated detections."""
 
-    def __init__(
-        self,
-        state: LandmarkState,
-        detections: LandmarkDetections,
-        problem: Elimination,
-        settings: MapperSettings,
-        stamps: Array,
-    ) -> None:
-        self.state, self.detections, self.problem = state, detections, problem
-        self.settings, self.stamps = settings, stamps
+    def __init__(self, state: LandmarkState, system: LandmarkSystem, settings: MapperSettings) -> None:
+        self.state, self.detections, self.settings = state, system.detections, settings
+        self.problem, self.stamps = system.eliminated(state), system.chain.stamps
         self.gates = Gates.of(settings.landmark)
-        self.points_map = to_map(detections.point, state.variables.poses_at(detections.cycle))
+        self.points_map = self.detections.points_map(slice(None), state.variables)
 
     def run(self) -> None:
-        """Set the landmark of every detection, and add new landmarks to the state."""
-        self._create(self._assign())
-
-    def _assign(self) -> IntArray:
-        """Assign every cycle anew, and return the rows of detections that may create landmarks."""
         detections = self.detections
         rows, landmarks, distances = self._nearby_pairs()
         cost = self._costs(rows, landmarks)
         held = detections.landmark[rows] == self.state.numbers[landmarks]
-        cost = hysteresis_costs(cost, held, self.gates)
+        cost = association.hysteresis_costs(cost, held, self.gates)
         relabel(self.state, detections.label, rows, landmarks, cost, self.gates.match)
         detections.landmark[:] = UNASSOCIATED
         free = np.ones(len(detections), bool)
@@ -251,15 +205,17 @@ class Reassociation:
         # a landmark with another label explains it, or one that a new landmark would be merged with
         known = (cost < self.gates.match) | (distances < self.settings.growth.merge_radius)
         free[rows[known]] = False
-        return np.flatnonzero(free & ~detections.used)
+        self._create(np.flatnonzero(free & ~detections.used))
 
     def _assign_cycle(self, rows: IntArray, landmarks: IntArray, cost: Array, free: BoolArray) -> None:
         detected, i = np.unique(rows, return_inverse=True)
         candidates, j = np.unique(landmarks, return_inverse=True)
         table = np.full((len(detected), len(candidates)), np.inf)
         table[i, j] = cost
-        table[~compatible(self.detections.label[detected], self.state.labels[candidates])] = np.inf
-        found = associate(table, self.gates)
+        table[~association.compatible(self.detections.label[detected], self.state.labels[candidates])] = (
+            np.inf
+        )
+        found = association.associate(table, self.gates)
         matched = found.landmark != UNASSOCIATED
         self.detections.take(detected[matched], self.state.numbers[candidates[found.landmark[matched]]])
         free[detected] = found.new
@@ -267,7 +223,7 @@ class Reassociation:
     def _nearby_pairs(self) -> tuple[IntArray, IntArray, Array]:
         """Return the detections (k,), ascending, landmarks and distances (m) of pairs in the rough gate."""
         points, tree = KDTree(self.points_map), KDTree(self.state.landmarks)
-        pairs = points.sparse_distance_matrix(tree, ROUGH, output_type="coo_matrix")
+        pairs = points.sparse_distance_matrix(tree, association.ROUGH, output_type="coo_matrix")
         order = np.argsort(pairs.row, kind="stable")
         return pairs.row[order].astype(np.intp), pairs.col[order].astype(np.intp), pairs.data[order]
 
@@ -277,15 +233,16 @@ class Reassociation:
         r = landmark_residuals(poses, state.landmarks[landmarks], detections.point[rows])
         jacobian = np.concatenate([r.by_pose, r.by_landmark], axis=2)
         spread = predicted_covariances(self.problem, cycles, state.keys[landmarks], jacobian)
-        return squared_mahalanobis(r.residual, spread + detections.covariance[rows])
+        return association.squared_mahalanobis(r.residual, spread + detections.covariance[rows])
 
     def _create(self, free: IntArray) -> None:
-        """Add landmarks where enough of the detections `free` (m,) lie together, as the online run does."""
         detections = self.detections
         for label in BOUNDARIES:
             rows = free[detections.label[free] == label]
             points, cycles = self._confirmed(rows), detections.cycle[rows]
-            chosen, landmark = associate_created(self.points_map[rows], cycles, points, self.settings.growth)
+            chosen, landmark = association.associate_created(
+                self.points_map[rows], cycles, points, self.settings.growth
+            )
             numbers = self.state.add(points, np.full(len(points), label, np.intp))
             detections.take(rows[chosen], numbers[landmark])
 
@@ -293,8 +250,7 @@ class Reassociation:
         """Return the tracks (k, 2) with enough of these detections, map frame; a batch forgets none."""
         detections = self.detections
         tentative = TentativeTracks(replace(self.settings.growth, forget_after=np.inf))
-        poses = self.state.variables.poses_at(detections.cycle[rows])
-        covariances = rotated(detections.covariance[rows], poses[:, 2])
+        covariances = detections.covariances_map(rows, self.state.variables)
         found = [np.zeros((0, POINT))]
         for cycle in np.unique(detections.cycle[rows]):
             now = detections.cycle[rows] == cycle
@@ -317,7 +273,7 @@ def relabel(
 def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray, jacobian: Array) -> Array:
     """Return `J Sigma J'` (m, 2, 2) of landmarks with keys (m,), as detected from the poses of cycles (m,).
 
-    J (m, 2, 5) is the derivative by [pose | landmark], and Sigma contains their cross terms.
+    J (m, 2, 5) is the derivative by [pose | landmark].
     """
     landmark = problem.map.columns(keys)[:, None] + np.arange(POINT)
     pose = POSE * cycles[:, None] + np.arange(POSE)
@@ -338,25 +294,14 @@ def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: in
     state.keep(~gone)
 
 
-# --- oracle associations ---------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class LandmarkSolution:
-    """The optimum of a landmark batch with oracle associations."""
-
-    trajectory_t: Array
-    """(n,) Stamps of the perception cycles, in s."""
-    trajectory: Array
-    """(n, 3) Smoothed poses (x, y, theta) in m and rad, map frame; theta is not wrapped."""
-    landmark_ids: Ints
-    """(m,) The associations' numbers of all landmarks that were detected, ascending."""
-    landmarks: Array
-    """(m, 2) Positions of the landmarks in m, map frame."""
-    covariance: Array | None
-    """(2m, 2m) Joint covariance of the landmarks in m^2, or None if it was not requested."""
-    error: float
-    """Half the sum of the squared whitened residuals."""
+    trajectory_t: Array  # (n,) stamps of the perception cycles, in s
+    trajectory: Array  # (n, 3) smoothed poses (x, y, theta) in m and rad, map frame; theta is not wrapped
+    landmark_ids: Ints  # (m,) the associations' numbers of all landmarks that were detected, ascending
+    landmarks: Array  # (m, 2) positions of the landmarks in m, map frame
+    covariance: Array | None  # (2m, 2m) of the landmarks in m^2, if it was requested
+    error: float  # half the sum of the squared whitened residuals
 
 
 def solve_landmarks(
@@ -398,5 +343,5 @@ def start_oracle(system: LandmarkSystem, associations: Ints) -> LandmarkState:
     state = LandmarkState()
     state.add(points, votes.argmax(axis=0).astype(np.intp), numbers.astype(np.intp))
     state.votes = votes[: len(BOUNDARIES)].T
-    insert_drive(state, calibration, poses)
+    insert_drive(state.variables, calibration, poses)
     return state

@@ -13,7 +13,6 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import chi2_quantile
-from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.front_end.front_end import FrontEnd, at_nearest_pose
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import POINT
@@ -21,13 +20,8 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.motion import (
-    doubt_calibrations,
-    known_noise,
-    predict,
-    smoother_settings,
-    vehicle_state,
-)
+from pathspace_graph.mapping import motion as motions
+from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
@@ -35,22 +29,13 @@ from pathspace_graph.run import CycleResult, Readings, Stopwatch
 from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .landmark_association import (
-    Gates,
-    associate_created,
-    associate_newest,
-    find_duplicates,
-    merge,
-    squared_mahalanobis,
-)
+from . import landmark_association as association
+from .landmark_association import Gates, find_duplicates, squared_mahalanobis
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 
-UNSEEN: Final = 40.0
-"""Path length (m) without a detection after which a landmark is old: none is associated near the start."""
-MIN_PAIRS: Final = 4
-"""Landmarks that must be recognized together to close the loop, a third of them of each colour."""
-MIN_LEAD: Final = 2.0
-"""Least lead of the recognized pairs over any other set, where each landmark counts as one gate."""
+UNSEEN: Final = 40.0  # path (m) without a detection after which a landmark is not associated near the start
+MIN_PAIRS: Final = 4  # recognized landmarks that close the loop, a third of them of each colour
+MIN_LEAD: Final = 2.0  # over any other set of pairs, where each landmark counts as one gate
 
 
 @at_scale
@@ -65,22 +50,20 @@ class LandmarkFixedLag:
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = settings or MapperSettings()
-        noise = known_noise(odometry_sigma)
+        noise = motions.known_noise(odometry_sigma)
         self.odometry_sigma = noise.odometry
         self.front_end = FrontEnd(self.settings, noise)
-        self.smoother = FixedLagSmoother(smoother_settings(self.settings), LandmarkMap(self.settings))
+        self.smoother = FixedLagSmoother(motions.smoother_settings(self.settings), LandmarkMap(self.settings))
         self.smoother.window.exact = True
         self.path = DrivenPath()
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """Tracks by label that are not landmarks yet."""
-        self.believed = self.settings
-        """Settings with the priors of the calibrations as they are now."""
+        self.believed = self.settings  # settings with the priors of the calibrations as they are now
         self.closed = False
         self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
         self._last_check = 0.0
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Process one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         cycle = self.front_end.admit(odometry, detections, self.smoother.times)
         if cycle.late:
@@ -92,7 +75,7 @@ class LandmarkFixedLag:
         new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
         self._use(new, detections.t, watch)
         if not self.closed:
-            self.believed = doubt_calibrations(
+            self.believed = motions.doubt_calibrations(
                 self.smoother, self.believed, reading.sensor_doubted, reading.measured
             )
         watch.lap("update")
@@ -103,10 +86,10 @@ class LandmarkFixedLag:
         return cycle.counted(self._result(detections.t, watch.laps))
 
     def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
-        """Use the detections of a late cycle at its time, without a pose of their own."""
         detections = self.front_end.use_late(detections, self.smoother.times)
         late = at_nearest_pose(self.smoother, detections, self.settings.motion)
-        new = self.smoother.map.add_late(late)
+        new = self.smoother.map.detections.append(late.detections, late.cycle, late.twist)
+        self.smoother.map.correct()
         self._use(new, detections.t, watch, late.cycle)
         watch.lap("update")
         used = int(self.smoother.map.detections.used[new].sum())
@@ -114,11 +97,9 @@ class LandmarkFixedLag:
 
     def _use(self, new: slice, t: float, watch: Stopwatch, cycle: int | None = None) -> None:
         eligible = np.ones(len(self.smoother.map.state), bool)
-        if (
-            not self.closed and self._near_start()
-        ):  # one detection alone can't tell which old landmark it shows
+        if not self.closed and self._near_start():  # one detection can't tell which old landmark it shows
             eligible = ~self._old()
-        associate_newest(self.smoother, new, eligible, cycle)
+        association.associate_newest(self.smoother, new, eligible, cycle)
         watch.lap("associate")
         created = self._create(new, t)
         watch.lap("create")
@@ -126,14 +107,12 @@ class LandmarkFixedLag:
             self.smoother.step()
 
     def _create(self, new: slice, t: float) -> bool:
-        """Add detections without a landmark to the tracks, and return whether any became landmarks."""
         detections, created = self.smoother.map.detections, False
         free = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
         for label, tentative in self.tentative.items():
             rows = free[detections.label[free] == label]
-            poses = self.smoother.variables.poses_at(detections.cycle[rows])
-            covariances = rotated(detections.covariance[rows], poses[:, 2])
-            tentative.add(to_map(detections.point[rows], poses), covariances, t)
+            points, variables = detections.points_map(rows, self.smoother.variables), self.smoother.variables
+            tentative.add(points, detections.covariances_map(rows, variables), t)
             confirmed = tentative.confirmed()
             if len(confirmed):
                 self._add_landmarks(label, tentative.points[confirmed].copy())
@@ -146,8 +125,8 @@ class LandmarkFixedLag:
         detections, state = self.smoother.map.detections, self.smoother.map.state
         rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
         cycles = detections.cycle[rows]
-        points_map = to_map(detections.point[rows], self.smoother.variables.poses_at(cycles))
-        chosen, landmark = associate_created(points_map, cycles, points, self.settings.growth)
+        points_map = detections.points_map(rows, self.smoother.variables)
+        chosen, landmark = association.associate_created(points_map, cycles, points, self.settings.growth)
         held, landmark = np.unique(landmark, return_inverse=True)
         numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
         detections.take(rows[chosen], numbers)
@@ -185,7 +164,7 @@ class LandmarkFixedLag:
         if len(gone):
             numbers = self.smoother.map.state.numbers
             np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
-            merge(self.smoother, gone, kept)
+            association.merge(self.smoother, gone, kept)
 
     def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
         detections, sizes = self.smoother.map.detections, landmark_counts(self.smoother.map.state.labels)
@@ -193,7 +172,6 @@ class LandmarkFixedLag:
         return CycleResult(t, self.smoother.variables.poses[-1].copy(), sizes, used, self.closed, stages)
 
     def map(self) -> Map:
-        """Return the map as it stands, with the joint covariance of each boundary's landmarks."""
         state = self.smoother.map.state
         if len(state) == 0:
             return Map(self.closed, {})
@@ -201,53 +179,41 @@ class LandmarkFixedLag:
         return point_map(state.landmarks, state.labels, joint, self.closed)
 
     def outline(self) -> Map:
-        """Return a copy of the present map without covariances."""
         state = self.smoother.map.state
         return point_map(state.landmarks, state.labels, None, self.closed)
 
     def window_poses(self) -> Array:
-        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.smoother.variables.poses.copy()
 
     def readings(self) -> Readings:
-        """Return the detections of the newest cycle as they were used or gated, with their landmarks."""
         table, state = self.smoother.map.detections, self.smoother.map.state
         rows = np.flatnonzero(table.cycle == self.smoother.next_cycle - 1)
         used = table.used[rows]
-        points = to_map(table.point[rows], self.smoother.variables.poses_at(table.cycle[rows]))
+        points = table.points_map(rows, self.smoother.variables)
         feet = np.full(points.shape, np.nan)
         feet[used] = state.landmarks[state.positions(table.landmark[rows[used]])]
         return Readings(points, table.label[rows], used, feet)
 
     def noise_used(self) -> RunNoise:
-        """Return the noise that is used now, and what was measured so far."""
         return self.front_end.noise_used
 
     def vehicle_state(self) -> VehicleState:
-        """Return the newest pose and the calibration, with their joint covariance."""
         return vehicle_state(self.smoother)
-
-
-# --- closing ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class LoopPairs:
     """A hypothesis: pairs of landmarks that are the same cone."""
 
-    recent: IntArray
-    """(k,) Positions of landmarks that were seen lately."""
-    old: IntArray
-    """(k,) Positions of the landmarks of the beginning that they are."""
-    distance: float
-    """Squared Mahalanobis distance of all pairs together, with 2 k degrees of freedom."""
+    recent: IntArray  # (k,) positions of landmarks that were seen lately
+    old: IntArray  # (k,) positions of the landmarks of the beginning that they are
+    distance: float  # squared Mahalanobis distance of all pairs together, with 2 k degrees of freedom
 
     def score(self, gate: float) -> float:
         """Return `k gate - d^2`: how much better the pairs explain the detections than new landmarks do."""
         return len(self.recent) * gate - self.distance
 
     def overlaps(self, other: "LoopPairs") -> bool:
-        """Return whether both hypotheses have a pair in common."""
         pairs = set(zip(self.recent.tolist(), self.old.tolist(), strict=True))
         return not pairs.isdisjoint(zip(other.recent.tolist(), other.old.tolist(), strict=True))
 
@@ -329,6 +295,6 @@ def detect_loop(
 
 
 def optimize_loop(smoother: LandmarkSmoother, pairs: LoopPairs) -> None:
-    """Solve the whole loop with the pairs held together, each submap in its own frame; merge them later."""
+    """Solve the whole loop with the pairs held together; merge them later."""
     smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([pairs.recent, pairs.old])]
     smoother.solve_loop(smoother.map.settings.closing.iterations, None)

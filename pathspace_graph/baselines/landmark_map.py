@@ -12,7 +12,6 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights, whiteners
 from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.factors.sensor import restored
-from pathspace_graph.front_end.front_end import LateDetections
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import (
@@ -30,12 +29,9 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.settings.mapper import MapperSettings
 
-UNASSOCIATED: Final = -1
-"""Landmark of a detection that has none, and that may create one."""
-AMBIGUOUS: Final = -2
-"""Landmark of a detection that has none, and that must not create one."""
-SIGMA_MERGE: Final = 0.1
-"""Standard deviation (m) of the distance between two landmarks of one cone, beyond their covariance."""
+UNASSOCIATED: Final = -1  # landmark of a detection that has none, and that may create one
+AMBIGUOUS: Final = -2  # landmark of a detection that has none, and that must not create one
+SIGMA_MERGE: Final = 0.1  # of the distance of two landmarks of one cone (m), beyond their covariance
 NO_PAIRS: IntArray = np.zeros((0, 2), np.intp)
 
 
@@ -43,14 +39,10 @@ class LandmarkState:
     """Landmarks, oldest first. A landmark's number is that of its key and never changes."""
 
     def __init__(self, variables: Variables | None = None) -> None:
-        self.variables = variables or Variables()
-        """Landmarks, calibration and poses by key."""
-        self.numbers: IntArray = np.zeros(0, np.intp)
-        """(n,) Numbers of the landmarks, ascending."""
-        self.labels: IntArray = np.zeros(0, np.intp)
-        """(n,) Labels of the landmarks."""
-        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)
-        """(n, 2) Detections with the left and the right label on each landmark."""
+        self.variables = variables or Variables()  # landmarks, calibration and poses by key
+        self.numbers: IntArray = np.zeros(0, np.intp)  # (n,) numbers of the landmarks, ascending
+        self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
+        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)  # (n, 2) detections by label
         self.next_number = 0
 
     def __len__(self) -> int:
@@ -58,7 +50,6 @@ class LandmarkState:
 
     @property
     def keys(self) -> IntArray:
-        """Return the keys (n,) of the landmarks."""
         return landmark_keys(self.numbers)
 
     @property
@@ -71,10 +62,7 @@ class LandmarkState:
         return self.numbers.searchsorted(numbers)
 
     def add(self, points: Array, labels: IntArray, numbers: IntArray | None = None) -> IntArray:
-        """Add landmarks (k, 2) with labels (k,) behind the others, and return their numbers (k,).
-
-        `numbers` must be ascending, and none may be less than `next_number`; by default they follow it.
-        """
+        """Add landmarks (k, 2) with labels (k,), by default with the next numbers, and return these (k,)."""
         new = self.next_number + np.arange(len(labels)) if numbers is None else numbers
         self.variables.insert(landmark_keys(new), points.ravel())
         self.numbers = np.concatenate([self.numbers, new])
@@ -84,10 +72,7 @@ class LandmarkState:
         return new
 
     def vote(self, labels: IntArray, numbers: IntArray) -> None:
-        """Count detections with labels (k,) on landmarks (k,), which take the label of their majority.
-
-        Else a landmark created by a few detections with the wrong label would keep it for ever.
-        """
+        """Count detections with labels (k,) on landmarks (k,), which take the label of their majority."""
         known = np.isin(labels, BOUNDARIES)
         np.add.at(self.votes, (self.positions(numbers[known]), labels[known]), 1)
         most = self.votes.argmax(axis=1)
@@ -103,56 +88,41 @@ class LandmarkState:
 class LandmarkDetections(DetectionColumns):
     """Detections with the landmark that each of them is associated with."""
 
-    landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Number of each detection's landmark, or UNASSOCIATED or AMBIGUOUS."""
+    landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # or UNASSOCIATED or AMBIGUOUS
 
     @property
     def used(self) -> BoolArray:
-        """Return (m,) whether each detection has a landmark, and so is a row of the graph."""
         return self.landmark >= 0
 
     def _clear_associations(self) -> None:
         self.landmark = np.full(len(self), UNASSOCIATED, np.intp)
 
     def merge(self, gone: IntArray, kept: IntArray) -> None:
-        """Associate all detections of landmarks `gone` (k,), by number, with `kept` (k,)."""
         for number, became in zip(gone.tolist(), kept.tolist(), strict=True):
             self.landmark[self.landmark == number] = became
 
     def take(self, rows: IntArray, numbers: IntArray) -> None:
-        """Associate detections (k,) with landmarks (k,)."""
         self.landmark[rows], self.changed[rows] = numbers, True
 
 
 class LandmarkMap:
     """The landmarks and the detections of the window, as the engine sees them (`graph.window:MapRows`)."""
 
-    reached_inactive = False
-    """No landmark is ever inactive."""
+    reached_inactive = False  # no landmark is ever inactive
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
         self.state = LandmarkState()
         self.variables = self.state.variables
-        self.detections = LandmarkDetections()
-        """Detections from the poses in the window."""
-        self.twist: Array = np.zeros(POSE)
-        """(3,) Twist of the vehicle at the newest detections, in m/s, m/s and rad/s."""
-        self.loop_pairs: IntArray = NO_PAIRS
-        """(k, 2) Numbers of two landmarks each that are held together while the loop closes."""
-        self.merged_into: dict[int, int] = {}
-        """From the number of each landmark that was merged to the number of the one that was kept."""
+        self.detections = LandmarkDetections()  # detections from the poses in the window
+        self.twist: Array = np.zeros(POSE)  # (3,) at the newest detections (m/s, m/s, rad/s)
+        self.loop_pairs: IntArray = NO_PAIRS  # (k, 2) numbers, held together while the loop closes
+        self.merged_into: dict[int, int] = {}  # number that was kept by the one that was merged
 
     def add(self, detections: Detections, cycle: int, twist: Array) -> slice:
         """Add the corrected detections of the newest cycle, made at a twist (3,); return their rows."""
         self.twist = twist
         rows = self.detections.append(detections, cycle, twist)
-        self.correct()
-        return rows
-
-    def add_late(self, late: LateDetections) -> slice:
-        """Add late detections to those of their pose, corrected; return their rows."""
-        rows = self.detections.append(late.detections, late.cycle, late.twist)
         self.correct()
         return rows
 
@@ -175,7 +145,6 @@ class LandmarkMap:
         return self.loop_pairs
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """Return no rows, since the detections alone hold the landmarks."""
         return []
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
@@ -218,8 +187,8 @@ def landmark_rows(
 ) -> Rows:
     """Return the rows `w W (R^T (l - t) - z)` of associated detections (m,), with `W' W = K^-1`.
 
-    The factor w is the square root of each row's own Huber weight. The detections z are corrected by the
-    sensor's calibration, and the residuals are those of measured ones (`factors.sensor:restored`).
+    w is the root of each row's Huber weight. The detections z are corrected by the sensor's calibration, and
+    the residuals are those of measured ones (`factors.sensor:restored`).
     """
     cycles, numbers = detections.cycle[chosen], detections.landmark[chosen]
     points = state.landmarks[state.positions(numbers)]
@@ -247,7 +216,6 @@ def two_rows(cycles: IntArray, numbers: IntArray, jacobian: Array, residual: Arr
 
 
 def landmark_counts(labels: IntArray) -> tuple[int, int]:
-    """Return the number of landmarks with the left and with the right label."""
     return int((labels == LEFT).sum()), int((labels == RIGHT).sum())
 
 

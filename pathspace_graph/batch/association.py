@@ -9,7 +9,7 @@ from scipy.ndimage import minimum_filter1d
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import project
 from pathspace_graph.factors.se2 import rotated, to_map, to_vehicle
-from pathspace_graph.graph.variables import pose_keys
+from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, in_front_row
@@ -46,9 +46,14 @@ FOLD_DISTANCE: Final = 1.5
 
 def add_drive(state: State, poses: Array, calibration: Array, settings: AssociationSettings) -> None:
     """Add the poses (P, 3) of all cycles to a state that has its curves already."""
-    state.variables.insert_calibrations(calibration)
-    state.variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
+    insert_drive(state.variables, calibration, poses)
     locate_poses(state, settings)
+
+
+def insert_drive(variables: Variables, calibration: Array, poses: Array) -> None:
+    """Make the calibration, (2,) or (7,), and the poses (P, 3) of a whole log variables."""
+    variables.insert_calibrations(calibration)
+    variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
 
 
 def locate_poses(state: State, settings: AssociationSettings) -> None:

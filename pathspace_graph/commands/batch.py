@@ -18,7 +18,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import BatchRun, write_result
 from pathspace_graph.plausibility.hint import Hint
-from pathspace_graph.plausibility.reading import read_plausible_log
+from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 

@@ -26,7 +26,7 @@ from pathspace_graph.labels import NAMES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
-from pathspace_graph.plausibility.reading import read_plausible_log
+from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings

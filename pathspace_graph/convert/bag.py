@@ -17,8 +17,7 @@ from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_
 from .recording import Recording, twists_between
 from .settings import LabelRule
 
-INSTALL: Final = "pip install 'pathspace-graph[ros]'"
-"""Command that installs the package that reads bags."""
+INSTALL: Final = "pip install 'pathspace-graph[ros]'"  # command that installs the package that reads bags
 SUPPORTED: Final = {
     "--odometry": "a twist, a speed or a pose",
     "--imu": "an angular velocity",
@@ -26,71 +25,47 @@ SUPPORTED: Final = {
     "transforms": "transforms",
 }
 """What a message must hold, by the option of its topic."""
-STATIC: Final = "/tf_static"
-"""Topic of the transforms between frames that are fixed to the vehicle."""
-BODIES: Final = ("base_link", "base_footprint")
-"""Frames of a vehicle whose odometry names none."""
-LEVEL: Final = 0.98
-"""Least cosine of a level sensor's z axis and the vehicle's."""
-LATE: Final = 0.1
-"""Median time (s) of receipt after or before the stamps that is worth a word."""
+STATIC: Final = "/tf_static"  # topic of the transforms between frames that are fixed to the vehicle
+BODIES: Final = ("base_link", "base_footprint")  # frames of a vehicle whose odometry names none
+LEVEL: Final = 0.98  # least cosine of a level sensor's z axis and the vehicle's
+LATE: Final = 0.1  # median time (s) of receipt after or before the stamps that is worth a word
 
 
 @dataclass(frozen=True)
 class BagOptions:
-    """What is read of a bag."""
-
-    odometry: str | None
-    """Topic of the odometry."""
-    detections: str | None
-    """Topic of the detections."""
-    imu: str | None = None
-    """Topic of the yaw rate, where it is not that of the odometry."""
-    wheelbase: float | None = None
-    """Wheelbase (m), by which a steering angle gives the yaw rate."""
+    odometry: str | None  # topic of the odometry
+    detections: str | None  # topic of the detections
+    imu: str | None = None  # topic of the yaw rate, where it is not that of the odometry
+    wheelbase: float | None = None  # wheelbase (m), by which a steering angle gives the yaw rate
     definitions: Sequence[str] = ()
     """Files of message definitions, each as `TYPE=FILE` or as a path that ends in `PACKAGE/msg/NAME.msg`."""
-    label_field: str | None = None
-    """Field of the label of a detection; None takes the first that is known."""
-    from_poses: bool = False
-    """Make the twists from poses, also where the messages have twists."""
-    received: bool = False
-    """Take the times of receipt as stamps, also where messages have one of their own."""
-    mounted: bool = False
-    """The pose of the sensor was stated, so that frames of other names are no surprise."""
+    label_field: str | None = None  # field of the label of a detection; None takes the first that is known
+    from_poses: bool = False  # make the twists from poses, also where the messages have twists
+    received: bool = False  # take the times of receipt as stamps, also where messages have one of their own
+    mounted: bool = False  # the pose of the sensor was stated, so that frames of other names are no surprise
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
     """What was taken of the messages of one topic, in the order of the bag."""
 
-    name: str
-    """Topic and type of the messages."""
-    t: Array
-    """(N,) Stamps (s)."""
-    values: list[Any]
-    """What was taken of each message."""
+    name: str  # topic and type of the messages
+    t: Array  # (N,) stamps (s)
+    values: list[Any]  # what was taken of each message
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """What a message says of the vehicle's motion."""
 
-    twist: Array | None
-    """(3,) Twist in m/s, m/s and rad/s, NaN where it is not known."""
-    pose: Array | None
-    """(3,) Pose in m, m and rad."""
-    world: str
-    """Frame of the pose."""
-    body: str
-    """Frame of the twist."""
+    twist: Array | None  # (3,) twist in m/s, m/s and rad/s, NaN where it is not known
+    pose: Array | None  # (3,) pose in m, m and rad
+    world: str  # frame of the pose
+    body: str  # frame of the twist
 
 
 def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
-    """Return what the topics of a bag have of a drive.
-
-    What is wrong is an InputError: a topic that is not there lists those that are, with types and rates.
-    """
+    """Return what the topics of a bag have of a drive; an InputError lists the topics that are there."""
     notes: Counter[str] = Counter()
 
     def motion(message: Any) -> Motion:
@@ -196,10 +171,7 @@ def _twists(
 
 
 def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[Array, Array]:
-    """Return the twists with the mean yaw rate of an IMU until the next of them.
-
-    The heading is then that of the IMU, whichever of both is faster. Twists outside its time are left out.
-    """
+    """Return the twists in the time of an IMU with its mean yaw rate until the next of them."""
     order, turn = np.argsort(t, kind="stable"), np.argsort(imu_t, kind="stable")
     t, twists, imu_t, rates = t[order], twists[order].copy(), imu_t[turn], rates[turn]
     finite = np.isfinite(rates)
@@ -222,7 +194,6 @@ def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[
 
 @contextmanager
 def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Bag]":
-    """Yield a bag that is closed afterwards."""
     if not path.exists():
         raise InputError(path, "expected a bag, found none")
     rosbag1, rosbag2, _ = _rosbags()
@@ -245,10 +216,8 @@ class Bag:
 
     path: Path
     reader: Any
-    definitions: dict[str, Any]
-    """Definitions of messages that were handed over."""
-    received: bool
-    """Take the times of receipt as stamps."""
+    definitions: dict[str, Any]  # definitions of messages that were handed over
+    received: bool  # take the times of receipt as stamps
     notes: Counter[str]
 
     def samples(self, topic: str | None, option: str, take: Callable[[Any], Any]) -> Samples:
@@ -275,8 +244,7 @@ class Bag:
     ) -> Samples:
         """Return samples with header stamps where most have one, else with the times of receipt.
 
-        Both are not mixed, since they may be of different clocks: a message without a stamp among others that
-        have one is left out.
+        Both are not mixed, since they may be of different clocks.
         """
         topic = name.split(maxsplit=1)[0]
         stamped = [] if self.received else [k for k, stamp in enumerate(stamps) if stamp is not None]
@@ -295,7 +263,6 @@ class Bag:
         return [entry for entry in self.reader.connections if entry.topic == topic]
 
     def _error(self, message: str) -> InputError:
-        """Return an InputError that also lists all topics with type, number of messages and rate."""
         seconds = 1e-9 * (self.reader.end_time - self.reader.start_time)
         topics = [
             f"{name} ({topic.msgtype}, {topic.msgcount} messages, {topic.msgcount / seconds:.3g} Hz)"
@@ -386,7 +353,6 @@ def _given_definitions(definitions: Sequence[str]) -> dict[str, Any]:
 
 
 def _rosbags() -> tuple[Any, Any, Any]:
-    """Return the modules of `rosbags`, which is an optional package."""
     try:
         from rosbags import rosbag1, rosbag2, typesys  # noqa: PLC0415
     except ImportError:

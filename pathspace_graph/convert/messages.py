@@ -21,20 +21,13 @@ LIST_NAMES: Final = {
 """Labels of the cones in a list with such a word in its name."""
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
 """Fields that may hold the label of a detection, the first one that is there."""
-NO_LABEL: Final = "none"
-"""Name of a label field that says there are no labels."""
-CLOUD_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""Type of numpy by the `datatype` of a field of a point cloud."""
-POINT_MARKERS: Final = (1, 2, 3, 10)
-"""Types of markers that are one point: cube, sphere, cylinder, mesh."""
-LIST_MARKERS: Final = (6, 7, 8)
-"""Types of markers that are lists of points: cubes, spheres, points."""
-ADDED: Final = 0
-"""Action of a marker that is added; others are taken away."""
-POSITIONS: Final = ("point", "position", "location", "center", "pose", "bbox")
-"""Fields that lead to the position of a cone that has no `x` and `y` itself."""
-SPEEDS: Final = ("speed", "data")
-"""Fields of a speed alone."""
+NO_LABEL: Final = "none"  # name of a label field that says there are no labels
+CLOUD_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # by `datatype`
+POINT_MARKERS: Final = (1, 2, 3, 10)  # types of markers that are one point: cube, sphere, cylinder, mesh
+LIST_MARKERS: Final = (6, 7, 8)  # types of markers that are lists of points: cubes, spheres, points
+ADDED: Final = 0  # action of a marker that is added; others are taken away
+POSITIONS: Final = ("point", "position", "location", "center", "pose", "bbox")  # of a cone without x and y
+SPEEDS: Final = ("speed", "data")  # fields of a speed alone
 
 
 class MessageError(PathspaceError):
@@ -45,16 +38,15 @@ class MessageError(PathspaceError):
 class Points:
     """Detected points of one message, in the frame of its sensor."""
 
-    points: Array
-    """(m, 2) Points in m."""
-    covariances: Array
-    """(m, 2, 2) Covariances in m^2, NaN where the message does not give them."""
-    labels: IntArray
-    """(m,) Labels."""
+    points: Array  # (m, 2) points in m
+    covariances: Array  # (m, 2, 2) covariances in m^2, NaN where the message does not give them
+    labels: IntArray  # (m,) labels
 
     def where(self, chosen: BoolArray) -> "Points":
-        """Return some of the points."""
         return Points(self.points[chosen], self.covariances[chosen], self.labels[chosen])
+
+    def equals(self, other: "Points") -> bool:
+        return np.array_equal(self.points, other.points) and np.array_equal(self.labels, other.labels)
 
 
 def header_of(message: Any) -> Any:
@@ -78,14 +70,10 @@ def frame_of(message: Any, name: str = "frame_id") -> str:
     return str(frame).lstrip("/")
 
 
-# --- odometry --------------------------------------------------------------------------------------------
-
-
 def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
     """Return the twist [vx, vy, wz] (3,) of a message in m/s, m/s and rad/s, None of one with a pose alone.
 
-    A speed alone, as in `Float64`, has vy = 0 and an unknown wz, which is NaN. With a steering angle delta,
-    as in `AckermannDriveStamped`, it is `wz = v tan(delta) / wheelbase` where the wheelbase (m) is known.
+    Of a speed alone, vy = 0 and wz is NaN, or `v tan(delta) / wheelbase` (m) with a steering angle delta.
     MessageError where there is no motion at all in the message.
     """
     twist = message
@@ -128,14 +116,8 @@ def yaw_of(quaternion: Any) -> float:
     return float(np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
 
 
-# --- detections ------------------------------------------------------------------------------------------
-
-
 def points_of(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:
-    """Return the points of a point cloud, an array of markers, or a message with lists of cones or numbers.
-
-    Anything else is a MessageError.
-    """
+    """Return the points of a cloud, an array of markers, or a message with lists of cones or numbers."""
     if hasattr(message, "point_step"):
         return cloud_points(message, rule, label_field)
     if hasattr(message, "x") and hasattr(message, "y"):
@@ -146,10 +128,7 @@ def points_of(message: Any, rule: LabelRule, label_field: str | None = None) -> 
 
 
 def cloud_points(cloud: Any, rule: LabelRule, label_field: str | None = None) -> Points:
-    """Return the points of a `PointCloud2` by its fields `x`, `y` and that of the label.
-
-    The fields `xx`, `xy` and `yy` are the covariance, where the cloud has them.
-    """
+    """Return the points of a `PointCloud2` by its fields `x`, `y`, the label and, if any, xx, xy, yy."""
     columns = _cloud_columns(cloud)
     points = np.column_stack([columns["x"], columns["y"]]).astype(float)
     covariances = np.full((len(points), 2, 2), np.nan)
@@ -203,11 +182,7 @@ def array_points(message: Any, rule: LabelRule, label_field: str | None = None) 
 
 
 def marker_points(array: Any, rule: LabelRule) -> Points:
-    """Return the points of a `MarkerArray` that are added: blue ones are left, yellow ones right.
-
-    Text, arrows, lines and triangles are no points. A marker that is a list has a colour for each of its
-    points, or one for all.
-    """
+    """Return the points of a `MarkerArray` that are added: blue ones are left, yellow ones right."""
     rows = [row for marker in _added(array.markers) for row in _of_marker(marker, rule)]
     points = np.array([row[:2] for row in rows], dtype=float).reshape(-1, 2)
     labels = np.array([row[2] for row in rows], dtype=int)
@@ -298,7 +273,6 @@ def _label_value(holder: Any, names: Sequence[str]) -> Any:
 
 
 def _names(message: Any) -> Sequence[str]:
-    """Return the names of a message's fields."""
     if is_dataclass(message):
         return [field.name for field in fields(message)]
     if hasattr(message, "get_fields_and_field_types"):

@@ -15,54 +15,36 @@ import numpy as np
 from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
-from pathspace_graph.io.log import (
-    MAX_HOLD,
-    Detections,
-    Log,
-    Odometry,
-    Truth,
-    covariances_of,
-    is_positive_definite,
-)
+from pathspace_graph.io import log as logs
+from pathspace_graph.io.log import Detections, Log, Odometry, Truth, covariances_of
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .messages import Points, points_of, stamp_of, twist_of
 from .settings import SIGMA_ODOMETRY, Frames, LabelRule, NoiseSettings, Window
 
-MAX_ASYMMETRY: Final = 1e-3
-"""Largest difference of the entries xy and yx of a covariance, by the larger variance; messages may have
-single precision."""
+MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 """Note of covariances that the record does not have."""
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
 SHARED_STAMP: Final = "messages with detections have the stamp of another one, and are one cycle with it"
-MIN_RANGE_OF_BEARING: Final = 1.0
-"""Least range (m) at which a bearing's standard deviation counts across, so that the covariance of a
-detection at the sensor itself is positive definite."""
+MIN_RANGE_OF_BEARING: Final = (
+    1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at the sensor
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
     """What a record has of a drive, in its own order and its own frames."""
 
-    t: Array
-    """(N,) Stamps of the twists (s)."""
-    twists: Array
-    """(N, 3) Twists in m/s, m/s and rad/s."""
-    scan_t: Array
-    """(M,) Stamps of the messages with detections (s)."""
-    scans: list[Points]
-    """Detections of each message, in the frame of the sensor."""
-    source: dict[str, str]
-    """Where the record comes from, in words."""
-    notes: Counter[str] = field(default_factory=Counter)
-    """What was done, in words, with the number of times."""
-    truth: Truth | None = None
-    """What is known of the drive, for evaluation only."""
-    odometry_sigma: Array | None = None
-    """(3,) Standard deviations of a twist (m/s, m/s, rad/s), where the record states them."""
-    mounting: tuple[float, float, float] | None = None
-    """Pose of the sensor in the vehicle frame (m, m, rad), where the record states it."""
+    t: Array  # (N,) stamps of the twists (s)
+    twists: Array  # (N, 3) twists in m/s, m/s and rad/s
+    scan_t: Array  # (M,) stamps of the messages with detections (s)
+    scans: list[Points]  # detections of each message, in the frame of the sensor
+    source: dict[str, str]  # where the record comes from, in words
+    notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, with the number of times
+    truth: Truth | None = None  # what is known of the drive, for evaluation only
+    odometry_sigma: Array | None = None  # (3,) sigmas of a twist (m/s, m/s, rad/s), where they are stated
+    mounting: tuple[float, float, float] | None = None  # sensor's pose (m, m, rad), where it is stated
 
 
 def twists_of(moves: Array) -> Array:
@@ -79,8 +61,7 @@ def twists_between(t: Array, poses: Array) -> Array:
 def windowed(record: Recording, window: Window) -> Recording:
     """Return the part of a record that counts, with the stamps of its detections corrected.
 
-    Its truth then no longer says which cone each detection is of, and there is none of a later beginning,
-    where the map has another origin.
+    The truth then has no associations, and there is none of a later beginning, where the map begins.
     """
     if window == Window():
         return record
@@ -92,8 +73,9 @@ def windowed(record: Recording, window: Window) -> Recording:
         notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
         scans = [scan.where(one) for scan, one in zip(scans, near, strict=True)]
     scan_t, begin = record.scan_t + window.time_offset, float(np.nanmin(record.t, initial=np.inf))
+    is_cut = window.start > 0.0 or window.end < np.inf  # else stamps that are not finite stay to be counted
     kept, seen = (
-        (t >= begin + window.start) & (t <= begin + window.end) if window.is_cut else np.ones(len(t), bool)
+        (t >= begin + window.start) & (t <= begin + window.end) if is_cut else np.ones(len(t), bool)
         for t in (record.t, scan_t)
     )
     notes["odometry samples outside --start and --end were left out"] += int((~kept).sum())
@@ -105,8 +87,7 @@ def windowed(record: Recording, window: Window) -> Recording:
 
 
 def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) -> Log:
-    """Return the log of a record, in order of time and in the vehicle frame; it counts in `record.notes`
-    what was left out.
+    """Return the log of a record in order of time and in the vehicle frame, and note what is left out.
 
     A record without a usable twist, or without a detection in its time, is an InputError of the `file`.
     """
@@ -125,9 +106,6 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
         detections_stated=noise.states_detections or not record.notes[ASSUMED],
         truth=record.truth,
     )
-
-
-# --- odometry --------------------------------------------------------------------------------------------
 
 
 def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
@@ -160,16 +138,13 @@ def _check_stamps(t: Array, what: str, file: Path) -> None:
         raise InputError(file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}")
 
 
-# --- detections ------------------------------------------------------------------------------------------
-
-
 def _cycles(
     record: Recording, odometry: Odometry, frames: Frames, noise: NoiseSettings, file: Path
 ) -> tuple[Detections, ...]:
     t, notes = record.scan_t, record.notes
     _check_stamps(t, "detections", file)
     notes["messages with detections were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
-    begin, end = float(odometry.t[0]), float(odometry.t[-1]) + MAX_HOLD
+    begin, end = float(odometry.t[0]), float(odometry.t[-1]) + logs.MAX_HOLD
     found: dict[float, list[Points]] = {}
     for index in np.argsort(t, kind="stable"):
         points = usable(record.scans[index], notes)
@@ -180,16 +155,15 @@ def _cycles(
             notes[OUTSIDE] += 1
             continue
         scans = found.setdefault(float(t[index]), [])
-        if any(
-            np.array_equal(scan.points, points.points) and np.array_equal(scan.labels, points.labels)
-            for scan in scans
-        ):
+        if any(map(points.equals, scans)):
             notes["messages with detections were repetitions, and were left out"] += 1
             continue
         notes[SHARED_STAMP] += bool(scans)
         scans.append(points)
     if not found and notes[OUTSIDE]:
-        expected = f"expected detections in the time of the odometry, {begin:.9g} s to {end - MAX_HOLD:.9g} s"
+        expected = (
+            f"expected detections in the time of the odometry, {begin:.9g} s to {end - logs.MAX_HOLD:.9g} s"
+        )
         stamps = f"from {t.min():.9g} s to {t.max():.9g} s"
         raise InputError(file, f"{expected}, found them {stamps}: do both have the same clock?")
     if not found:
@@ -198,13 +172,11 @@ def _cycles(
 
 
 def join(scans: list[Points]) -> Points:
-    """Return the points of several messages as those of one."""
     parts = zip(*((scan.points, scan.covariances, scan.labels) for scan in scans), strict=True)
     return scans[0] if len(scans) == 1 else Points(*map(np.concatenate, parts))
 
 
 def usable(points: Points, notes: Counter[str]) -> Points:
-    """Return the points that are finite and in the range of the format."""
     finite = np.asarray(np.isfinite(points.points).all(axis=1))
     inside = ~finite | (np.abs(points.points) <= MAX_RANGE).all(axis=1)
     notes["detections that are not finite were left out"] += int((~finite).sum())
@@ -240,7 +212,7 @@ def positive_definite(covariances: Array) -> BoolArray:
     xx, yy = covariances[:, 0, 0], covariances[:, 1, 1]
     xy, yx = covariances[:, 0, 1], covariances[:, 1, 0]
     with np.errstate(over="ignore", invalid="ignore"):
-        good = np.isfinite(covariances).all(axis=(1, 2)) & is_positive_definite(xx, xy, yy)
+        good = np.isfinite(covariances).all(axis=(1, 2)) & logs.is_positive_definite(xx, xy, yy)
         good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
         good &= np.maximum(xx, yy) < MAX_RANGE**2
     return np.asarray(good)
@@ -261,10 +233,7 @@ def default_covariances(points: Array, noise: NoiseSettings) -> Array:
     return covariances_of(xx, xy, yy)
 
 
-# --- messages as they arrive -------------------------------------------------------------------------------
-
-MAX_BUFFERED: Final = 10_000
-"""Largest number of twists that wait for a perception cycle, the newest ones."""
+MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle, the newest ones
 BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexError, OverflowError)
 """Errors of a message that cannot be read."""
 
@@ -285,8 +254,7 @@ class MessageStream:
     ) -> None:
         self.frames, self.noise = frames or Frames(), noise or NoiseSettings()
         self.rule, self.label_field = rule or LabelRule(), label_field
-        self.refused: Counter[str] = Counter()
-        """Number of messages for each reason."""
+        self.refused: Counter[str] = Counter()  # number of messages for each reason
         self._twists: deque[tuple[float, list[float]]] = deque(maxlen=MAX_BUFFERED)
         self._first = np.inf  # the stamp (s) of the first twist
         self._newest = -np.inf  # the stamp (s) of the newest cycle in order
@@ -308,8 +276,7 @@ class MessageStream:
     def take_detections(self, message: Any, received: float) -> tuple[Odometry, Detections] | None:
         """Return a perception cycle with the twists since the last one that was used, or None.
 
-        A late cycle comes without twists, which the cycles in order have had already. The caller says by
-        `use` that the estimator took the cycle; until then its twists are kept.
+        A late cycle comes without twists. They are kept until the caller says by `use` that it was taken.
         """
         try:
             points = usable(points_of(message, self.rule, self.label_field), self.refused)
@@ -320,16 +287,12 @@ class MessageStream:
         except BROKEN as error:
             self.refused[str(error)] += 1
             return None
-        return self._odometry_until(t), cycle
+        rows = [] if t <= self._newest else [row for row in self._twists if row[0] <= t]
+        twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
+        return Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
 
     def use(self, t: float) -> None:
         """Drop the twists that a cycle at t (s) has used, but for the last one, which is held."""
         self._newest = max(self._newest, t)
         while len(self._twists) > 1 and self._twists[1][0] <= self._newest:
             self._twists.popleft()
-
-    def _odometry_until(self, t: float) -> Odometry:
-        """Return the buffered twists up to t (s); there are none for a late cycle."""
-        rows = [] if t <= self._newest else [row for row in self._twists if row[0] <= t]
-        twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
-        return Odometry(np.array([stamp for stamp, _ in rows]), twists)

@@ -14,25 +14,19 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
 
-Side = Literal["left", "right"]
-"""Side of the x axis to which the y axis points."""
-DEFAULT_LABELS: Final = ("left=0", "right=1")
-"""Labels of numbers where nothing else is said."""
-SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)
-"""Standard deviations of a twist (m/s, m/s, rad/s) where nothing is known of them."""
-SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)
-"""Noise of detections (m, m/m, rad) where nothing is known of it."""
+Side = Literal["left", "right"]  # side of the x axis to which the y axis points
+DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
+SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
+SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)  # (m, m/m, rad) where nothing is known
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}
 UNKNOWN_WORDS: Final = {"unknown", "none", "other", "undefined", "uncolored", "colourless", "colour"}
 """Words of values that mean no side, and of colours, whose hue has decided."""
-MOST_TOLD: Final = 12
-"""Number of values of labels that a line lists."""
+MOST_TOLD: Final = 12  # number of values of labels that a line lists
 HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}
 """Hues (degrees) of blue, orange and yellow; that of red is below, that of green between yellow and blue."""
-MIN_SATURATION: Final = 0.3
-"""Least saturation of a colour that is not grey."""
+MIN_SATURATION: Final = 0.3  # least saturation of a colour that is not grey
 
 
 @dataclass(frozen=True)
@@ -126,11 +120,6 @@ class Window:
         if not isfinite(self.time_offset):
             raise SettingsError(f"--time-offset: expected a number, found {self.time_offset:g}")
 
-    @property
-    def is_cut(self) -> bool:
-        """Return whether a part of the drive is left out."""
-        return self.start > 0.0 or self.end < inf
-
 
 class LabelRule:
     """The labels of numbers, words and colours, and a count of the values that were met.
@@ -162,7 +151,6 @@ class LabelRule:
         return label
 
     def of_all(self, values: NDArray[Any]) -> NDArray[np.int_]:
-        """Return the labels (m,) of values (m,)."""
         texts, place, counts = np.unique(values, return_inverse=True, return_counts=True)
         labels = np.array([self.of(text) for text in texts.tolist()], dtype=int)
         for text, label, count in zip(texts.tolist(), labels.tolist(), counts.tolist(), strict=True):

@@ -29,8 +29,7 @@ QUANTITIES: Final = {
     },
 }
 """Columns of each file and their quantities; a covariance is of the square of one."""
-COVARIANCE: Final = ("xx", "xy", "yy")
-"""Columns of the covariance of a detection, if there is one."""
+COVARIANCE: Final = ("xx", "xy", "yy")  # columns of the covariance of a detection, if there is one
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
@@ -39,28 +38,18 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "yaw_rate": {"rad/s": 1.0, "deg/s": pi / 180.0},
 }
 """Units of each quantity, in SI units."""
-MAX_BEARING: Final = 2.0 * pi
-"""Largest bearing (rad); more are degrees."""
-LARGEST: Final = 1e30
-"""Largest number of a file; stamps in nanoseconds are large."""
-UNSTATED: Final = ((np.nan, np.nan), (np.nan, np.nan))
-"""Covariance of a detection that states none."""
-MIN_PERIOD: Final = 1e-5
-"""Least mean period of samples (s); less is a wrong unit of time."""
-MAX_PERIOD: Final = 1e3
-"""Largest mean period of samples (s); more is a wrong unit of time."""
+MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
+LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
+UNSTATED: Final = ((np.nan, np.nan), (np.nan, np.nan))  # covariance of a detection that states none
+MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong unit of time
+MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong unit of time
 
 
 class Columns:
-    """Columns of the quantities: `vx=speed`, `y=-cone_y` with the sign changed, `detections.t=stamp` for one
-    of both files only.
-
-    A quantity that is not named is in the column of its own name.
-    """
+    """Columns of the quantities, by default their own names: `vx=speed`, `y=-cone_y`, `odometry.t=stamp`."""
 
     def __init__(self, pairs: Sequence[str] = ()) -> None:
-        self.named: dict[tuple[str, str], str] = {}
-        """Columns by kind of file and quantity, those whose sign is changed with a minus."""
+        self.named: dict[tuple[str, str], str] = {}  # by kind and quantity, a minus changing the sign
         for pair in pairs:
             key, equals, name = pair.partition("=")
             if not equals or not name.removeprefix("-"):
@@ -74,10 +63,7 @@ class Columns:
 
 
 class Units:
-    """Units of the quantities: `length=mm angle=deg time=ns`, and `speed` and `yaw_rate`.
-
-    A speed is in the unit of length, and a yaw rate in that of angle, for each second, unless it has its own.
-    """
+    """Units of the quantities: `length=mm angle=deg time=ns`; a `speed` and a `yaw_rate` follow these."""
 
     def __init__(self, pairs: Sequence[str] = ()) -> None:
         self.names = {"time": "s", "length": "m", "angle": "rad"}
@@ -128,7 +114,6 @@ class _File:
         return (self.kind, key) in self.columns.named or key in self.table.columns
 
     def column(self, key: str) -> str:
-        """Return the column of a quantity; an InputError lists the columns that are there."""
         column = self.columns.named.get((self.kind, key), key).removeprefix("-")
         if column not in self.table.columns:
             expected = f"expected a column '{column}' for {key} (--columns {key}=NAME)"
@@ -191,9 +176,6 @@ def _points(file: _File) -> Array:
     negative = f"expected ranges of at least 0 in column '{file.column('range')}'"
     file.table.require(ranges >= 0.0, negative)
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
-
-
-# --- JSON lines ------------------------------------------------------------------------------------------
 
 
 def read_json_lines(file: Path, rule: LabelRule) -> Recording:

@@ -22,41 +22,28 @@ from pathspace_graph.labels import LEFT
 from .messages import Points
 from .recording import Recording, twists_of
 
-EXAMPLE: Final = "victoria_park.txt"
-"""Name of the file that GTSAM brings."""
-PERIOD: Final = 0.2
-"""Time from pose to pose (s), as the scans of the drive nearly had it; the file has no times."""
+EXAMPLE: Final = "victoria_park.txt"  # name of the file that GTSAM brings
+PERIOD: Final = 0.2  # time from pose to pose (s), nearly as the drive had it; the file has none
 SIGMA_ODOMETRY: Final = (0.055, 0.025, 0.08)
 """Standard deviations (m/s, m/s, rad/s) of white noise with the effect of the odometry's errors.
 
-The file claims 0.05, 0.01 and 0.01 from pose to pose. Against the reference, the errors are correlated over a
-hundred poses, and that of the yaw rate has a mean of 0.005 rad/s. The standard deviations here are the rms of
-the errors times the square root of their integrated autocorrelation."""
-FIELDS: Final = {"ODOMETRY": 11, "LANDMARK": 7}
-"""Number of numbers in a row after the word that it begins with."""
-ANCHOR_SIGMA: Final = 1e-4
-"""Standard deviation of the first pose of the reference (m, m, rad)."""
-POSES_A_STEP: Final = 10
-"""Number of poses of a step in which the reference is built up; a batch does not find its way after the drift
-of 4 km."""
+The rms of the errors against the reference times the square root of their integrated autocorrelation: the
+file's 0.05, 0.01, 0.01 from pose to pose are white, its errors are correlated over a hundred poses."""
+FIELDS: Final = {"ODOMETRY": 11, "LANDMARK": 7}  # numbers in a row, by its first word
+ANCHOR_SIGMA: Final = 1e-4  # standard deviation of the first pose of the reference (m, m, rad)
+POSES_A_STEP: Final = 10  # of the reference, which no batch finds after the drift of 4 km
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
     """Rows of the file, with poses numbered from 0 in order."""
 
-    moves: Array
-    """(n, 3) Moves from each pose to the next one, in m, m and rad."""
-    sigmas: Array
-    """(3,) Standard deviations of a move (m, m, rad)."""
-    pose: IntArray
-    """(r,) Number of the pose that each detection is from."""
-    tree: IntArray
-    """(r,) Number of the tree of each detection, from 0, as the file has it."""
-    points: Array
-    """(r, 2) Detections in the vehicle frame, in m."""
-    covariances: Array
-    """(r, 2, 2) Their covariances in m^2."""
+    moves: Array  # (n, 3) moves from each pose to the next one, in m, m and rad
+    sigmas: Array  # (3,) standard deviations of a move (m, m, rad)
+    pose: IntArray  # (r,) number of the pose that each detection is from
+    tree: IntArray  # (r,) number of the tree of each detection, from 0, as the file has it
+    points: Array  # (r, 2) detections in the vehicle frame, in m
+    covariances: Array  # (r, 2, 2) their covariances in m^2
 
 
 def read_victoria_park(file: Path | None = None) -> Recording:
@@ -86,7 +73,6 @@ def read_victoria_park(file: Path | None = None) -> Recording:
 
 
 def example_file() -> Path:
-    """Return the file that GTSAM brings."""
     find: Any = gtsam.findExampleDataFile
     return Path(find(EXAMPLE))
 
@@ -130,11 +116,7 @@ def _read(file: Path) -> Drive:
     )
 
 
-# --- the reference ---------------------------------------------------------------------------------------
-
-
 def _reference(drive: Drive, t: Array) -> Truth:
-    """Return the optimum of GTSAM with the associations of the file."""
     values = _optimum(drive)
     poses = [values.atPose2(X(index)) for index in range(len(t))]
     trees = np.array([values.atPoint2(L(index)) for index in range(int(drive.tree.max()) + 1)])

@@ -40,30 +40,21 @@ COLOURLESS: Final = {
     False: "most detections have a colour again",
 }
 """Notices that most colours are unknown from now on, or no longer."""
-NEAREST: Final = 2
-"""Number of nearest cones that are orange where the vehicle drives between orange cones."""
+NEAREST: Final = 2  # number of nearest cones that are orange where the vehicle drives between orange cones
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
     """Readings of a cycle after they were judged."""
 
-    motion: MeasuredMotion
-    """Motion that leads to the cycle."""
-    detections: Detections
-    """Detections of cones that bound the road."""
-    seen_again: BoolArray
-    """(m,) Whether each of them lies where the cycles just before had one."""
-    orange: Detections
-    """Detections of orange cones, which bound no road."""
-    stated: Array
-    """(m, 2, 2) Covariances of the detections in m^2 as stated, before any noise was measured."""
-    sensor_doubted: bool = False
-    """Whether the readings so far contradict the prior of the sensor's yaw or latency."""
-    measured: MapperSettings | None = None
-    """Settings with the priors of the calibrations, in a cycle in which they were measured."""
-    notice: str = ""
-    """What the labels mean from now on, where that has changed."""
+    motion: MeasuredMotion  # motion that leads to the cycle
+    detections: Detections  # detections of cones that bound the road
+    seen_again: BoolArray  # (m,) whether each of them lies where the cycles just before had one
+    orange: Detections  # detections of orange cones, which bound no road
+    stated: Array  # (m, 2, 2) covariances of the detections in m^2 as stated, before any noise was measured
+    sensor_doubted: bool = False  # whether readings contradict the prior of the sensor's yaw or latency
+    measured: MapperSettings | None = None  # with priors of calibrations that were measured in this cycle
+    notice: str = ""  # what the labels mean from now on, where that has changed
 
 
 class FrontEnd:
@@ -79,17 +70,11 @@ class FrontEnd:
         self._sides = SideJudge(settings.sides)
 
     def admit(self, odometry: Odometry, detections: Detections, window: Sequence[float] = ()) -> Admitted:
-        """Return a cycle that may be used, or raise a ReadingError; nothing but a count changes.
-
-        A late cycle is admitted between the stamps (s) of the `window`.
-        """
+        """Return a usable cycle, maybe a late one between the `window`'s stamps, or a ReadingError."""
         return self.gate.admit(odometry, detections, self._motion.newest, window)
 
     def use_late(self, detections: Detections, window: Sequence[float]) -> Detections:
-        """Return the detections of a late cycle with the labels of their sides; unknown ones stay so.
-
-        Its stamp is not admitted again as long as it lies in the window, whose poses have these stamps (s).
-        """
+        """Return the detections of a late cycle with the labels of their sides; it counts as used."""
         self.gate.use_late(detections.t, window)
         detections = detections.where(~is_orange(detections))
         return self._sides.relabelled(detections, np.full(len(detections.labels), UNKNOWN))
@@ -112,20 +97,13 @@ class FrontEnd:
         # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
         if not (self._sensor_doubted or noise.of_detections):
             self._sensor_doubted = self._motion.errors.contradict(self._settings.calibration)
-        return Reading(
-            motion,
-            judged,
-            self._motion.seen_again,
-            noise.for_map(orange),
-            detections.covariances,
-            self._sensor_doubted,
-            self._measured(odometry, replace(detections, labels=labels), motion),
-            notice="; ".join(notices),
-        )
+        orange, seen, stated = noise.for_map(orange), self._motion.seen_again, detections.covariances
+        measured = self._measured(odometry, replace(detections, labels=labels), motion)
+        doubted = self._sensor_doubted
+        return Reading(motion, judged, seen, orange, stated, doubted, measured, "; ".join(notices))
 
     @property
     def noise_used(self) -> RunNoise:
-        """Noise that is used now, and what was measured so far."""
         return self.noise.used(self._settings)
 
     @property
@@ -151,22 +129,15 @@ class FrontEnd:
 class JudgedLog:
     """Readings of a whole log after they were judged cycle by cycle."""
 
-    chain: LogOdometry
-    """Motion from each cycle to the next."""
+    chain: LogOdometry  # motion from each cycle to the next
     cycles: Sequence[Detections]
-    orange: Sequence[Detections]
-    """Those of orange cones."""
-    settings: MapperSettings
-    """Settings, with wide priors of the sensor where the readings contradict them."""
+    orange: Sequence[Detections]  # those of orange cones
+    settings: MapperSettings  # settings, with wide priors of the sensor where the readings contradict them
     noise: RunNoise
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
-    """Return a log as the front end gives it to an estimator of whole logs.
-
-    Unknown noise is measured on the whole log first. A cycle that an online estimator would refuse is a
-    ReadingError.
-    """
+    """Return a log as the front end gives it to a batch; unknown noise is measured on all of it first."""
     front_end = FrontEnd(settings, noise)
     if front_end.noise.is_learning:
         front_end = FrontEnd(settings, replace(noise, measured=measure_log(log)))
@@ -190,7 +161,6 @@ def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
 
 
 def is_orange(detections: Detections) -> BoolArray:
-    """Return which detections (m,) are of orange cones."""
     return np.asarray(detections.labels >= min(POINTS))
 
 
@@ -200,10 +170,7 @@ def measure_log(log: Log) -> MeasuredNoise | None:
 
 
 def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
-    """Return the cycles of a log where odometry alone places them, and the twists.
-
-    It is not doubted, since the detections' noise and the sensor's errors are not known yet.
-    """
+    """Return the cycles of a log where odometry alone, which is not doubted, places them, and the twists."""
     readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
     for odometry, _ in readings:
         twists.add(odometry)
@@ -216,18 +183,13 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
     return cycles, twists
 
 
-# --- late cycles -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class LateDetections:
     """The detections of a late cycle as they would be seen from a pose of the window."""
 
-    detections: Detections
-    """Detections in the vehicle frame of that pose."""
+    detections: Detections  # detections in the vehicle frame of that pose
     cycle: int
-    twist: Array
-    """(3,) Mean twist of the vehicle then, m/s, m/s and rad/s."""
+    twist: Array  # (3,) mean twist of the vehicle then, m/s, m/s and rad/s
 
 
 def at_nearest_pose(
@@ -235,11 +197,10 @@ def at_nearest_pose(
 ) -> LateDetections:
     """Return late detections as they would be seen from the pose of the window that is nearest in time.
 
-    No pose is added. The vehicle is taken to move with a constant twist from the pose before the stamp to the
-    pose after it. With T the motion from the nearest pose to the late one, a detection z with covariance K
-    becomes `T z` with `R (K + G Q G') R'`, where `G = [I | J z]` and J is the quarter turn. Q is the
-    covariance of the odometry for the share of the interval up to the nearest pose, and what a changing twist
-    may add: half the acceleration times the times to both poses. This treats the errors of the detections as
+    The vehicle moves with a constant twist between the poses around the stamp. With T the motion from the
+    nearest pose to the late one, a detection z with covariance K becomes `T z` with `R (K + G Q G') R'`,
+    where `G = [I | J z]` and J is the quarter turn. Q is the covariance of the odometry for the share of the
+    interval, and of a changing twist: half the acceleration times the times to both poses. Errors count as
     independent, though one motion has moved them all.
     """
     times, poses, t = smoother.times, smoother.variables.poses, detections.t

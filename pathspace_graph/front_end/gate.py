@@ -1,8 +1,7 @@
 """The gate of the online estimators: a perception cycle is checked before anything is touched.
 
-A cycle that no estimator can use is a ReadingError, and changes nothing. A single detection that is
-impossible is dropped, and the others are used: a detector may fail for one cone, while a wrong stamp, shape,
-label or twist makes the whole cycle useless.
+A wrong stamp, shape, label or twist makes the whole cycle useless, which is a ReadingError and changes
+nothing. A single detection that is impossible is dropped: a detector may fail for one cone.
 """
 
 from collections.abc import Sequence
@@ -24,26 +23,18 @@ from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.scale import in_scene, scale_of
 from pathspace_graph.settings.online import LimitSettings
 
-UNITS: Final = "stamps are in seconds"
-"""Hint where a stamp looks like one in milliseconds or nanoseconds."""
+UNITS: Final = "stamps are in seconds"  # hint where a stamp looks like one in milliseconds or nanoseconds
 TWIST: Final = ("vx", "vy", "wz")
 UNIT: Final = ("m/s", "m/s", "rad/s")
-MAX_STAMP: Final = 1e11
-"""Largest stamp, s: some three thousand years. Stamps in nanoseconds are larger."""
-MIN_INTERVAL: Final = 1e-3
-"""Least time from a cycle to the next, s: between nearer ones the odometry is too certain for doubles."""
+MAX_STAMP: Final = 1e11  # largest stamp, s: some three thousand years. Stamps in nanoseconds are larger
+MIN_INTERVAL: Final = 1e-3  # s from cycle to cycle: below, the odometry is too certain for doubles
 MAX_TWISTS: Final = 100_000
-MAX_DETECTIONS: Final = 500
-"""Largest numbers of twists and detections in a cycle, which bound its time."""
-MIN_RANGE: Final = 0.01
-"""Least distance of a detection from the vehicle, m."""
+MAX_DETECTIONS: Final = 500  # largest numbers of twists and detections in a cycle, which bound its time
+MIN_RANGE: Final = 0.01  # least distance of a detection from the vehicle, m
 MIN_SIGMA: Final = 1e-6
-MAX_SIGMA: Final = 100.0
-"""Least and largest standard deviation of a detection in any direction, m."""
-MIN_DETERMINANT: Final = 1e-12
-"""Least det of a covariance over xx * yy; below, it is singular to double precision."""
-MAX_ASYMMETRY: Final = 1e-6
-"""Largest difference of the entries xy and yx of a covariance, by its larger eigenvalue."""
+MAX_SIGMA: Final = 100.0  # least and largest standard deviation of a detection in any direction, m
+MIN_DETERMINANT: Final = 1e-12  # least det of a covariance over xx * yy: singular to doubles below
+MAX_ASYMMETRY: Final = 1e-6  # largest |xy - yx| of a covariance by its larger eigenvalue
 _COVARIANCES: Final = (MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA, MAX_SIGMA)
 
 
@@ -51,26 +42,20 @@ _COVARIANCES: Final = (MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA, MAX_SIGMA)
 class Newest:
     """Stamp and twist of the newest cycle in order; None before the first one."""
 
-    t: float | None = None
-    """Stamp, s."""
-    twist: Array | None = None
-    """(3,) Twist that was measured last, m/s, m/s and rad/s."""
+    t: float | None = None  # stamp, s
+    twist: Array | None = None  # (3,) twist that was measured last, m/s, m/s and rad/s
 
 
 @dataclass(frozen=True, eq=False)
 class Admitted:
     """A perception cycle that may be used, in arrays of its own."""
 
-    odometry: Odometry
-    """Twists in force from the newest cycle in order to this one; a late cycle has none."""
+    odometry: Odometry  # twists in force from the newest cycle in order to this one; a late cycle has none
     detections: Detections
     dropped: int = 0
-    late: bool = False
-    """Whether the cycle is older than the newest one, and is used at its own time."""
-    refused: int = 0
-    """Number of cycles that were refused since the last one that was used."""
-    notice: str = ""
-    """What was dropped, in the first of the cycles in which that happens."""
+    late: bool = False  # whether the cycle is older than the newest one, and is used at its own time
+    refused: int = 0  # number of cycles that were refused since the last one that was used
+    notice: str = ""  # what was dropped, in the first of the cycles in which that happens
 
     def counted(self, result: CycleResult) -> CycleResult:
         """Return the result of the cycle with what was counted at the gate."""
@@ -90,9 +75,8 @@ def admit(
 ) -> Admitted:
     """Return a cycle as an estimator may use it, or raise a ReadingError.
 
-    A late cycle, older than the newest one, is admitted between the stamps (s) of the `window`, whose poses
-    can still take detections, unless its stamp is among those `used`. Each twist is held until the next one,
-    and what was in force before the newest cycle is left out.
+    A late cycle is admitted between the stamps (s) of the `window`, unless its stamp is among those `used`.
+    Each twist is held until the next one, and what was in force before the newest cycle is left out.
     """
     t = _stamp(_of_type(Detections, detections, "detections").t)
     try:
@@ -116,8 +100,7 @@ class Gate:
 
     def __init__(self, limits: LimitSettings) -> None:
         self.limits = limits
-        self.refused = 0
-        """Number of cycles that were refused since the last one that was used."""
+        self.refused = 0  # number of cycles that were refused since the last one that was used
         self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
         self._late: list[float] = []  # the stamps (s) of late cycles in the window that were used
         self._dropping = False
@@ -140,20 +123,14 @@ class Gate:
         return admitted
 
     def refuse(self) -> None:
-        """Count a cycle that another check has refused."""
         self.refused += 1
 
     def _goes_on(self, detections: Detections) -> bool:
-        """Return whether a cycle goes on from the one that has just been refused.
-
-        One stamp far ahead is an error. Two that agree are of a vehicle that was silent for long, which must
-        not be refused for ever.
-        """
+        """Return whether a cycle goes on from the one just refused: two that agree end a silence."""
         t, before = _stamp_or_none(detections), self._refused_at
         return t is not None and before is not None and 0.0 < t - before <= self.limits.silence
 
     def use_late(self, t: float, window: Sequence[float]) -> None:
-        """Note that the late cycle at t (s) is used, so that it is not used again."""
         self._late = [stamp for stamp in self._late if stamp >= window[0]] + [t]
 
 
@@ -245,7 +222,6 @@ def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, A
 
 
 def _require(good: BoolArray, field: str, expected: str, values: NDArray[Any]) -> None:
-    """Raise a ReadingError about the first of the values (n,) that is not good (n,)."""
     if not good.all():
         row = int(good.argmin())
         raise ReadingError(field, expected, values[row].item(), row)
@@ -289,11 +265,9 @@ def possible_detections(detections: Detections, t: float, limits: LimitSettings)
 
 @compiled
 def _usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tuple[BoolArray, BoolArray]:
-    """Return whether points (m, 2), vehicle frame, are where a sensor can see; those not finite are not.
+    """Return which points (m, 2) are where a sensor sees, and which covariances (m, 2, 2) are possible.
 
-    The second result is whether covariances (m, 2, 2) are symmetric and positive definite, and of a possible
-    size; the smaller eigenvalue is the determinant by the larger one. The limits are MIN_RANGE, the largest
-    range, and `_COVARIANCES`.
+    The limits are MIN_RANGE, the largest range, and `_COVARIANCES`.
     """
     min_range, max_range, asymmetry, determinant, min_sigma, max_sigma = limits
     distance = np.hypot(points[:, 0], points[:, 1])
@@ -327,7 +301,6 @@ def _numbers(values: Any, field: str, shape: tuple[int, ...]) -> Array:
 
 
 def _array(values: Any, field: str, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return values as an array with a shape, in which -1 stands for any length."""
     try:
         array = np.asarray(values)
     except ValueError:

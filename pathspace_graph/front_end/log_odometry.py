@@ -20,22 +20,14 @@ from .motion import mean_bias
 class LogOdometry:
     """The prior of the first pose, and the motion from each cycle's pose to the next."""
 
-    stamps: Array
-    """(P,) Stamps of the perception cycles, s."""
-    first: Array
-    """(3,) Pose of the first cycle in the map frame, by odometry from the first odometry stamp."""
-    first_information: Array
-    """(3, 3) Inverse of its covariance, map frame."""
-    odometry: OdometryChain
-    """P - 1 intervals, one from each cycle's pose to the next."""
-    twists: Array
-    """(P, 3) Twists in force at the cycles, m/s, m/s and rad/s."""
-    calibration_mean: Array
-    """(2,) Prior mean of the calibration: scale error (-), yaw-rate bias (rad/s)."""
-    calibration_sigma: Array
-    """(2,) Its prior standard deviation."""
-    bias: BiasMeasurement | None = None
-    """Bias of the yaw rate that the vehicle has measured at rest, where it stood."""
+    stamps: Array  # (P,) stamps of the perception cycles, s
+    first: Array  # (3,) pose of the first cycle in the map frame, by odometry from the first odometry stamp
+    first_information: Array  # (3, 3) inverse of its covariance, map frame
+    odometry: OdometryChain  # p - 1 intervals, one from each cycle's pose to the next
+    twists: Array  # (P, 3) twists in force at the cycles, m/s, m/s and rad/s
+    calibration_mean: Array  # (2,) prior mean of the calibration: scale error (-), yaw-rate bias (rad/s)
+    calibration_sigma: Array  # (2,) its prior standard deviation
+    bias: BiasMeasurement | None = None  # of the yaw rate, measured at rest
 
     def __len__(self) -> int:
         return len(self.stamps)

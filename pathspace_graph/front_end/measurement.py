@@ -5,11 +5,9 @@ What is left depends on range, motion and time: constant errors of the sensor sh
 derivatives, noise scatters them, and errors that stay with a cone scatter its sightings together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from scipy.optimize import nnls
@@ -29,45 +27,25 @@ less than 0.05 m/s is lost in the noise of its detections."""
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02])
 """Weak priors of the sensor's errors (rad, m, s, -, m) and of the yaw rate's bias (rad/s), one sigma."""
 FIRST_ALONG: Final = (0.1, 0.04)
-FIRST_ACROSS: Final = (0.05, 0.016)
-"""Noise that the iteration begins with: m and m/m, then m and rad."""
-PASSES: Final = 4
-"""Times that cones are followed."""
-FOLLOWED: Final = 40
-"""Cycles in which cones are followed in a step."""
-ROUNDS: Final = 5
-"""Times that errors, noise and weights are found in turn."""
-STRETCH: Final = 3.0
-"""Time (s) over which errors of the odometry are alike."""
-COUNTED: Final = 0.8
-"""Share of `MAX_RANGE` beyond which cones hardly count: they are followed only where they seem nearer."""
-HARDLY: Final = 1e-6
-"""Weight of their sightings. It is not zero, so that a cone seen only there still has a place."""
+FIRST_ACROSS: Final = (0.05, 0.016)  # noise that the iteration begins with: m and m/m, then m and rad
+PASSES: Final = 4  # times that cones are followed
+FOLLOWED: Final = 40  # cycles in which cones are followed in a step
+ROUNDS: Final = 5  # times that errors, noise and weights are found in turn
+STRETCH: Final = 3.0  # time (s) over which errors of the odometry are alike
+COUNTED: Final = 0.8  # share of `MAX_RANGE` beyond which cones are followed only where they seem nearer
+HARDLY: Final = 1e-6  # weight of sightings beyond: a cone seen only there still has a place
 HUBER: Final = 2.0
-MIN_COUNT: Final = 5
-"""Least number of sightings of a cone that counts."""
-MIN_ROWS: Final = 60
-"""Least number of sightings with a reference that tell the noise of detections."""
-NEAR: Final = 0.6
-"""Share of a sighting's range within which the same cone's sightings are its reference."""
-NEAR_TIME: Final = 6.0
-"""Greatest time to a reference (s), over which odometry is trusted."""
+MIN_COUNT: Final = 5  # least number of sightings of a cone that counts
+MIN_ROWS: Final = 60  # least number of sightings with a reference that tell the noise of detections
+NEAR: Final = 0.6  # share of a sighting's range within which the same cone's sightings are its reference
+NEAR_TIME: Final = 6.0  # greatest time to a reference (s), over which odometry is trusted
 BINS: Final = 8
-TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-"""Correlation times that are tried (s)."""
-LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
-"""Edges of the lags at which correlation is measured (s)."""
-MODEL_ERROR: Final = 0.05
-"""Share of an error that the linear model may be wrong by, one sigma."""
-FIRST_SHARE: Final = 0.5
-"""Share of a cone's error that stays with it, as long as hardly any cone says otherwise."""
-FIRST_CONES: Final = 8.0
-"""Number of cones that `FIRST_SHARE` counts as much as."""
-LEAST: Final = (0.02, 0.002)
-"""Least noise along the ray (m) and across it (rad): a cone is no point."""
-
-
-# --- errors of the sensor --------------------------------------------------------------------------------
+TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # correlation times that are tried (s)
+LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)  # edges of the lags at which correlation is measured (s)
+MODEL_ERROR: Final = 0.05  # share of an error that the linear model may be wrong by, one sigma
+FIRST_SHARE: Final = 0.5  # share of a cone's error that stays with it, unless cones say otherwise
+FIRST_CONES: Final = 8.0  # number of cones that `FIRST_SHARE` counts as much as
+LEAST: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
 
 
 @dataclass(eq=False)
@@ -76,33 +54,26 @@ class _Cones:
 
     table: Sightings
     begins: IntArray
-    pairs: tuple[IntArray, IntArray]
-    """Ordered pairs of sightings of one cone that are less than `NEAR_TIME` apart, by index."""
-    ranges: Array
-    """(n,) Range of the cone as the sensor measures it, without noise (m)."""
-    ray: Array
-    """(n, 2) Unit vector along the ray, map frame."""
+    pairs: tuple[IntArray, IntArray]  # of one cone's sightings less than `NEAR_TIME` apart, by index
+    ranges: Array  # (n,) range of the cone as the sensor measures it, without noise (m)
+    ray: Array  # (n, 2) unit vector along the ray, map frame
     side: Array
     points: Array
-    columns: Array
-    """(n, 2, 6) Derivatives by the sensor's errors and by the bias of the yaw rate."""
+    columns: Array  # (n, 2, 6) derivatives by the sensor's errors and by the bias of the yaw rate
 
-    def without(self, off: Array) -> _Cones:
+    def without(self, off: Array) -> Self:
         """Return the sightings with ranges and derivatives where they would be without their errors (n, 2).
 
-        At the measured points both have the noise in them: weights would prefer sightings that came out
-        too short, and errors would come out too small.
+        With the noise in them weights would prefer short sightings, and errors come out too small.
         """
         seen = self.table.point - np.einsum("nij,nj->ni", rotations(-self.table.pose[:, 2]), off)
         ranges = np.maximum(np.hypot(*seen.T), np.finfo(float).tiny)
         return replace(self, ranges=ranges, columns=_columns(self.table, self.begins, seen))
 
     def sums(self, values: Array) -> Array:
-        """Return the sum of values (n, ...) over each cone."""
         return np.asarray(np.add.reduceat(values, self.begins, axis=0))
 
     def spread(self, values: Array) -> Array:
-        """Return values (c, ...) of the cones for each of their sightings."""
         return np.repeat(values, np.diff(np.append(self.begins, len(self.ranges))), axis=0)
 
 
@@ -128,8 +99,7 @@ def _cones(sightings: Sightings) -> _Cones | None:
 def _columns(table: Sightings, begins: IntArray, seen: Array) -> Array:
     """Return the derivatives (n, 2, 6) of sightings at points (n, 2), vehicle frame, in the map frame.
 
-    The bias of the yaw rate counts from the first sighting of each cone on: what it did before turns all
-    sightings of the cone alike.
+    The bias of the yaw rate counts from each cone's first sighting: before, it turns all of the cone's alike.
     """
     first = np.repeat(begins, np.diff(np.append(begins, len(seen))))
     turn, by_bias, then = rotations(table.pose[:, 2]), table.by_bias, table.by_bias[first]
@@ -141,7 +111,6 @@ def _columns(table: Sightings, begins: IntArray, seen: Array) -> Array:
 
 
 def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Array) -> Array:
-    """Return the information (n, 2, 2) of each sighting, map frame."""
     by_ray = cones.ray[:, :, None] * cones.ray[:, None, :] / (along.sigmas(cones.ranges) ** 2)[:, None, None]
     by_side = cones.side[:, :, None] * cones.side[:, None, :]
     by_side /= (across.sigmas(cones.ranges) ** 2)[:, None, None]
@@ -149,10 +118,9 @@ def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Arra
 
 
 def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
-    """Return errors b (6,), their covariance twice, and what is left (n, 2) of each sighting about its cone.
+    """Return errors b (6,), both covariances of them, and what is left (n, 2) of the sightings.
 
-    The places of the cones, which are the weighted means of `p + A b`, are eliminated. The covariances are
-    that of independent sightings, and `_clustered`.
+    The cones' places, weighted means of `p + A b`, are eliminated. One covariance is `_clustered`.
     """
     total = np.linalg.inv(cones.sums(information))
     mean_columns = total @ cones.sums(information @ cones.columns)
@@ -170,8 +138,8 @@ def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Arra
 def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
     """Return the covariance (6, 6) of the errors by how much the stretches of the drive disagree.
 
-    With the scores g (c, 6) of the cones summed over stretches of `STRETCH` seconds it is `P (sum g g') P`
-    (White's estimator for clusters). Errors of the odometry, which all cones share, are in it.
+    With the scores g (c, 6) of the cones summed over `STRETCH` seconds it is `P (sum g g') P` (White's
+    estimator for clusters), which has the errors of the odometry in it.
     """
     middle = cones.sums(cones.table.t) / np.diff(np.append(cones.begins, len(cones.ranges)))
     _, stretch = np.unique(np.floor(middle / STRETCH), return_inverse=True)
@@ -181,25 +149,17 @@ def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
     return np.asarray(covariance @ (summed.T @ summed) @ covariance * count / max(count - 1, 1))
 
 
-# --- noise of the detections -----------------------------------------------------------------------------
-
-
 @dataclass(eq=False)
 class _Residuals:
     """What is left of far sightings about nearer ones of the same cone, after the constant errors."""
 
     rows: IntArray
-    offsets: Array
-    """(k, 2) Along the ray and across it, m."""
-    reference: Array
-    """(k, 2) Variance of the reference and of the odometry in between, along and across (m^2)."""
+    offsets: Array  # (k, 2) along the ray and across it, m
+    reference: Array  # (k, 2) variance of reference and odometry, along and across (m^2)
 
 
 def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], odometry: Array) -> _Residuals:
-    """Return the residuals of sightings against nearer ones.
-
-    `odometry` is the drift (3,) by root of s that white noise of the twists makes.
-    """
+    """Return the residuals against nearer sightings, with the drift (3,) by root of s of white noise."""
     (i, j), t, ranges = cones.pairs, cones.table.t, cones.ranges
     near = ranges[j] < NEAR * ranges[i]
     i, j = i[near], j[near]
@@ -283,9 +243,6 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
     return best[1], best[2]
 
 
-# --- all of it -------------------------------------------------------------------------------------------
-
-
 class _Rounds:
     """Search for errors, noise and weights in turn."""
 
@@ -296,7 +253,6 @@ class _Rounds:
         self._left = ROUNDS
 
     def advance(self) -> MeasuredNoise | None:
-        """Do one round; return what was found after the last one."""
         walk, noise = self._found.odometry * np.sqrt(self._found.interval), self._noise
         information = _information(self._cones, *noise, self._weights)
         errors, *covariances, off = _solve(self._cones, information)
@@ -315,8 +271,7 @@ class _Rounds:
     def _result(self, errors: Array, covariance: Array, clustered: Array) -> MeasuredNoise:
         """Return what was found, with errors (6,) and both covariances (6, 6) of them.
 
-        What stays of a cone's errors shifts its place, and only what changes while it is seen is taken for
-        an error of the sensor, as a slope would be.
+        What stays of a cone's errors shifts its place; only what changes is taken for an error of the sensor.
         """
         stamps, cones = np.unique(self._sightings.t), self._cones
         period = float(np.median(np.diff(stamps)))
@@ -337,10 +292,7 @@ class _Rounds:
 
 
 class Measurement:
-    """Measurement of noise in steps short enough for a perception cycle.
-
-    Cones are followed again with the noise and the errors that were found, from those known already on.
-    """
+    """Measurement of noise in steps short enough for a perception cycle, in passes of follow and measure."""
 
     def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
         """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least."""
@@ -351,9 +303,7 @@ class Measurement:
         self._rounds: _Rounds | None = None
 
     @classmethod
-    def of(
-        cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None
-    ) -> Measurement | None:
+    def of(cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None) -> Self | None:
         """Return a measurement; None where not even the noise of the odometry can be told."""
         white = twists.white()
         if white is None:
@@ -363,7 +313,6 @@ class Measurement:
         return cls(cycles, replace(found, odometry=sigma, interval=interval))
 
     def advance(self) -> MeasuredNoise | None:
-        """Do a step; return the noise after the last one."""
         if self._rounds is not None:
             found = self._rounds.advance()
             return None if found is None else self._passed(found)
@@ -380,7 +329,6 @@ class Measurement:
         return None
 
     def _passed(self, found: MeasuredNoise) -> MeasuredNoise | None:
-        """End a pass, and begin the next one unless it was the last."""
         self._passes -= 1
         self._found, self._rounds, self._followed = found, None, 0
         self._follower, self._sightings = Follower(found), [Sightings.none()]

@@ -13,63 +13,31 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, integrate_odometry
 from pathspace_graph.settings.online import MotionSettings
 
+from . import scan_matching as scans
 from .gate import Newest
-from .scan_matching import (
-    MIN_MATCHED,
-    REACHES_CHECK,
-    Difference,
-    Match,
-    RecentDetections,
-    SensorErrors,
-    by_errors,
-    match,
-    misfit_at,
-    off_prediction,
-    reaches,
-)
+from .scan_matching import REACHES_CHECK, Difference, Match, RecentDetections, SensorErrors, by_errors
 
-NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))
-"""A motion that no odometry has measured does not depend on the calibration of the odometry."""
-DOUBT_AGAIN: Final = 3.8
-"""Contradiction of an odometry that was contradicted not long ago, standard deviations."""
-DISTRUST: Final = 12.0
-"""Time for which it is distrusted so, s: wheels that slip do so in the next bends, too."""
-DOUBT_RATE: Final = 2.0
-"""Agreement within which the yaw rate of a contradicted odometry is still believed, standard deviations."""
-MIN_DOUBTING: Final = 4
-"""Least number of matched detections of a contradiction."""
-MISFIT: Final = 1.5
-"""Mean-square misfit beyond which detections are worse than they claim: its excess scales covariances."""
-MISFIT_GAIN: Final = 0.02
-"""Smoothing gain of the mean-square misfit."""
-MAX_MISFIT: Final = 3.0
-"""Largest misfit that tells a motion: about 1 where the vehicle moved, 4 where it was put down elsewhere."""
-MISFIT_ODOMETRY: Final = 2.0
-"""Least misfit at the odometry's own pose in a contradiction."""
-MISFIT_RATIO: Final = 1.3
-"""Least ratio of that misfit to the one of the match."""
-MAX_CHANGE: Final = 3.5
-"""Largest difference of a motion from the one before, in `SIGMAS_CHANGE`."""
-SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)
-"""Standard deviations (m/s, m/s, rad/s) of a velocity's change in a cycle whose odometry is not believed."""
-BEFORE: Final = 0.5
-"""Share of a contradiction's size added to its motion's sigma: it may have begun a few cycles before."""
-WIDENING: Final = 1.5
-"""Factor of the standard deviations of a motion told from detections, since the estimator uses them again."""
-HOLD: Final = 0.15
-"""Time for which a twist is held without a loss of certainty, s."""
-HOLD_INTERVALS: Final = 3.0
-"""Shortest intervals between two twists for which it is held so; the longer time counts."""
-STUCK: Final = 3
-"""Twists in a cycle equal to the one before from which readings are stuck, if no vehicle moves so."""
-REST: Final = 1.0
-"""Time of standing from which the vehicle is at rest, s: its mean yaw rate measures the bias then."""
-REST_TWIST: Final = (0.1, 0.1, 0.05)
-"""Largest mean twist (m/s, m/s, rad/s) of a vehicle that stands, but for noise; the yaw rate is bias."""
-REST_SIGMAS: Final = 3.0
-"""Standard deviations of the mean that count as its noise."""
-SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)
-"""Standard deviations (m, m, rad) of a motion at rest from cycle to cycle."""
+NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))  # of a motion that is not by odometry
+DOUBT_AGAIN: Final = 3.8  # contradiction of an odometry that was contradicted not long ago, sigmas
+DISTRUST: Final = 12.0  # time for which it is distrusted so, s: wheels that slip do so in the next bends, too
+DOUBT_RATE: Final = 2.0  # agreement within which a contradicted odometry's yaw rate is believed, sigmas
+MIN_DOUBTING: Final = 4  # least number of matched detections of a contradiction
+MISFIT: Final = 1.5  # mean-square misfit beyond which its excess scales the detections' covariances
+MISFIT_GAIN: Final = 0.02  # smoothing gain of the mean-square misfit
+MAX_MISFIT: Final = 3.0  # largest misfit of a motion: 1 where the vehicle moved, 4 where it was put down
+MISFIT_ODOMETRY: Final = 2.0  # least misfit at the odometry's own pose in a contradiction
+MISFIT_RATIO: Final = 1.3  # least ratio of that misfit to the one of the match
+MAX_CHANGE: Final = 3.5  # largest difference of a motion from the one before, in `SIGMAS_CHANGE`
+SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)  # m/s, m/s, rad/s from cycle to cycle without odometry
+BEFORE: Final = 0.5  # share of a contradiction added to its motion's sigma: it may have begun earlier
+WIDENING: Final = 1.5  # of the sigmas of a motion by detections, which the estimator uses again
+HOLD: Final = 0.15  # time for which a twist is held without a loss of certainty, s
+HOLD_INTERVALS: Final = 3.0  # shortest intervals of twists for which it is held so, if longer
+STUCK: Final = 3  # twists equal to the one before from which readings are stuck
+REST: Final = 1.0  # time of standing from which the mean yaw rate measures the bias, s
+REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest, m/s, m/s, rad/s, but for noise
+REST_SIGMAS: Final = 3.0  # standard deviations of the mean that count as its noise
+SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # m, m, rad, of a motion at rest from cycle to cycle
 
 
 class MotionCheck:
@@ -79,15 +47,11 @@ class MotionCheck:
     """
 
     def __init__(self, sigma: Array, settings: MotionSettings) -> None:
-        """Keep the settings, and the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         self.settings = settings
         self.sigma = sigma
-        self.seen_again: BoolArray = np.zeros(0, bool)
-        """(m,) Whether each detection of the newest cycle lies where the cycles before had one."""
-        self.pose: Array = np.zeros(3)
-        """(3,) Newest pose in the frame of the front end, in which the drive began at 0."""
-        self.errors = SensorErrors(settings)
-        """How much the sensor is turned, and how late its detections are."""
+        self.seen_again: BoolArray = np.zeros(0, bool)  # (m,) of the newest cycle, like `Reading.seen_again`
+        self.pose: Array = np.zeros(3)  # (3,) in the frame of the front end, from 0 on
+        self.errors = SensorErrors(settings)  # how much the sensor is turned, and how late its detections are
         self._recent = RecentDetections()
         self._velocity: Array | None = None
         self._t: float | None = None
@@ -100,18 +64,12 @@ class MotionCheck:
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
     def believe(self, sigma: Array) -> None:
-        """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten.
-
-        Its errors are taken out of the detections from now on.
-        """
+        """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten."""
         self.sigma = self._rest.sigma = sigma
         self._recent, self.errors = RecentDetections(), SensorErrors(self.settings)
 
     def update(self, odometry: Odometry, detections: Detections, may_doubt: bool = True) -> MeasuredMotion:
-        """Return the motion since the last cycle.
-
-        Unless it `may_doubt`, odometry is believed: the detections' noise is not known then.
-        """
+        """Return the motion since the last cycle, whose odometry may be doubted if the noise is known."""
         t, measured = detections.t, detections.points_vehicle
         motion = self._integrate(odometry, t)
         columns = by_errors(measured, motion.odometry.twist)
@@ -140,11 +98,8 @@ class MotionCheck:
 
     @property
     def newest(self) -> Newest:
-        """Stamp and twist of the last accepted cycle."""
         t, twist = self._reading
         return Newest(self._t, twist if t > -np.inf else None)
-
-    # --- the odometry ------------------------------------------------------------------------------------
 
     def _integrate(self, odometry: Odometry, t: float) -> MeasuredMotion:
         """Return the motion by odometry, whose noise grows where a twist is held for long."""
@@ -162,25 +117,16 @@ class MotionCheck:
         if missing or held.any():
             excess = held[:, None] * np.array(self.settings.accelerations)
         integrated = integrate_odometry(odometry, t, np.hypot(self.sigma, excess))
-        return MeasuredMotion(
-            integrated,
-            odometry.twist,
-            missing=missing,
-            stuck=_is_stuck(odometry.twist),
-            durations=np.diff(np.append(odometry.t, t)),
-            excess=excess,
-        )
+        durations, stuck = np.diff(np.append(odometry.t, t)), _is_stuck(odometry.twist)
+        return MeasuredMotion(integrated, odometry.twist, False, missing, stuck, None, durations, excess)
 
     def _at_rest(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
-        """Return no motion at all, where the detections say so as well, or else the given one."""
         standing = self._match(detections, variances, self.pose, REACHES_CHECK)
         none = integrated_odometry(np.zeros(3), np.diag(SIGMAS_REST) ** 2, NO_CALIBRATION)
         if standing is None or self._denies(standing, self._difference(none, self.pose, standing)):
             self._rest.end()
             return motion
         return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(detections.t))
-
-    # --- the check ---------------------------------------------------------------------------------------
 
     def _checked(
         self, motion: MeasuredMotion, detections: Detections, variances: Array, may_doubt: bool
@@ -214,47 +160,40 @@ class MotionCheck:
         return self._replaced(motion, best, going_on, dt) if failed else motion
 
     def _fits_better(self, best: Match, predicted: Array, detections: Detections, variances: Array) -> bool:
-        """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match.
-
-        In a bend, a few cones may as well be laid on each other's neighbours, far from where they fit.
-        """
+        """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
         points, variances = detections.points_vehicle[best.is_matched], variances[best.is_matched]
         at_odometry, at_match = (
-            misfit_at(self._recent, points, variances, pose) for pose in (predicted, best.pose)
+            scans.misfit_at(self._recent, points, variances, pose) for pose in (predicted, best.pose)
         )
         return at_odometry > max(MISFIT_ODOMETRY, MISFIT_RATIO * at_match)
 
     def _best(
         self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float
     ) -> Match | None:
-        """Return the better match of those that begin at two poses (3,), the first going on as before."""
-        matches = [self._match(detections, variances, start, reaches()) for start in starts]
+        matches = [self._match(detections, variances, start, scans.reaches()) for start in starts]
         possible = [one for one in matches if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)
 
     def _is_possible(self, matched: Match, going_on: Array, dt: float) -> bool:
-        """Return whether a match is that of a vehicle which went on from pose to pose (3,)."""
         sigmas = np.array(SIGMAS_CHANGE) * dt + np.sqrt(np.diag(np.linalg.inv(matched.information)))
         change = np.abs(relative(going_on, matched.pose))
         fits = matched.misfit < MAX_MISFIT * self._excess
         return fits and bool((change < MAX_CHANGE * sigmas).all())
 
     def _denies(self, matched: Match, difference: Difference) -> bool:
-        """Return whether a match of detections is too far off a motion."""
         return matched.matched >= MIN_DOUBTING and self.errors.square_of(difference) > self._limit**2
 
     def _match(
         self, detections: Detections, variances: Array, start: Array, reaches: Sequence[float]
     ) -> Match | None:
-        """Return the match of a cycle's detections that begins at a pose (3,), if it holds the pose."""
-        matched = match(self._recent, detections.points_vehicle, variances, start, reaches)
-        return matched if matched.matched >= MIN_MATCHED and matched.is_certain else None
+        matched = scans.match(self._recent, detections.points_vehicle, variances, start, reaches)
+        return matched if matched.matched >= scans.MIN_MATCHED and matched.is_certain else None
 
     def _difference(self, odometry: IntegratedOdometry, predicted: Array, matched: Match) -> Difference:
         """Return how far the detections are from the predicted pose (3,), in the vehicle's frame."""
         known = matched.pose, matched.information, self._excess, predicted, odometry.covariance
         way = rotation(predicted[2]).T @ (predicted[:2] - self._recent.seen_from)
-        return Difference(*off_prediction(*known), self.errors.shifts(way, odometry.twist))
+        return Difference(*scans.off_prediction(*known), self.errors.shifts(way, odometry.twist))
 
     @property
     def _excess(self) -> float:
@@ -273,7 +212,8 @@ class MotionCheck:
             gyro_is_right = abs(difference.off[2]) <= near
             if gyro_is_right and not (motion.missing or motion.stuck):
                 mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
-            turn = _to_vehicle(best.pose[2])
+            turn = np.eye(3)  # from the frame of the check to the vehicle's
+            turn[:2, :2] = rotation(best.pose[2]).T
             information = turn @ best.information @ turn.T / (WIDENING**2 * self._excess)
             prior = np.linalg.inv(covariance)
             covariance = np.linalg.inv(information + prior)
@@ -292,7 +232,6 @@ class Rest:
     """Judge of whether the vehicle stands, by the odometry; it averages the yaw rate meanwhile."""
 
     def __init__(self, sigma: Array) -> None:
-        """Keep the standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         self.sigma = sigma
         self._since: float | None = None
         self._sum: Array = np.zeros(3)
@@ -301,16 +240,10 @@ class Rest:
         self._rate_sum, self._rate_count = 0.0, 0
 
     def update(self, odometry: Odometry, t: float) -> bool:
-        """Return whether the vehicle has stood for long enough at t (s), by the twists since the last cycle.
-
-        Its mean twist is zero within its own noise, and within the limits of a vehicle that stands.
-        """
+        """Return whether the vehicle has stood for long enough at t (s), by the newest twists."""
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
-        if (
-            len(twists) == 0
-            or twists[:, 0].min() > REST_TWIST[0] + REST_SIGMAS * self.sigma[0]
-            or not self._is_still(twists.mean(axis=0), len(twists))
-        ):
+        moves = not len(twists) or twists[:, 0].min() > REST_TWIST[0] + REST_SIGMAS * self.sigma[0]
+        if moves or not self._is_still(twists.mean(axis=0), len(twists)):
             self.end()
             return False
         if self._since is None:
@@ -321,7 +254,6 @@ class Rest:
         return self._is_still(self._sum / self._count, self._count) and t - self._since >= REST
 
     def end(self) -> None:
-        """Note that the vehicle moves."""
         self._since, self._sum, self._count = None, np.zeros(3), 0
         self._rate_sum, self._rate_count = 0.0, 0
 
@@ -355,10 +287,3 @@ def _is_stuck(twists: Array) -> bool:
     if same.sum() < STUCK:
         return False
     return bool((twists[1:][same] == twists[:-1][same]).all(axis=1).sum() >= STUCK)
-
-
-def _to_vehicle(theta: float) -> Array:
-    """Return the matrix (3, 3) that turns a small motion from the frame of the check to the vehicle's."""
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(theta).T
-    return turn

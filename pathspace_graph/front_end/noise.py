@@ -19,17 +19,12 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .measurement import Measurement
 from .sightings import SeenCycle, TwistRecord
 
-FIRST: Final = 8.0
-"""Driving time (s) after which noise is measured first."""
-AGAIN: Final = 1.5
-"""Growth of the driving time after which it is measured again."""
-MOST_CYCLES: Final = 300
-"""Newest cycles on which it is measured, which bounds its time."""
-MIN_SPEED: Final = 0.3
-"""Speed from which on the vehicle drives (m/s)."""
+FIRST: Final = 8.0  # driving time (s) after which noise is measured first
+AGAIN: Final = 1.5  # growth of the driving time after which it is measured again
+MOST_CYCLES: Final = 300  # newest cycles on which it is measured, which bounds its time
+MIN_SPEED: Final = 0.3  # speed from which on the vehicle drives (m/s)
 SCALE: Final = SENSOR.index("range_scale")
-REFERENCE_RANGE: Final = 10.0
-"""Range at whose noise ranges are compared with speeds (m)."""
+REFERENCE_RANGE: Final = 10.0  # range at whose noise ranges are compared with speeds (m)
 
 
 class NoiseLearner:
@@ -41,10 +36,8 @@ class NoiseLearner:
         self.of_odometry = use == "measured" or (use is None and not known.odometry_stated)
         self.of_detections = use == "measured" or (use is None and not known.detections_stated)
         """Whether the noise of odometry and detections is the measured one."""
-        self.of_sensor = use != "stated"
-        """Whether constant errors of the sensor are measured: stated noise says nothing of them."""
-        self.measured = known.measured
-        """What was measured so far, or by an earlier look at the whole drive."""
+        self.of_sensor = use != "stated"  # its constant errors: stated noise says nothing of them
+        self.measured = known.measured  # what was measured so far, or by an earlier look at the whole drive
         self._cycles: deque[SeenCycle] = deque(maxlen=MOST_CYCLES)
         self._twists = TwistRecord()
         self._measurement: Measurement | None = None
@@ -53,17 +46,14 @@ class NoiseLearner:
 
     @property
     def is_learning(self) -> bool:
-        """Return whether the drive is still needed to know its noise."""
         return self.of_sensor and self.known.measured is None
 
     @property
     def is_settled(self) -> bool:
-        """Return whether the noise of the detections is known, stated or measured."""
         return not self.of_detections or (self.measured is not None and self.measured.along is not None)
 
     @property
     def twist_sigma(self) -> Array:
-        """Return the standard deviation (3,) of a twist."""
         if self.of_odometry and self.measured is not None:
             return self.measured.twist_sigma
         return self.known.odometry
@@ -101,10 +91,7 @@ class NoiseLearner:
         )
 
     def for_map(self, detections: Detections) -> Detections:
-        """Return detections whose covariances say what each adds to the others of its cone.
-
-        Stated ones are those of single detections, which say nothing of errors that stay.
-        """
+        """Return detections whose covariances say what each adds to the others of its cone."""
         measured, points = self.measured, detections.points_vehicle
         if not self.of_sensor or measured is None:
             return detections
@@ -116,11 +103,9 @@ class NoiseLearner:
     def for_lap(
         self, motions: Sequence[MeasuredMotion], detections: Sequence[Detections]
     ) -> tuple[list[MeasuredMotion], list[Detections]]:
-        """Return the readings of a drive with the noise that is known now.
+        """Return the readings of a drive, with stated covariances, with the noise that is known now.
 
-        Its first seconds were driven before any was measured. They decide the heading of the map, so a lap
-        that is solved as a whole must not believe them more than the rest. The detections have their stated
-        covariances.
+        Its first seconds were driven before any was measured, and decide the heading of the map.
         """
         if self.of_odometry and self.measured is not None:
             motions = [motion.with_sigma(self.twist_sigma) for motion in motions]
@@ -176,8 +161,7 @@ class NoiseLearner:
     def trusts_odometry(self, settings: MapperSettings) -> bool:
         """Return whether the odometry sets the size of the map, by default where it is the smoother one.
 
-        Over a second it errs by the white noise of its readings, the ranges by that of their detections. What
-        drifts slowly hardly changes a length.
+        Over a second it errs by the white noise of its readings, the ranges by that of their detections.
         """
         measured, trust = self.measured, settings.calibration.trust
         if trust is not None or measured is None or measured.along is None:

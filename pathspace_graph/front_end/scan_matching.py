@@ -1,12 +1,10 @@
 """Scan matching: the detections of a cycle are laid on those of the cycles just before.
 
-Cones stand still, so that the detections tell how the vehicle has moved, in every direction. No cone needs an
-identity: each detection is drawn to the weighted mean of the earlier ones beside it, and the weights sharpen
-from iteration to iteration (EM-ICP; Granger and Pennec 2002).
+No cone needs an identity: each detection is drawn to the weighted mean of the earlier ones beside it, and the
+weights sharpen from iteration to iteration (EM-ICP; Granger and Pennec 2002).
 
-Matches also tell how much the sensor is turned, and how late it is. A sensor that is turned by psi sees each
-motion turned by -psi. Detections that are late by tau lie too far ahead by `tau v`. While the vehicle goes on
-evenly, that is the same in every cycle, and no match shows it, but each change of the velocity does.
+Matches also tell how much the sensor is turned, and how late it is. One turned by psi sees each motion turned
+by -psi. Detections that are late by tau lie too far ahead by `tau v`, which changes of the velocity show.
 """
 
 from collections.abc import Sequence
@@ -23,38 +21,25 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.online import MotionSettings
 
-ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]
-"""Errors of a sensor that are learned, as indices of its calibration."""
-SIGMAS_ERRORS: Final = (0.02, 0.05)
-"""Standard deviations (rad, s) of yaw and latency before anything is learned: those of a hasty mounting."""
-SIGMAS_CHANGES: Final = (0.001, 0.005)
-"""Their change in a minute (rad, s), one sigma, so that an old value is forgotten."""
+ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
+SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
+SIGMAS_CHANGES: Final = (0.001, 0.005)  # their change in a minute, rad and s
 MINUTE: Final = 60.0
 
-MEMORY: Final = 0.65
-"""Time for which detections are remembered, s: several cycles, over which odometry hardly drifts."""
-MOST_REMEMBERED: Final = 2000
-"""Largest number of remembered detections, which bounds the time of a match."""
+MEMORY: Final = 0.65  # age of remembered detections, s, over which odometry hardly drifts
+MOST_REMEMBERED: Final = 2000  # largest number of remembered detections, which bounds the time of a match
 REACH: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
 ITERATIONS: Final = 6
-REACHES_CHECK: Final = (REACH, REACH_LAST)
-"""Reaches in the check of the odometry, which begins near the solution."""
-FARTHEST: Final = 3.0
-"""Distance in reaches from which on a remembered detection has no weight."""
-MIN_WEIGHT: Final = 0.7
-"""Least sum of weights of a matched detection."""
-MIN_MATCHED: Final = 3
-"""Least number of matched detections that tell a motion."""
-HUBER: Final = 2.5
-"""Whitened distance beyond which the Huber loss reduces the weight of a matched detection."""
-SIGMA_CONE: Final = 0.05
-"""Standard deviation added to that of a detection, m, since one side of a cone is seen."""
-LEAST_SHARE: Final = 1e-6
-"""Least determinant of a pose's information that holds it, by the product of the diagonal."""
-MOST_MISFIT: Final = 9.0
-"""Largest whitened square distance that counts in a misfit which is compared with another."""
+REACHES_CHECK: Final = (REACH, REACH_LAST)  # of the check, which begins near the solution
+FARTHEST: Final = 3.0  # distance in reaches from which on a remembered detection has no weight
+MIN_WEIGHT: Final = 0.7  # least sum of weights of a matched detection
+MIN_MATCHED: Final = 3  # least number of matched detections that tell a motion
+HUBER: Final = 2.5  # whitened distance beyond which the Huber loss reduces the weight of a matched detection
+SIGMA_CONE: Final = 0.05  # added to a detection's, m, since one side of a cone is seen
+LEAST_SHARE: Final = 1e-6  # least det of a pose's information by the product of its diagonal
+MOST_MISFIT: Final = 9.0  # largest whitened square in a misfit that is compared with another
 _TINY: Final = float(np.finfo(float).tiny)
 
 
@@ -68,16 +53,12 @@ class RecentDetections:
     """Detections of the newest cycles in one frame."""
 
     def __init__(self) -> None:
-        self.points: Array = np.zeros((0, 2))
-        """(n, 2) Place of each detection, m."""
+        self.points: Array = np.zeros((0, 2))  # (n, 2) place of each detection, m
         # a row is [stamp | point as measured | place of the vehicle | derivatives of x | derivatives of y]
         self._table: Array = np.zeros((0, 5 + 2 * len(ERRORS)))
 
     def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
-        """Add the detections of a cycle at t (s), measured at (m, 2) in the frame of the pose (3,).
-
-        Their derivatives by e errors of the sensor are the columns (m, 2, e), in the same frame.
-        """
+        """Add detections (m, 2) at t (s) from a pose (3,), and their derivatives (m, 2, e) by errors."""
         new = np.empty((len(measured), self._table.shape[1]))
         new[:, 0], new[:, 1:3], new[:, 3:5] = t, to_map(measured, pose[None]), pose[:2]
         new[:, 5:] = (rotation(pose[2]) @ columns).reshape(len(measured), new.shape[1] - 5)
@@ -90,7 +71,6 @@ class RecentDetections:
         self.points = self._table[:, 1:3] + columns @ errors
 
     def forget(self, t: float) -> None:
-        """Drop the detections that are too old at t (s)."""
         first = int(self._table[:, 0].searchsorted(t - MEMORY, side="right"))
         self._table = self._table[first:]
         self.points = self._table[:, 1:3]
@@ -109,18 +89,13 @@ class RecentDetections:
 class Match:
     """Pose that lays detections on earlier ones."""
 
-    pose: Array
-    """(3,) In the frame of the earlier detections, m, m and rad."""
-    information: Array
-    """(3, 3) Information about the pose from the matched detections, same frame."""
-    is_matched: BoolArray
-    """(m,) Whether each detection lies on earlier ones."""
-    misfit: float
-    """Mean square of the matched detections' whitened distances."""
+    pose: Array  # (3,) in the frame of the earlier detections, m, m and rad
+    information: Array  # (3, 3) information about the pose from the matched detections, same frame
+    is_matched: BoolArray  # (m,) whether each detection lies on earlier ones
+    misfit: float  # mean square of the matched detections' whitened distances
 
     @property
     def matched(self) -> int:
-        """Number of detections that lie on earlier ones."""
         return int(self.is_matched.sum())
 
     @property
@@ -155,10 +130,7 @@ def _matched(
     reaches: Sequence[float],
     limits: tuple[float, ...],
 ) -> tuple[Array, Array, BoolArray, float]:
-    """Return the pose (3,) of `match`, and of its last step what `_match_step` returns but the gradient.
-
-    The limits are FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE, MIN_MATCHED and LEAST_SHARE.
-    """
+    """Return the pose (3,) of `match`, and of its last step what `_match_step` returns but the gradient."""
     pose, (min_matched, least_share) = start.copy(), limits[4:]
     for reach in reaches:
         information, gradient, matched, cost = _match_step(
@@ -209,10 +181,7 @@ def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array,
 
 @compiled
 def _weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
-    """Return the weighted means (m, 2) of recent points (n, 2) beside points (m, 2), and sums of weights.
-
-    The weights are `exp(-d^2 / 2 reach^2)` below a distance of `farthest` reaches.
-    """
+    """Return means (m, 2) of recent points by `exp(-d^2 / 2 reach^2)`, and the sums of weights."""
     dx = points[:, 0, None] - recent[:, 0]
     dy = points[:, 1, None] - recent[:, 1]
     square = (dx * dx + dy * dy) / reach**2
@@ -236,12 +205,9 @@ def by_errors(points_vehicle: Array, twist: Array) -> Array:
 class Difference:
     """Distance of a match of detections from the odometry, in the vehicle frame."""
 
-    off: Array
-    """(3,) m, m and rad."""
-    covariance: Array
-    """(3, 3) Its covariance, for a sensor without errors."""
-    shifts: Array
-    """(3, 2) Its derivatives by the errors of the sensor."""
+    off: Array  # (3,) m, m and rad
+    covariance: Array  # (3, 3) its covariance, for a sensor without errors
+    shifts: Array  # (3, 2) its derivatives by the errors of the sensor
 
 
 class SensorErrors:
@@ -253,10 +219,8 @@ class SensorErrors:
     """
 
     def __init__(self, settings: MotionSettings) -> None:
-        self.mean: Array = np.zeros(len(ERRORS))
-        """(2,) Yaw (rad, to the left) and latency (s)."""
-        self.covariance: Array = np.diag(np.square(SIGMAS_ERRORS))
-        """(2, 2) Their covariance."""
+        self.mean: Array = np.zeros(len(ERRORS))  # (2,) yaw (rad, to the left) and latency (s)
+        self.covariance: Array = np.diag(np.square(SIGMAS_ERRORS))  # (2, 2) their covariance
         self._drift: Array = np.diag(np.square(SIGMAS_CHANGES)) / MINUTE
         self._velocity: Array = np.zeros(3)
         self._possible: Array = 0.5 * MEMORY * np.array(settings.accelerations)
@@ -275,29 +239,23 @@ class SensorErrors:
         self._velocity = self._velocity + share * (velocity - self._velocity)
 
     def covariance_of(self, difference: Difference) -> Array:
-        """Return the covariance (3, 3) of a difference, with what is not known of the errors."""
         shifts = difference.shifts
         return np.asarray(difference.covariance + shifts @ self.covariance @ shifts.T)
 
     def square_of(self, difference: Difference) -> float:
-        """Return the square of a difference in standard deviations, by `covariance_of`."""
         return _squared(difference.off, difference.covariance, difference.shifts, self.covariance)
 
     def shifts(self, way: Array, velocity: Array) -> Array:
         """Return the derivatives (3, 2) of how far a match is off the odometry, by the errors.
 
-        Way (2,) and velocity (3,) are in the vehicle frame (m, m/s, m/s, rad/s). Changes of the velocity
-        beyond the accelerations of a vehicle are slip, and not latency.
+        Way (2,) and velocity (3,) are in the vehicle frame; changes that no vehicle makes are slip.
         """
         off = np.minimum(np.maximum(self._velocity - velocity, -self._possible), self._possible)
         (ahead, left), (x, y, turn) = way.tolist(), off.tolist()
         return np.array([[left, x], [-ahead, y], [0.0, turn]])
 
     def update(self, difference: Difference, dt: float) -> None:
-        """Learn from a match that agrees with the odometry, dt (s) after the last cycle.
-
-        Matches share the remembered detections, so one counts by the share of its own time.
-        """
+        """Learn from a match that agrees, dt (s) after the last; it counts by its share of memory."""
         measured = difference.off, difference.covariance, difference.shifts, min(dt / MEMORY, 1.0)
         self.mean, self.covariance = _learned(self.mean, self.covariance, dt * self._drift, *measured)
 
@@ -310,10 +268,7 @@ def off_prediction(
     predicted: Array,
     covariance: Array,
 ) -> tuple[Array, Array]:
-    """Return how far a match is off a predicted pose (3,), in its frame, and the covariance of that.
-
-    The variances of the detections are `excess` times what they claim, and the prediction has a covariance.
-    """
+    """Return how far a match, of variance times `excess`, is off a prediction, and its covariance."""
     turn = np.eye(3)
     turn[:2, :2] = rotation(predicted[2]).T
     return turn @ (pose - predicted), turn @ (excess * np.linalg.inv(information)) @ turn.T + covariance
@@ -329,10 +284,7 @@ def _squared(off: Array, covariance: Array, shifts: Array, errors: Array) -> flo
 def _learned(
     mean: Array, errors: Array, drift: Array, off: Array, covariance: Array, shifts: Array, share: float
 ) -> tuple[Array, Array]:
-    """Return mean (2,) and covariance (2, 2) of the errors after a measurement that counts by a share.
-
-    The errors have a covariance (2, 2), which has grown by the drift (2, 2).
-    """
+    """Return mean (2,) and covariance (2, 2) of the errors after a measurement that counts by a share."""
     weighted = share * np.linalg.solve(covariance, shifts).T
     known = np.asarray(np.linalg.inv(np.linalg.inv(errors + drift) + weighted @ shifts))
     return mean + known @ weighted @ off, known

@@ -1,9 +1,8 @@
 """The side of each detection: what is left of the way driven is left, and colours are evidence of it.
 
-A detector may have no colours, and a track may be driven the other way round, with its blue cones on the
-right. The coloured cones beside the path decide together what the colours mean. Where most detections have
-no colour, two rows of cones are followed from beside the vehicle ahead, each cone to the row that it fits
-better. What is in neither of them stays unknown.
+A detector may have no colours, and a track may be driven the other way round. The coloured cones beside the
+path decide together what colours mean. Where most have none, two rows of cones are followed from beside the
+vehicle ahead, each cone to the row that it fits better.
 """
 
 from collections.abc import Mapping
@@ -20,47 +19,27 @@ from pathspace_graph.mapping.path import SIDES, DrivenPath, PathAhead, in_front_
 from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.online import SidesSettings
 
-REACH: Final = 8.0
-"""Length of the predicted path beside which coloured cones say what the colours mean, m."""
+REACH: Final = 8.0  # length of the predicted path beside which coloured cones say what the colours mean, m
 MIN_LATERAL: Final = 0.5
-MAX_LATERAL: Final = 8.0
-"""Distances from the path between which it tells the side of a cone, m."""
-MAJORITY: Final = 2.5
-"""Least ratio of cones on the other colour's side to those on their own where the colours are swapped."""
-ENOUGH_VOTES: Final = 30
-"""Number of cones that settles what the colours mean."""
-REMEMBERED: Final = 0.98
-"""Factor by which the detections so far count less in the share without a colour, from cycle to cycle."""
-MIN_DETECTIONS: Final = 6
-"""Least number of detections of which the share is taken."""
-MERGE_RADIUS: Final = 1.0
-"""Distance within which detections are of one cone, m."""
-FORGET_AFTER: Final = 3.0
-"""Time without a detection after which a cone is forgotten, s."""
-MAX_CONES: Final = 2000
-"""Largest number of cones that are remembered, the ones that were seen last."""
-SIGHTINGS: Final = 2
-"""Detections from which a cone has a side."""
-BEHIND: Final = 8.0
-"""Length behind the vehicle at which the rows begin, m along the path."""
-SURE: Final = 3.0
-"""Length ahead of it up to which the path tells sides, m; beyond, the rows do."""
-BESIDE: Final = 2.0
-"""Distance along the path within which cones stand beside each other, m."""
-LATERAL_GAP: Final = 0.8
-"""Distance from a nearer cone beside it beyond which a cone is of another stretch, m."""
-HALF_WIDTH: Final = 1.5
-"""Distance beside the vehicle at which a row without any cone begins, m."""
-GAP: Final = 8.0
-"""Largest distance of neighbouring cones of a row, m."""
-TURN: Final = 1.3
-"""Largest turn of a row from one cone to the next, rad."""
-TURN_COST: Final = 2.0
-"""The next cone of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)."""
-CLEAR: Final = 1.3
-"""Least cost of the next cone of a row in the other row, by its own cost."""
-MIN_WIDTH: Final = 1.8
-"""Least distance of a cone of one row from each cone of the other row, m."""
+MAX_LATERAL: Final = 8.0  # distances from the path between which it tells the side of a cone, m
+MAJORITY: Final = 2.5  # least ratio of cones on the other colour's side where colours are swapped
+ENOUGH_VOTES: Final = 30  # number of cones that settles what the colours mean
+REMEMBERED: Final = 0.98  # factor from cycle to cycle of the detections so far in the colourless share
+MIN_DETECTIONS: Final = 6  # least number of detections of which the share is taken
+MERGE_RADIUS: Final = 1.0  # distance within which detections are of one cone, m
+FORGET_AFTER: Final = 3.0  # time without a detection after which a cone is forgotten, s
+MAX_CONES: Final = 2000  # largest number of cones that are remembered, the ones that were seen last
+SIGHTINGS: Final = 2  # detections from which a cone has a side
+BEHIND: Final = 8.0  # length behind the vehicle at which the rows begin, m along the path
+SURE: Final = 3.0  # length ahead of it up to which the path tells sides, m; beyond, the rows do
+BESIDE: Final = 2.0  # distance along the path within which cones stand beside each other, m
+LATERAL_GAP: Final = 0.8  # distance from a nearer cone beside it beyond which a cone is of another stretch, m
+HALF_WIDTH: Final = 1.5  # distance beside the vehicle at which a row without any cone begins, m
+GAP: Final = 8.0  # largest distance of neighbouring cones of a row, m
+TURN: Final = 1.3  # largest turn of a row from one cone to the next, rad
+TURN_COST: Final = 2.0  # the next cone of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)
+CLEAR: Final = 1.3  # least cost of the next cone of a row in the other row, by its own cost
+MIN_WIDTH: Final = 1.8  # least distance of a cone of one row from each cone of the other row, m
 
 
 class SideJudge:
@@ -68,10 +47,8 @@ class SideJudge:
 
     def __init__(self, settings: SidesSettings) -> None:
         self.settings = settings
-        self.swapped = False
-        """Whether the colours of the log so far are on the other sides."""
-        self.colourless = False
-        """Whether most detections have no colour, so that the way driven tells their sides."""
+        self.swapped = False  # whether the colours of the log so far are on the other sides
+        self.colourless = False  # whether most detections have no colour
         self._path: DrivenPath | None = None
         self._cones = NearCones()
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
@@ -82,8 +59,8 @@ class SideJudge:
     ) -> Detections:
         """Return the detections of a cycle with the labels of their sides.
 
-        The vehicle came to the pose (3,), in the frame of the front end, with twists (k, 3). In a lane of
-        orange cones it isn't on the road yet, and the colours of others prove nothing.
+        The vehicle came to the pose (3,), front end's frame, with twists (k, 3). In a lane of orange cones
+        it isn't on the road yet, and the colours of others prove nothing.
         """
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
         if not self.colourless and self._agreeing + self._opposing >= ENOUGH_VOTES:
@@ -108,10 +85,7 @@ class SideJudge:
         return detections if (labels == detections.labels).all() else replace(detections, labels=labels)
 
     def _judge_colours(self, path: PathAhead) -> None:
-        """Count cones on the side of their colour and on the other one, and swap the colours by majority.
-
-        Each cone is counted once, when it is a little ahead.
-        """
+        """Count cones once on the side of their colour or the other one, and swap colours by majority."""
         near = self._cones
         fresh = np.flatnonzero(~near.judged & near.votes.any(axis=1))
         if len(fresh) == 0:
@@ -131,7 +105,6 @@ class SideJudge:
             self.swapped = not self.swapped
 
     def _is_colourless(self, labels: IntArray) -> bool:
-        """Return whether most detections have no colour, of which the newest ones count most."""
         unknown = int((labels == UNKNOWN).sum())
         self._unknown = REMEMBERED * self._unknown + unknown
         self._known = REMEMBERED * self._known + len(labels) - unknown
@@ -139,7 +112,6 @@ class SideJudge:
         return total >= MIN_DETECTIONS and self._unknown > self.settings.colourless * total
 
     def _sides(self, pose: Array, path: PathAhead) -> IntArray:
-        """Return the side (n,) of each near cone; it is unknown for those in neither row."""
         near = self._cones
         seen = np.flatnonzero(near.counts >= SIGHTINGS)
         sides = np.full(len(near.points), UNKNOWN)
@@ -158,7 +130,6 @@ class SideJudge:
     def _beginning(
         self, label: int, pose: Array, path: PathAhead, seen: IntArray, stations: Array, lateral: Array
     ) -> "Row":
-        """Return the row of a boundary beside the vehicle, where the path tells the side of each cone."""
         side = SIDES[label] * lateral
         beside = (side > MIN_LATERAL) & (side < MAX_LATERAL)
         beside &= (stations > path.driven - BEHIND) & (stations < path.driven + SURE)
@@ -179,13 +150,10 @@ class Row:
     """A row of cones, the nearest first."""
 
     cones: list[int]
-    end: Array
-    """(2,) Point at which the row ends, m."""
-    heading: float
-    """Direction in which it leads there, rad."""
+    end: Array  # (2,) point at which the row ends, m
+    heading: float  # direction in which it leads there, rad
 
     def lead_to(self, cone: int, point: Array) -> None:
-        """Lead the row on to a cone at a point (2,)."""
         dx, dy = point - self.end
         self.cones.append(cone)
         self.end, self.heading = point, float(np.arctan2(dy, dx))
@@ -194,9 +162,8 @@ class Row:
 def follow_rows(rows: Mapping[int, Row], points: Array, votes: IntArray, free: IntArray) -> None:
     """Lead both rows on through free cones (k,), as long as it is clear which cone comes next.
 
-    All cones (n,) have points (n, 2) in m, and votes (n, 2) for left and right. The next cone has the least
-    `distance (1 + TURN_COST turn^2)` from the end of its row, and is far dearer for the other row. Else both
-    rows end: they could be confused there.
+    All cones have points (n, 2) in m, and votes (n, 2) for left and right. The next one has the least
+    `distance (1 + TURN_COST turn^2)` from the end of its row, and is far dearer for the other row.
     """
     left = free.tolist()
     while left:
@@ -230,14 +197,10 @@ class NearCones:
     """Cones near the vehicle as means of their detections, with the colours in which they were seen."""
 
     def __init__(self) -> None:
-        self.points: Array = np.zeros((0, 2))
-        """(n, 2) Place of each cone in the frame of the front end, m."""
-        self.counts: IntArray = np.zeros(0, np.intp)
-        """(n,) Number of detections."""
-        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)
-        """(n, 2) Number of detections with the label of the left and of the right boundary."""
-        self.judged: BoolArray = np.zeros(0, bool)
-        """(n,) Whether the colour of the cone has been compared with its side."""
+        self.points: Array = np.zeros((0, 2))  # (n, 2) place of each cone in the frame of the front end, m
+        self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
+        self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)  # (n, 2) detections by label
+        self.judged: BoolArray = np.zeros(0, bool)  # (n,) whether its colour was compared with its side
         self._last: Array = np.zeros(0)
 
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:

@@ -13,59 +13,40 @@ from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Odometry
 
-MAD: Final = 1.4826
-"""Standard deviation of a Gaussian by its median absolute deviation."""
+MAD: Final = 1.4826  # standard deviation of a Gaussian by its median absolute deviation
 MOST_TWISTS: Final = 4000
 MOST_PARTS: Final = 200
-MIN_SPEED_SHARE: Final = 0.3
-"""Share of its median speed below which a vehicle says little of noise in motion."""
-MIN_TWISTS: Final = 30
-"""Least number of twists that tell white noise."""
-MAX_RANGE: Final = 30.0
-"""Range beyond which sightings are not followed (m): they are hardly ever seen near later."""
-MAX_AGE: Final = 3.0
-"""Time without a sighting after which a cone counts as another one (s)."""
-GATE: Final = (0.4, 0.06, 1.5)
-"""Gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m."""
-FOLLOWING: Final = (0.5, 0.15)
-"""Share by which a cone goes to where it is seen, and where it was seen from nearer before."""
+MIN_SPEED_SHARE: Final = 0.3  # share of its median speed below which a vehicle says little of noise in motion
+MIN_TWISTS: Final = 30  # least number of twists that tell white noise
+MAX_RANGE: Final = 30.0  # m; beyond, cones are hardly ever seen near later
+MAX_AGE: Final = 3.0  # time without a sighting after which a cone counts as another one (s)
+GATE: Final = (0.4, 0.06, 1.5)  # gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m
+FOLLOWING: Final = (0.5, 0.15)  # of a cone to where it is seen, and was seen from nearer before
 GATE_SIGMAS: Final = 3.5
 GATE_LEAST: Final = 0.4
-GATE_MOST: Final = 3.5
-"""Gate once it is known: sigmas along and across the ray, at least and at most this far, m."""
+GATE_MOST: Final = 3.5  # of the gate once noise is known: sigmas along and across the ray; least, most, m
 
 
 @dataclass(eq=False)
 class Sightings:
     """Columns of sightings of cones, in order of time."""
 
-    cone: IntArray
-    """(n,) Number of the cone."""
-    t: Array
-    """(n,) Stamp (s)."""
-    point: Array
-    """(n, 2) Detection as measured (m), vehicle frame."""
-    twist: Array
-    """(n, 3) Twist of the vehicle then: m/s, m/s, rad/s."""
-    pose: Array
-    """(n, 3) Pose of the vehicle by dead reckoning."""
-    by_bias: Array
-    """(n, 3) Derivative of that pose by the bias of the yaw rate."""
+    cone: IntArray  # (n,) number of the cone
+    t: Array  # (n,) stamp (s)
+    point: Array  # (n, 2) detection as measured (m), vehicle frame
+    twist: Array  # (n, 3) twist of the vehicle then: m/s, m/s, rad/s
+    pose: Array  # (n, 3) pose of the vehicle by dead reckoning
+    by_bias: Array  # (n, 3) derivative of that pose by the bias of the yaw rate
 
     @classmethod
     def none(cls) -> "Sightings":
-        empty = np.zeros(0)
-        return cls(
-            empty.astype(np.intp), empty, empty.reshape(0, 2), *(empty.reshape(0, 3) for _ in range(3))
-        )
+        return cls(np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 2)), *np.zeros((3, 0, 3)))
 
     def where(self, rows: IntArray | BoolArray | slice) -> "Sightings":
-        """Return some of the rows."""
         return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     @classmethod
     def stacked(cls, tables: "list[Sightings]") -> "Sightings":
-        """Return the rows of several tables, one after the other."""
         return cls(*(np.concatenate([getattr(one, column.name) for one in tables]) for column in fields(cls)))
 
 
@@ -73,22 +54,18 @@ class Sightings:
 class SeenCycle:
     """A perception cycle where dead reckoning has placed it."""
 
-    detections: Detections
-    """Detections as measured."""
-    pose: Array
-    """(3,) Pose of the vehicle by dead reckoning."""
-    twist: Array
-    """(3,) Twist of the vehicle: m/s, m/s, rad/s."""
+    detections: Detections  # detections as measured
+    pose: Array  # (3,) pose of the vehicle by dead reckoning
+    twist: Array  # (3,) twist of the vehicle: m/s, m/s, rad/s
 
 
 def follow(cycles: Iterable[SeenCycle], known: MeasuredNoise) -> Sightings:
-    """Return the sightings of cones in the cycles, in order of time.
-
-    Sightings are matched after known constant errors of the sensor are taken out, and by known noise; they
-    are returned as measured.
-    """
+    """Return the sightings of cones in the cycles, in order of time, as measured."""
     follower = Follower(known)
     return Sightings.stacked([Sightings.none(), *(follower.add(cycle) for cycle in cycles)])
+
+
+COLUMNS: Final = ("_points", "_labels", "_nearest", "_last", "_cones")  # of the cones that are followed
 
 
 class Follower:
@@ -107,31 +84,20 @@ class Follower:
         self._t = 0.0
 
     def add(self, cycle: SeenCycle) -> Sightings:
-        """Return the sightings of a cycle."""
         detections, pose = cycle.detections, cycle.pose
         self._follow_bias(detections.t, pose)
         keep = self._last > detections.t - MAX_AGE
-        self._points, self._labels, self._nearest = (
-            self._points[keep],
-            self._labels[keep],
-            self._nearest[keep],
-        )
-        self._last, self._cones = self._last[keep], self._cones[keep]
+        for name in COLUMNS:
+            setattr(self, name, getattr(self, name)[keep])
         ranges = np.hypot(*detections.points_vehicle.T)
         order = np.argsort(ranges, kind="stable")
         order = order[ranges[order] < MAX_RANGE]
         measured = detections.points_vehicle[order]
         points = to_map(self._known.corrected(measured, cycle.twist), pose[None])
         rows, cones = self._assign(points, detections.labels[order], ranges[order], pose, detections.t)
-        count = len(rows)
-        return Sightings(
-            cones,
-            np.full(count, detections.t),
-            measured[rows],
-            np.tile(cycle.twist, (count, 1)),
-            np.tile(pose, (count, 1)),
-            np.tile(self._by_bias, (count, 1)),
-        )
+        stamps = np.full(len(rows), detections.t)
+        shared = (np.tile(one, (len(rows), 1)) for one in (cycle.twist, pose, self._by_bias))
+        return Sightings(cones, stamps, measured[rows], *shared)
 
     def _follow_bias(self, t: float, pose: Array) -> None:
         """Carry the derivative of the pose by the yaw rate's bias on: `d theta = -dt`, and what follows."""
@@ -153,30 +119,20 @@ class Follower:
     def _assign(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float
     ) -> tuple[IntArray, IntArray]:
-        """Return which detections (m,), nearest first, are sightings, and of which cones.
-
-        Several cameras may see a cone at once, and each counts: the best one alone would favour known errors.
-        """
+        """Return which detections (m,), nearest first, are sightings, and of which cones."""
         count = len(self._cones)
+        known = self._points, self._labels, self._nearest
+        along, across = self._gates(ranges)
         place, self._points, self._nearest = _assigned(
-            points,
-            labels,
-            ranges,
-            pose[:2],
-            *self._gates(ranges),
-            self._points,
-            self._labels,
-            self._nearest,
-            FOLLOWING,
+            points, labels, ranges, pose[:2], along, across, *known, FOLLOWING
         )
         new = np.flatnonzero(place >= count)
         own, first = np.unique(place[new], return_index=True)
         first = new[first]
-        self._points = np.concatenate([self._points, points[first]])
-        self._labels = np.concatenate([self._labels, labels[first]])
-        self._nearest = np.concatenate([self._nearest, ranges[first]])
-        self._last = np.concatenate([self._last, np.full(len(first), t)])
-        self._cones = np.concatenate([self._cones, self._count + np.arange(len(own))])
+        numbers = self._count + np.arange(len(own))
+        added = points[first], labels[first], ranges[first], np.full(len(first), t), numbers
+        for name, values in zip(COLUMNS, added, strict=True):
+            setattr(self, name, np.concatenate([getattr(self, name), values]))
         self._count += len(own)
         rows = np.concatenate([np.flatnonzero((place >= 0) & (place < count)), new])
         self._last[place[rows]] = t
@@ -198,10 +154,9 @@ def _assigned(
 ) -> tuple[IntArray, Array, Array]:
     """Return the cone of each detection at points (m, 2), and places and least ranges of the known cones.
 
-    A detection with gates along and across its ray (m,) from a place (2,) is of the nearest of the known
-    cones (n,) of its label in its gate. The others are new cones from n on, each of the first of those
-    beside it, or -1 where that one is not a cone of its own. A cone goes to its detections by the first of
-    the weights, or by the second where it was seen from nearer before.
+    A detection with gates along and across its ray (m,) from a place (2,) is of the nearest known cone (n,)
+    of its label in its gate. The others are new cones from n on, each of the first of those beside it, or -1
+    where that one is not a cone of its own. A cone goes to its detections by the weights (`FOLLOWING`).
     """
     index, least, moved = np.full(len(points), -1), nearest.copy(), known.copy()
     if len(known):
@@ -228,10 +183,7 @@ def _assigned(
 
 
 def _gated_squares(points: Array, others: Array, place: Array, along: Array, across: Array) -> Array:
-    """Return `(a_ij / along_i)^2 + (c_ij / across_i)^2` (m, n) of points (m, 2) and others (n, 2).
-
-    a and c are their differences along and across the rays from a place (2,) to the points.
-    """
+    """Return `(a_ij / along_i)^2 + (c_ij / across_i)^2` (m, n) on the rays from a place (2,)."""
     ray = points - place
     ray = ray / np.maximum(np.hypot(ray[:, 0], ray[:, 1]), np.finfo(float).tiny)[:, None]
     off = others - points[:, None]
@@ -247,7 +199,6 @@ class TwistRecord:
         self._parts: list[Odometry] = []
 
     def add(self, odometry: Odometry) -> None:
-        """Add twists."""
         self._parts.append(odometry)
         if len(self._parts) > MOST_PARTS:
             self._parts = [Odometry(*self._newest)]
@@ -262,18 +213,14 @@ class TwistRecord:
         return t[new][-MOST_TWISTS:], twists[new][-MOST_TWISTS:]
 
     def white(self) -> tuple[Array, float] | None:
-        """Return the white noise (3,) of a twist, and the time between two twists (s).
-
-        The least of `orders`: the higher the order, the less of the motion itself is in it.
-        """
+        """Return the white noise (3,) of a twist, the least of `orders`, and the time between two (s)."""
         orders = self.orders()
         return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(self._newest[0]))))
 
     def orders(self) -> Array | None:
-        """Return the noise (k, 3) of a twist by differences of second to fourth order; None without enough.
+        """Return the noise (k, 3) of a twist by differences of second to fourth order, if there are enough.
 
-        The median absolute difference over `sqrt(binomial(2 k, k))`, that of white noise. Where the orders
-        differ, the noise is not white, or the motion itself is in it.
+        The median absolute difference over `sqrt(binomial(2 k, k))`; it is not white where orders differ.
         """
         _, twists = self._newest
         if len(twists) < MIN_TWISTS:

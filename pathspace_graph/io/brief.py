@@ -3,23 +3,18 @@
 Those rooms stand above the records and import matplotlib and pandas, so they are imported when asked for.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from typing import Any, Final
 
-LONGEST: Final = 3
-"""Most values of an array that its text lists."""
+LONGEST: Final = 3  # most values of an array that its text lists
 
 
 def pictures() -> Any:
-    """Return the module of pictures of records."""
     return import_module("pathspace_graph.eval.figures.map_plot")
 
 
 def frames() -> Any:
-    """Return the module of frames of records."""
     return import_module("pathspace_graph.frames")
 
 

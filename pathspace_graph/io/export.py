@@ -23,21 +23,14 @@ from pathspace_graph.spline.planning import speed_profile
 from .files import to_plain
 from .map import Map, MapBoundary, PointBoundary, SplineBoundary
 
-CENTRE_LINE_HEADER: Final = "# x_m,y_m,w_tr_right_m,w_tr_left_m"
-"""Header of TUM's raceline format; its reader takes the line for a comment."""
-PROFILE_HEADER: Final = "# s_m,x_m,y_m,psi_rad,kappa_radpm,vx_mps,ax_mps2"
-"""Columns of TUM's trajectories."""
-POINTS_HEADER: Final = "x,y,label"
-"""Header of a table of points, as that of a log's true cones."""
-_FEWEST_INTERVALS: Final = 4
-"""Least number of intervals of a sampled boundary."""
+CENTRE_LINE_HEADER: Final = "# x_m,y_m,w_tr_right_m,w_tr_left_m"  # of TUM's raceline format
+PROFILE_HEADER: Final = "# s_m,x_m,y_m,psi_rad,kappa_radpm,vx_mps,ax_mps2"  # of TUM's trajectories
+POINTS_HEADER: Final = "x,y,label"  # header of a table of points, as that of a log's true cones
+_FEWEST_INTERVALS: Final = 4  # least number of intervals of a sampled boundary
 
 
 def write_centre_line(file: Path, track: Map, step: float) -> None:
-    """Write the centre line in TUM's raceline format, in m, `step` (m) apart, to full precision.
-
-    The first point of a closed line isn't repeated.
-    """
+    """Write the centre line in TUM's raceline format, `step` (m) apart; a loop ends before its start."""
     line = track.centre_line(step)
     _write_rows(file, CENTRE_LINE_HEADER, line.points, line.width_right, line.width_left)
 
@@ -67,10 +60,7 @@ def write_profile(
 
 
 def write_points(file: Path, track: Map, step: float) -> None:
-    """Write the boundaries as points in m, `step` (m) apart along each, and orange cones, to full precision.
-
-    The landmarks of a boundary that is no curve are written as they are.
-    """
+    """Write boundaries as points (m), `step` (m) apart, or as their landmarks, and orange cones."""
     points = [
         f"{x!r},{y!r},{NAMES[label]}"
         for label, boundary in sorted([*track.boundaries.items(), *track.points.items()])
@@ -80,15 +70,12 @@ def write_points(file: Path, track: Map, step: float) -> None:
 
 
 def boundary_points(boundary: MapBoundary, step: float) -> Array:
-    """Return points (n, 2) of a boundary about `step` (m) apart along it, or its landmarks.
-
-    The points of an open curve begin and end at its ends; the first of a closed one isn't repeated.
-    """
+    """Return points (n, 2) of a boundary about `step` (m) apart along it, or its landmarks."""
     return boundary.points if isinstance(boundary, PointBoundary) else sampled(boundary.spline, step)
 
 
 def sampled(spline: BSpline, step: float) -> Array:
-    """Return points (n, 2) of a curve evenly spaced by arc length, about `step` (m) apart."""
+    """Return points (n, 2) of a curve about `step` (m) apart; the first of a closed one isn't repeated."""
     length = spline.length()
     at = np.linspace(0.0, length, max(round(length / step), _FEWEST_INTERVALS) + 1)
     return spline.evaluate(spline.parameters_at(at[:-1] if spline.periodic else at))
@@ -105,16 +92,11 @@ def _write_lines(file: Path, lines: Iterable[str]) -> None:
 
 # --- latitude and longitude ------------------------------------------------------------------------------
 
-SEMI_MAJOR_AXIS: Final = 6_378_137.0
-"""Radius of the equator of WGS84 (m)."""
-FLATTENING: Final = 1.0 / 298.257223563
-"""Flattening of the ellipsoid of WGS84."""
-_SQUARE: Final = FLATTENING * (2.0 - FLATTENING)
-"""Square e^2 of its eccentricity."""
-_ITERATIONS: Final = 8
-"""Iterations of the latitude, each of which leaves less than a hundredth of the error."""
-_DECIMALS_DEGREES: Final = 10
-"""Number of decimals of degrees, which is 0.01 mm."""
+SEMI_MAJOR_AXIS: Final = 6_378_137.0  # radius of the equator of WGS84 (m)
+FLATTENING: Final = 1.0 / 298.257223563  # flattening of the ellipsoid of WGS84
+_SQUARE: Final = FLATTENING * (2.0 - FLATTENING)  # square e^2 of its eccentricity
+_ITERATIONS: Final = 8  # iterations of the latitude, each of which leaves less than a hundredth of the error
+_DECIMALS_DEGREES: Final = 10  # number of decimals of degrees, which is 0.01 mm
 
 
 @dataclass(frozen=True)
@@ -177,8 +159,7 @@ def _normal_radius(sine: Any) -> Any:
 
 # --- GeoJSON ---------------------------------------------------------------------------------------------
 
-CENTRE: Final = "centre"
-"""Name of the centre line."""
+CENTRE: Final = "centre"  # name of the centre line
 _PROPERTIES: Final = (
     ("arc_length_m", "arc_length"),
     ("curvature_per_m", "curvature"),
@@ -194,10 +175,9 @@ the point that a closed line repeats."""
 
 
 def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> None:
-    """Write a FeatureCollection with each boundary and, where both are curves, the centre line.
+    """Write each boundary and, where both are curves, the centre line as a FeatureCollection.
 
-    A curve is a LineString of points `step` (m) apart, which ends where it begins if it is closed. Landmarks
-    are a MultiPoint, and so are orange cones of each label.
+    A curve is a LineString of points `step` (m) apart; landmarks and orange cones are MultiPoints.
     """
 
     def feature(kind: str, points: Array, closed: bool, properties: dict[str, Any]) -> dict[str, Any]:
@@ -224,8 +204,7 @@ def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> Non
 
 # --- Lanelet2 --------------------------------------------------------------------------------------------
 
-WAY_TAGS: Final = {"type": "line_thin", "subtype": "solid"}
-"""Tags of a way: a boundary of cones has no kind of its own, and is a line that must not be crossed."""
+WAY_TAGS: Final = {"type": "line_thin", "subtype": "solid"}  # lines that must not be crossed
 LANELET_TAGS: Final = {
     "type": "lanelet",
     "subtype": "road",
@@ -234,13 +213,10 @@ LANELET_TAGS: Final = {
     "participant:vehicle": "yes",
 }
 """Tags of a lanelet: a road for vehicles, in the direction of travel."""
-CONE: Final = "cone"
-"""Type of the node of an orange cone, whose subtype is its label."""
-_PIECES: Final = 4
-"""Number of lanelets of a loop; Lanelet2 knows neither length nor successor of a single one."""
+CONE: Final = "cone"  # type of the node of an orange cone, whose subtype is its label
+_PIECES: Final = 4  # lanelets of a loop; Lanelet2 knows neither length nor successor of a single one
 _FEWEST_WAY_INTERVALS: Final = 2
-_DECIMALS: Final = 5
-"""Number of decimals of local coordinates (m)."""
+_DECIMALS: Final = 5  # number of decimals of local coordinates (m)
 
 
 def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> None:
@@ -278,9 +254,7 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
         add_tags(way, WAY_TAGS)
         return way.attrib["id"]
 
-    left, right = (track.curve(label, "lanelet2").spline for label in BOUNDARIES)
-    if left.periodic != right.periodic:
-        raise SettingsError("lanelet2: expected both boundaries closed or both open, found one of each")
+    left, right = (boundary.spline for boundary in track.curves("lanelet2"))
     closed = left.periodic
     line = find_line(left, right, closed)
     cuts = np.linspace(*line.ribbon.domain, _PIECES + 1)[: _PIECES if closed else 0]

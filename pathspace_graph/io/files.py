@@ -1,8 +1,7 @@
 """Output that appears as a whole or not at all, and never costs an earlier result.
 
-Each step that changes what a path names is one system call. Python announces most of them to audit hooks
-(`sys.addaudithook`); those that it doesn't know announce themselves in the same way, so that a test can end
-the process before any of them.
+Each step that changes what a path names is one system call that audit hooks see (`sys.addaudithook`), so that
+a test can end the process before any of them.
 """
 
 import ctypes
@@ -33,12 +32,9 @@ try:
 except ImportError:  # Windows has no such locks
     fcntl = None  # type: ignore[assignment]
 
-STDOUT: Final = Path("-")
-"""Path at which a single file is written to standard output."""
-SYNC: Final = "pathspace_graph.sync"
-"""Audit event before a file or a folder is flushed to the disk, with its path."""
-RENAME: Final = "pathspace_graph.rename"
-"""Audit event before a rename with flags, with both paths."""
+STDOUT: Final = Path("-")  # path at which a single file is written to standard output
+SYNC: Final = "pathspace_graph.sync"  # audit event before a file or a folder is flushed, with its path
+RENAME: Final = "pathspace_graph.rename"  # audit event before a rename with flags, with both paths
 
 _AT_FDCWD: Final = -100  # a relative path is relative to the working folder
 _NOREPLACE: Final = 1
@@ -106,11 +102,7 @@ def write_text(file: Path, text: str) -> None:
 
 
 def to_plain(value: Any) -> Any:
-    """Return the value in the types of strict JSON.
-
-    Arrays and tuples become lists, numpy's scalars numbers, and paths texts. NaN becomes null, and infinity
-    the text "inf".
-    """
+    """Return the value in the types of strict JSON; NaN becomes null, and infinity the text "inf"."""
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -128,12 +120,10 @@ def write_json(file: Path, content: Any, indent: int | None = 2) -> None:
 
 
 def write_manifest(folder: Path) -> None:
-    """Write the manifest of what a folder holds now."""
     write_text(folder / MANIFEST_FILE, manifest_of(folder))
 
 
 def remove_manifest(folder: Path) -> None:
-    """Remove the manifest of a folder that is about to change, where there is one."""
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
 
 
@@ -182,10 +172,7 @@ def _check_parents(target: Path) -> None:
 
 @contextmanager
 def _placed(final: Path, make: Callable[[Path], None], check: Callable[[], None]) -> Iterator[Path]:
-    """Yield a temporary path that is flushed to the disk and put in place on success.
-
-    Folders above it are made; on failure those of them are removed that are still empty.
-    """
+    """Yield a temporary path that is put in place on success; on failure new folders above are removed."""
     check()
     missing = [parent for parent in final.parents if not parent.exists()]
     with _naming(final):
@@ -206,7 +193,6 @@ def _placed(final: Path, make: Callable[[Path], None], check: Callable[[], None]
 
 
 def _put_in_place(temporary: Path, final: Path) -> None:
-    """Move what was written to its place, and what was there to a numbered backup."""
     if temporary.is_dir():
         with suppress(OSError):
             temporary.rename(final)  # also over an empty folder, but over nothing else
@@ -243,16 +229,14 @@ def _naming(final: Path) -> Iterator[None]:
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether a file has the name of a temporary one."""
     return re.fullmatch(rf"\..*\.{_TOKEN}\.tmp(\.[^.]*)?", name) is not None
 
 
 @contextmanager
 def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
-    """Yield a new path beside `final`, made by `make`, and remove it if it is still there at the end.
+    """Yield a new path beside `final`, made by `make` and locked, which is gone at the end.
 
-    It is locked meanwhile, so that another run knows that it is in use. What runs that died have left of the
-    same target is removed before.
+    What runs that died have left of the same target is removed before.
     """
     remove_leftovers(final)
     descriptor = None
@@ -292,8 +276,7 @@ def _remove(path: Path) -> None:
 def lock(path: Path, *, wait: bool) -> int | None:
     """Return a descriptor that locks a file or a folder until it is closed, or the process dies.
 
-    None where the path is gone, where the file system has no locks, and, unless it is to `wait`, where
-    another process holds the lock.
+    None where there is no such path or lock, or, unless it is to `wait`, another process holds it.
     """
     if fcntl is None:
         return None
@@ -353,11 +336,7 @@ def rename_new(source: Path, target: Path) -> bool:
 
 
 def exchange(first: Path, second: Path, spare: Path) -> None:
-    """Exchange what two paths name in one step.
-
-    Where the system has no such step there are three by way of `spare`, and `first` names the old content of
-    `second` between the last two.
-    """
+    """Exchange what two paths name: in one step, or else in three by way of `spare`."""
     if _rename(first, second, _EXCHANGE):
         return
     first.rename(spare)

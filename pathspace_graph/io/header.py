@@ -18,8 +18,7 @@ from .parsing import MAX_HEADER_BYTES, MAX_NOISE, parse_toml, read_text, shown
 FORMAT: Final = "pathspace-log/1"
 POSITIVE: Final = math.ulp(0.0)
 STATED: Final = "stated"
-UNSTATED: Final = ("measured", "assumed")
-"""Noise that nobody has stated was measured, or it is assumed where the drive shows too little."""
+UNSTATED: Final = ("measured", "assumed")  # measured, or assumed where the drive shows too little
 MEASURED: Final = "noise.measured"
 _ODOMETRY: Final = {"odometry": (3, 0.0), "drift": (3, 0.0), "interval": (1, POSITIVE), "seconds": (1, 0.0)}
 _RAYS: Final = {"along": (4, 0.0), "across": (4, 0.0)}
@@ -105,7 +104,6 @@ def _is_number(value: object, least: float) -> bool:
 
 
 def to_toml(sections: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the text of a header with these sections."""
     lines = [f'format = "{FORMAT}"']
     for name, entries in sections.items():
         lines += ["", f"[{name}]"]
@@ -122,7 +120,6 @@ def toml_text(value: Any) -> str:
 
 
 def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | None) -> dict[str, Any]:
-    """Return the sections about the noise; none where all of it is stated and nothing was measured."""
     if odometry and detections and measured is None:
         return {}
     rays = measured is not None and measured.along is not None

@@ -52,21 +52,17 @@ COLUMNS: Final[dict[str, dict[str, Column]]] = {
 """Columns of each table, in the order in which they are written; those of the truth are optional files."""
 FILES: Final = (LOG_FILE, *COLUMNS)
 
-CALIBRATION: Final = ("scale", "bias")
-"""Names of the true calibration of the odometry in the log's header."""
+CALIBRATION: Final = ("scale", "bias")  # names of the true calibration of the odometry in the log's header
 
-SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
-"""Names of the true constant errors of the sensor in the log's header."""
+SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")  # true errors of the sensor
 NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
 """Names of the true noise in the log's header, where it is not white as the log states it."""
 _TRUE_ERRORS: Final = {"calibration": CALIBRATION, "sensor": SENSOR, "noise": NOISE}
 """Fields of the truth that are in the log's header, by the names of their entries."""
 _SENSOR_INFO: Final = ("range_max", "fov", "rate")
 
-MAX_HOLD: Final = 1.0
-"""Longest time for which the last twist is held (s); a perception cycle later than that has no odometry."""
-MIN_RELATIVE_DETERMINANT: Final = 1e-12
-"""Least det of a covariance over xx * yy; below, it is singular to double precision."""
+MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
+MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to double precision below
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,7 +108,6 @@ class Detections(Brief):
     """Their labels (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE."""
 
     def where(self, chosen: BoolArray) -> Detections:
-        """Return the chosen detections of the cycle."""
         if chosen.all():
             return self
         return Detections(self.t, self.points_vehicle[chosen], self.covariances[chosen], self.labels[chosen])
@@ -202,15 +197,11 @@ class Log:
 
     @property
     def noise(self) -> KnownNoise:
-        """Return what is known of the noise before the drive."""
         return KnownNoise(self.odometry_sigma, self.odometry_stated, self.detections_stated, self.measured)
 
 
 def read_log(folder: Path | str) -> Log:
-    """Read and check a log folder (FORMATS: A log).
-
-    Anything wrong is an InputError that names the file, the row and what was expected.
-    """
+    """Read and check a log folder; an InputError names the file, the row and what was expected."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
@@ -246,11 +237,10 @@ def _table(folder: Path, name: str) -> Table:
 
 
 def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
-    """Write a log folder that `read_log` gives back exactly.
+    """Write a log folder that `read_log` gives back exactly, but for cycles without detections.
 
-    A cycle without detections has no row in the file, so it is left out. The folder appears as a whole or not
-    at all; an earlier log there is kept as a numbered backup. With `check`, a log that cannot be read is an
-    InputError, and is not written.
+    It appears as a whole or not at all; an earlier log is kept as a numbered backup. With `check`, a log that
+    cannot be read is an InputError, and is not written.
     """
     with atomic_folder(folder, LOG_FILE) as target:
         (target / LOG_FILE).write_text(to_toml(_sections(log)), encoding="utf-8", newline="\n")
@@ -308,7 +298,6 @@ def cycles_of(
 
 
 def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
-    """Return covariances (m, 2, 2) from their entries (m,)."""
     return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
 
 
@@ -367,7 +356,6 @@ def _sections(log: Log) -> dict[str, dict[str, Any]]:
 
 
 def _columns(log: Log) -> dict[str, tuple[Any, ...]]:
-    """Return the columns of each table, see `COLUMNS`."""
     cycles, truth = log.cycles, log.truth
     covariances = np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in cycles)])
     columns: dict[str, tuple[Any, ...]] = {

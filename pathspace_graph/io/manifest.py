@@ -15,14 +15,13 @@ FORMAT: Final = "pathspace-manifest/1"
 MANIFEST_FILE: Final = "manifest.json"
 _MARK: Final = "pathspace"
 """Word that a manifest holds more than once, so that a damaged one is not taken for another program's."""
-_DIGEST: Final = "pathspace_digest"
-"""Key of the manifest's own SHA-256, taken without this key."""
+_DIGEST: Final = "pathspace_digest"  # key of the manifest's own SHA-256, taken without this key
 
 
 def manifest_of(folder: Path) -> str:
-    """Return the text of the manifest of all files in a folder and in its subfolders.
+    """Return the text of the manifest of all files of a folder but hidden ones.
 
-    Of a subfolder with a manifest of its own, only that is listed. Hidden files are left out.
+    Of a subfolder with a manifest of its own, only that is listed.
     """
     return _text(
         {
@@ -72,10 +71,7 @@ _ACCEPT: Final = f" (removing {MANIFEST_FILE} accepts the files as they are)"
 
 
 def verify(folder: Path, names: Iterable[str]) -> None:
-    """Raise an InputError for the first of these files that is not as the folder's manifest says.
-
-    A file that is missing or not listed, and a folder without a manifest, are accepted.
-    """
+    """Raise an InputError for the first of these files that differs from what the manifest lists."""
     listed = read_manifest(folder) or {}
     for name in names:
         if name in listed and (folder / name).is_file():
@@ -83,10 +79,7 @@ def verify(folder: Path, names: Iterable[str]) -> None:
 
 
 def verify_all(folder: Path) -> int:
-    """Verify every listed file, also by the manifests of subfolders, and return their number.
-
-    An InputError names the first file that is missing or differs, or the folder where it has no manifest.
-    """
+    """Verify every listed file, also by the manifests of subfolders, and return their number."""
     listed = read_manifest(folder)
     if listed is None:
         raise InputError(folder, f"expected a folder with a manifest ({MANIFEST_FILE}), found none")
@@ -120,10 +113,7 @@ def _digest(file: Path) -> str:
 
 @contextmanager
 def verified(folder: Path, *names: str) -> Iterator[None]:
-    """Verify these files after they were read without an error.
-
-    An error of the content of a file that has changed comes first, since it names the row.
-    """
+    """Verify these files after they were read; an error of their content comes first, as it names the row."""
     try:
         yield
     except InputError as error:

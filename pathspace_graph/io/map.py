@@ -27,13 +27,10 @@ if TYPE_CHECKING:
 FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
 
-NO_COVARIANCE: Final[Array] = np.zeros((0, 0))
-"""Covariance of a boundary for which none was asked; it can't be written."""
+NO_COVARIANCE: Final[Array] = np.zeros((0, 0))  # none was asked for; it can't be written
 
-_SYMMETRY_TOLERANCE = 1e-9
-"""Largest |P - P^T| over max|P| of a covariance that is symmetric to rounding."""
-_NEGATIVE_TOLERANCE = 1e-9
-"""Most negative eigenvalue over the largest one of a covariance that is positive semidefinite to rounding."""
+_SYMMETRY_TOLERANCE = 1e-9  # largest |P - P^T| over max|P| of a covariance that is symmetric to rounding
+_NEGATIVE_TOLERANCE = 1e-9  # most negative eigenvalue over the largest one of P >= 0, to rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -68,7 +65,6 @@ class PointBoundary(Brief):
 
     @property
     def size(self) -> int:
-        """Return the number m of points."""
         return len(self.points)
 
 
@@ -143,7 +139,6 @@ class Map:
 
     @property
     def size(self) -> int:
-        """Return the number of control points or landmarks on both boundaries together."""
         return sum(boundary.size for boundary in self.boundaries.values())
 
     def centre_line(self, step: float = 1.0) -> CentreLine:
@@ -153,13 +148,16 @@ class Map:
         independent. A tentative stretch takes part as well. Both boundaries must be splines; otherwise, or
         where they aren't side by side, SettingsError is raised.
         """
-        left, right = (self.curve(label, "a centre line") for label in BOUNDARIES)
-        closed = left.spline.periodic
-        if closed != right.spline.periodic:
-            raise SettingsError(
-                "a centre line: expected both boundaries closed or both open, found one of each"
-            )
-        return centre_line(left.spline, right.spline, self.covariance_of(left, right), closed, step)
+        left, right = self.curves("a centre line")
+        covariance = self.covariance_of(left, right)
+        return centre_line(left.spline, right.spline, covariance, left.spline.periodic, step)
+
+    def curves(self, purpose: str) -> tuple[SplineBoundary, SplineBoundary]:
+        """Return both boundaries, which must be curves, and both closed or both open."""
+        left, right = (self.curve(label, purpose) for label in BOUNDARIES)
+        if left.spline.periodic != right.spline.periodic:
+            raise SettingsError(f"{purpose}: expected both boundaries closed or both open, found one of each")
+        return left, right
 
     def curve(self, label: int, purpose: str) -> SplineBoundary:
         """Return a boundary that is a curve; a SettingsError says for which purpose one was expected."""
@@ -179,18 +177,12 @@ class Map:
 
 
 def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:
-    """Return a joint covariance (2m, 2m) with each boundary's own covariance as its diagonal block.
-
-    A boundary's covariance may hold what the others don't share, such as the scatter of its cones.
-    """
+    """Return a joint covariance (2m, 2m) with each boundary's own one, which may hold more, inside."""
     joint, at = joint.copy(), 0
     for _, boundary in sorted(boundaries.items()):
         own = slice(at, at := at + len(boundary.covariance))
         joint[own, own] = boundary.covariance
     return joint
-
-
-# --- JSON ------------------------------------------------------------------------------------------------
 
 
 def map_to_json(track: Map) -> dict[str, Any]:
@@ -354,9 +346,6 @@ def _is_covariance(P: Array) -> bool:
         return False
     eigenvalues = np.linalg.eigvalsh(P)
     return bool(eigenvalues[0] >= -_NEGATIVE_TOLERANCE * max(eigenvalues[-1], 0.0))
-
-
-# --- folders ---------------------------------------------------------------------------------------------
 
 
 def read_map(folder: Path | str) -> Map:

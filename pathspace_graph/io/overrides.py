@@ -11,8 +11,7 @@ from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_json, parse_toml,
 from pathspace_graph.settings.checked import successor
 
 T = TypeVar("T")
-Overrides = Mapping[str, Any]
-"""New values by dotted field."""
+Overrides = Mapping[str, Any]  # new values by dotted field
 
 
 def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:
@@ -53,10 +52,7 @@ def check_gone(name: str, said: str) -> None:
 
 
 def read_settings(file: Path, settings: T) -> T:
-    """Return the settings with those of a file: TOML in the same nesting, or a run's `summary.json`.
-
-    An InputError names the file and the setting that is wrong, unknown or gone.
-    """
+    """Return the settings with those of a file, TOML or a run's `summary.json`, or raise an InputError."""
     text = read_text(file, "a file of settings", MAX_HEADER_BYTES)
     content = parse_json(text, file) if file.suffix == ".json" else parse_toml(text, file)
     table = content.get("settings", content) if isinstance(content, dict) else content

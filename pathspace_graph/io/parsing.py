@@ -179,7 +179,6 @@ def parse_yaml(text: str, file: Path) -> Any:
 
 
 def _row(mark: Any) -> int | None:
-    """Return the row (from 1) of a mark, which the parser may not give."""
     return None if mark is None else int(mark.line) + 1
 
 
@@ -187,8 +186,6 @@ def _row(mark: Any) -> int | None:
 
 
 class Column(NamedTuple):
-    """What the numbers of a column must be."""
-
     largest: float = MAX_COORDINATE
     unit: str = ""
 
@@ -198,10 +195,8 @@ class Table:
     """Rows below a CSV header, as text, column by column."""
 
     file: Path
-    columns: dict[str, list[str]]
-    """Texts of each column, as they stand in the file."""
-    lines: list[int]
-    """Line of each row in the file; the header is line 1."""
+    columns: dict[str, list[str]]  # texts of each column, as they stand in the file
+    lines: list[int]  # line of each row in the file; the header is line 1
     declared: Mapping[str, Column] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -217,10 +212,7 @@ class Table:
             self.fail(int(np.argmin(good)), message)
 
     def numbers(self, name: str, largest: float | None = None) -> Array:
-        """Return the column as numbers (rows,), at most as large as declared, or as `largest`.
-
-        A word, NaN, infinity or a larger number is an InputError.
-        """
+        """Return the column as finite numbers (rows,), at most as large as declared, or as `largest`."""
         column, texts = self.declared.get(name, Column()), self.columns[name]
         most, unit = largest or column.largest, f" {column.unit}".rstrip()
         try:
@@ -251,8 +243,7 @@ def read_table(
     """Read a CSV file with a header that holds at least the required columns, in any order.
 
     Quotes, blanks around fields, empty lines, Windows line ends and a byte-order mark are tolerated;
-    `comment` is stripped from the front of the header. A file that is missing, empty or larger than `most`
-    (bytes), a missing column, or a row with too few or too many fields is an InputError.
+    `comment` is stripped from the front of the header. Anything else is an InputError.
     """
     rows: list[list[str]] = []
     lines: list[int] = []
@@ -286,10 +277,7 @@ def read_table(
 
 
 def write_table(file: Path, names: Iterable[str], *values: ArrayLike) -> None:
-    """Write a CSV file of columns (rows,), each of numbers or of texts, or of several side by side (rows, k).
-
-    Every number has the shortest text that reads back as the same one.
-    """
+    """Write a CSV file of columns (rows,) or (rows, k); numbers read back as the same ones."""
     columns = [column for value in values for column in np.atleast_2d(np.asarray(value).T).tolist()]
     with file.open("w", encoding="utf-8", newline="") as out:
         writer = csv.writer(out, lineterminator="\n")

@@ -47,10 +47,7 @@ def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
 
 
 def read_trajectory(file: Path) -> tuple[Array, Array]:
-    """Return stamps (n,) in s and poses [x, y, theta] (n, 3), map frame, theta in [-2 pi, 2 pi].
-
-    Empty lines and lines that begin with # are left out. An InputError names the row that is wrong.
-    """
+    """Return stamps (n,) in s and poses [x, y, theta] (n, 3), map frame; an InputError names a wrong row."""
     with verified(file.parent, file.name):
         lines = enumerate(read_text(file, "a trajectory").split("\n"), start=1)
         rows = [_values(file, line, n) for n, line in lines if line.strip() and not line.startswith("#")]
@@ -72,11 +69,7 @@ def _values(file: Path, line: str, number: int) -> list[float]:
     return values
 
 
-# --- cycles and the whole run ----------------------------------------------------------------------------
-
-
-NoiseSource = Literal["stated", "measured", "assumed"]
-"""Where noise comes from: the log's statement, the drive, or a default."""
+NoiseSource = Literal["stated", "measured", "assumed"]  # by the log, by the drive, by default
 
 CYCLES_FILE: Final = "cycles.csv"
 CYCLE_COLUMNS: Final = {
@@ -147,24 +140,17 @@ class VehicleState(Brief):
     """Its covariance (5, 5), or (0, 0)."""
 
     @property
-    def sensor_sigmas(self) -> Array:
-        """Return the standard deviations (5,) of the sensor's calibration, or (0,)."""
-        return np.sqrt(np.diag(self.sensor_covariance))
-
-    @property
     def by_name(self) -> dict[str, tuple[float, float]]:
         """Return each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
         values = [*self.calibration.tolist(), *self.sensor.tolist()]
-        sigmas = [*self.sigmas[len(self.pose) :].tolist(), *self.sensor_sigmas.tolist()]
+        of_sensor = np.sqrt(np.diag(self.sensor_covariance))
+        sigmas = [*self.sigmas[len(self.pose) :].tolist(), *of_sensor.tolist()]
         known = zip([*CALIBRATION, *SENSOR], values, sigmas, strict=False)
         return {name: (value, sigma) for name, value, sigma in known}
 
     @classmethod
     def split(cls, pose: Array, calibrations: Array, joint: Array) -> VehicleState:
-        """Return the state of a joint covariance of [pose | calibration of odometry | of sensor].
-
-        The calibrations (2,) or (7,) are copied.
-        """
+        """Return the state of a joint covariance of [pose | calibration of odometry | of sensor]."""
         known = len(pose) + CALIBRATION_SIZE
         odometry, sensor = np.split(calibrations.copy(), [CALIBRATION_SIZE])
         return cls(pose.copy(), odometry, joint[:known, :known], sensor, joint[known:, known:])
@@ -275,9 +261,8 @@ class BatchRun(RunResult):
 
 
 def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:
-    """Write map.json, trajectory.tum, cycles.csv and summary.json: all of them, or on failure nothing.
+    """Write map.json, the trajectories, cycles.csv and summary.json: all of them, or on failure nothing.
 
-    A smoothed trajectory is in smoothed.tum.
     An earlier result in `folder` is kept as a numbered backup; anything else there is an OutputError.
     """
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:

@@ -9,20 +9,16 @@ from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.results import RunNoise, VehicleState
 
-LIMIT: Final = 3.0
-"""Prior standard deviations from zero beyond which a calibration is worth a line."""
+LIMIT: Final = 3.0  # prior standard deviations from zero beyond which a calibration is worth a line
 
 
 class Cause(NamedTuple):
     """What a calibration means, and the group of the settings with its prior as `sigma_` and its name."""
 
     group: str
-    text: str
-    """Cause, with a place for the size."""
-    unit: float
-    """Size of a calibration of 1."""
-    signs: tuple[str, str]
-    """Words for a positive and for a negative calibration."""
+    text: str  # cause, with a place for the size
+    unit: float  # size of a calibration of 1
+    signs: tuple[str, str]  # words for a positive and for a negative calibration
 
 
 CAUSES: Final = {
@@ -60,23 +56,30 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-# --- measured noise --------------------------------------------------------------------------------------
-
-REFERENCE: Final = 10.0
-"""Range at which the noise of detections is told (m)."""
-CLEAR: Final = 4.0
-"""Standard deviations beyond which a measured error of the sensor is told."""
+REFERENCE: Final = 10.0  # range at which the noise of detections is told (m)
+CLEAR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is told
 WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
 """Size beyond which it is told (rad, m, s, -, m)."""
-STAYING: Final = 0.1
-"""Share of the variance from which errors that stay with a cone are told."""
+TOLD: Final = {
+    "latency": ("stamps {:.0f} ms {}", 1e3, ("late", "early")),
+    "yaw": ("turned {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
+    "lateral": ("{:.2f} m too far to the {}", 1.0, ("left", "right")),
+}
+STAYING: Final = 0.1  # share of the variance from which errors that stay with a cone are told
 
 
 def noise_lines(noise: RunNoise | None) -> list[str]:
     """Return a line on what was measured, and another one where ranges and speeds disagree."""
     if noise is None or noise.measured is None or "measured" not in (noise.odometry, noise.detections):
         return []
-    return [measured_line(noise.measured), *size_lines(noise)]
+    lines = [measured_line(noise.measured)]
+    if noise.size is not None:
+        share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
+        of_odometry = "the odometry's", "ranges"
+        whose, other = of_odometry if noise.size == "odometry" else ("the ranges'", "odometry")
+        advice = f"--calibration.trust {other} turns it round"
+        lines.append(f"ranges and speeds disagree by {share:.0f} %: the map's size is {whose} ({advice})")
+    return lines
 
 
 def measured_line(measured: MeasuredNoise) -> str:
@@ -98,30 +101,15 @@ def measured_line(measured: MeasuredNoise) -> str:
     return f"{line}; {', '.join(errors)}" if errors else line
 
 
-def size_lines(noise: RunNoise) -> list[str]:
-    """Return a line where ranges and speeds disagree: by how much, and which of them the map believes."""
-    if noise.size is None or noise.measured is None:
-        return []
-    share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
-    other = "ranges" if noise.size == "odometry" else "odometry"
-    whose = "the odometry's" if noise.size == "odometry" else "the ranges'"
-    advice = f"--calibration.trust {other} turns it round"
-    return [f"ranges and speeds disagree by {share:.0f} %: the map's size is {whose} ({advice})"]
-
-
 def _errors(measured: MeasuredNoise) -> list[str]:
-    """Return the constant errors of the sensor that are clear and worth a word."""
     errors = zip(SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True)
     clear = {name: value for name, value, sigma in errors if abs(value) > max(CLEAR * sigma, WORTH[name])}
-    side = {name: "left" if value > 0.0 else "right" for name, value in clear.items()}
-    texts, ranges = [], []
-    if "latency" in clear:
-        late = "late" if clear["latency"] > 0.0 else "early"
-        texts.append(f"stamps {1e3 * abs(clear['latency']):.0f} ms {late}")
-    if "yaw" in clear:
-        texts.append(f"turned {np.rad2deg(abs(clear['yaw'])):.1f} degrees to the {side['yaw']}")
-    if "lateral" in clear:
-        texts.append(f"{abs(clear['lateral']):.2f} m too far to the {side['lateral']}")
+    texts = [
+        text.format(unit * abs(clear[name]), words[clear[name] < 0.0])
+        for name, (text, unit, words) in TOLD.items()
+        if name in clear
+    ]
+    ranges = []
     if "range_scale" in clear:
         ranges.append(f"{clear['range_scale']:+.1%}".replace("%", " %"))
     if "range_bias" in clear:

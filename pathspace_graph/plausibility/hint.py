@@ -42,7 +42,6 @@ class Hint:
 
     @property
     def line(self) -> str:
-        """The hint in one line."""
         return f"{self.file}, {self.columns}: {self.found}; likely cause: {self.likely}; {self.advice}"
 
 

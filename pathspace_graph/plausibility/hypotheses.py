@@ -1,8 +1,7 @@
 """Hypotheses about a log: in which frame its detections are, and what its odometry means.
 
-Static cones must move in the frame of the vehicle as the odometry says. Each hypothesis lays the detections
-of nearby cycles on each other. One that explains far more of them than the log as it is written is the likely
-truth.
+Each lays the detections of nearby cycles on each other, since cones stand still. One that explains far more
+of them than the log as it is written is the likely truth.
 """
 
 from collections.abc import Iterator
@@ -20,32 +19,19 @@ from pathspace_graph.labels import LEFT, UNKNOWN
 
 from .pairs import DEGREE, SOME_CYCLES, Meaning, Pairs, motions
 
-TURN_STEP: Final = 15.0
-"""Step of the angles that the frame of the detections is tried at (degrees)."""
-EQUAL: Final = 0.02
-"""Difference of explained shares below which hypotheses are equally good."""
-SIDED: Final = 0.2
-"""Further share of the labels on its side by which one of equally good hypotheses is better."""
-TELLING: Final = 0.2
-"""Difference of explained shares from which a pair tells two hypotheses apart."""
-CHANCE: Final = 1e-8
-"""Probability of winning as many of the pairs by chance below which a hypothesis is believed."""
-FAR_BETTER: Final = 1.8
-"""Least ratio of what a believed hypothesis explains to what the log as it is written does."""
-LEAST_SHARE: Final = 0.3
-"""Least share of the detections that a believed hypothesis explains."""
-MOUNTING_STEPS: Final = 5
-"""Gauss-Newton steps that find the mounting of the sensor."""
-LEAST_MATCHES: Final = 60
-"""Least number of matched detections from which the mounting is found."""
-WORST_CONDITION: Final = 1e6
-"""Largest condition number of the normal equations at which the mounting is found."""
-LATEST: Final = 10.0
-"""Largest delay or lead of detections that is tried (s)."""
-LATE_STEP: Final = 0.25
-"""Step of these (s)."""
-QUARTER: Final = 90.0
-"""A quarter turn in degrees."""
+TURN_STEP: Final = 15.0  # step of the angles that the frame of the detections is tried at (degrees)
+EQUAL: Final = 0.02  # difference of explained shares below which hypotheses are equally good
+SIDED: Final = 0.2  # further share of labels on their side by which one of equal hypotheses is better
+TELLING: Final = 0.2  # difference of explained shares from which a pair tells two hypotheses apart
+CHANCE: Final = 1e-8  # probability of winning by chance below which a hypothesis is believed
+FAR_BETTER: Final = 1.8  # least ratio of what it explains to what the log as written does
+LEAST_SHARE: Final = 0.3  # least share of the detections that a believed hypothesis explains
+MOUNTING_STEPS: Final = 5  # Gauss-Newton steps that find the mounting of the sensor
+LEAST_MATCHES: Final = 60  # least number of matched detections from which the mounting is found
+WORST_CONDITION: Final = 1e6  # largest condition number at which the mounting is found
+LATEST: Final = 10.0  # largest delay or lead of detections that is tried (s)
+LATE_STEP: Final = 0.25  # step of these (s)
+QUARTER: Final = 90.0  # a quarter turn in degrees
 MEANINGS: Final = (
     Meaning(),
     Meaning(content="nothing"),
@@ -74,14 +60,11 @@ MEANINGS: Final = (
 class Frame:
     """How the frame of the detections stands in that of the vehicle."""
 
-    turn: float = 0.0
-    """Turn to the left (degrees)."""
-    mirrored: bool = False
-    """Whether the y axis points to the other side, seen from the x axis."""
+    turn: float = 0.0  # turn to the left (degrees)
+    mirrored: bool = False  # whether the y axis points to the other side, seen from the x axis
 
     @property
     def matrix(self) -> Array:
-        """Matrix (2, 2) that leads to the vehicle's frame."""
         return rotation(self.turn * DEGREE) @ np.diag([1.0, -1.0 if self.mirrored else 1.0])
 
 
@@ -91,12 +74,10 @@ class Hypothesis:
 
     frame: Frame = Frame()
     meaning: Meaning = field(default_factory=Meaning)
-    late: float = 0.0
-    """How much too large the stamps of the detections are (s)."""
+    late: float = 0.0  # how much too large the stamps of the detections are (s)
 
 
-AS_WRITTEN: Final = Hypothesis()
-"""The log means what it should."""
+AS_WRITTEN: Final = Hypothesis()  # the log means what it should
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +85,8 @@ class Trial:
     """How well a hypothesis explains the pairs of cycles."""
 
     hypothesis: Hypothesis
-    explained: Array
-    """Share (P,) of the detections of each pair that is explained."""
-    sided: float = 0.0
-    """Share of the labelled detections on the side of their label."""
+    explained: Array  # share (P,) of the detections of each pair that is explained
+    sided: float = 0.0  # share of the labelled detections on the side of their label
 
     @property
     def share(self) -> float:
@@ -118,29 +97,22 @@ class Trial:
 class Verdict:
     """Comparison of a hypothesis with the log as it is written, on the pairs that tell them apart."""
 
-    telling: int
-    """Number of these pairs."""
-    better: int
-    """Number of those that the hypothesis explains better."""
-    share: float
-    """Share of their detections that it explains."""
-    share_as_written: float
-    """Share of their detections that the log as it is written explains."""
+    telling: int  # number of these pairs
+    better: int  # number of those that the hypothesis explains better
+    share: float  # share of their detections that it explains
+    share_as_written: float  # share of their detections that the log as it is written explains
 
     def is_clear(self) -> bool:
-        """Return whether the hypothesis is better beyond doubt."""
         chance = float(bdtrc(self.better - 1, self.telling, 0.5))
         far_better = self.share > FAR_BETTER * self.share_as_written
         return chance < CHANCE and far_better and self.share > LEAST_SHARE
 
     @property
     def figures(self) -> dict[str, float]:
-        """The shares of the detections that lie where they are expected, as written and if it is so."""
         return {"as_written": self.share_as_written, "share": self.share}
 
 
 def verdict(trial: Trial, reference: Trial) -> Verdict:
-    """Return how a trial compares with the reference."""
     gain = trial.explained - reference.explained
     telling: BoolArray = np.abs(gain) > TELLING
     if not telling.any():
@@ -150,8 +122,6 @@ def verdict(trial: Trial, reference: Trial) -> Verdict:
 
 
 class Trials:
-    """Trials of hypotheses on the pairs of cycles of a log."""
-
     def __init__(self, log: Log, pairs: Pairs) -> None:
         self.log, self.pairs = log, pairs
         self._poses: dict[Meaning, Array] = {}
@@ -200,7 +170,6 @@ class Trials:
 
     @cached_property
     def _labelled(self) -> tuple[Array, IntArray]:
-        """Return the near detections (m, 2) of some cycles that have a label, and the labels (m,)."""
         some = self.log.cycles[:: max(1, len(self.log.cycles) // SOME_CYCLES)]
         points = np.concatenate([cycle.points_vehicle for cycle in some])
         labels = np.concatenate([cycle.labels for cycle in some])
@@ -211,22 +180,17 @@ class Trials:
 
 # --- where the sensor is in the vehicle, and how late it is ----------------------------------------------
 
-MEDIAN_SQUARE: Final = 2.0 * float(np.log(2.0))
-"""Median of the squared length of a vector of two standard normal numbers."""
+MEDIAN_SQUARE: Final = 2.0 * float(np.log(2.0))  # median of |x|^2 of two standard normals
 
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
     """How the sensor stands in the vehicle, beyond the frame of a hypothesis."""
 
-    values: Array
-    """(3,) Turn to the left (rad), and place ahead and to the left of the odometry's point (m)."""
-    sigmas: Array
-    """(3,) Their standard deviations."""
-    scatter: float
-    """Median distance of detections of one cone (m)."""
-    claimed: float
-    """The same by their covariances (m)."""
+    values: Array  # (3,) turn to the left (rad), and place ahead and to the left of the odometry's point (m)
+    sigmas: Array  # (3,) their standard deviations
+    scatter: float  # median distance of detections of one cone (m)
+    claimed: float  # the same by their covariances (m)
 
     @property
     def yaw(self) -> tuple[float, float]:
@@ -270,7 +234,6 @@ def lever(motion: Array, arm: Array) -> Array:
 
 
 def _columns(motion: Array, arm: Array) -> Array:
-    """Return the derivatives (n, 2, 3) of the residuals by yaw and lever arm."""
     seen = motion + lever(motion, arm)
     columns = np.zeros((len(motion), 2, 3))
     columns[:, 0, 0], columns[:, 1, 0] = -seen[:, 1], seen[:, 0]

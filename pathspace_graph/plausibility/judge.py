@@ -1,79 +1,52 @@
-"""`hints`: a log is judged before it is mapped, and its likely mistakes are told."""
+"""A log is judged before it is mapped: its likely mistakes are told, also those for which it is refused."""
 
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
-from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
+from pathspace_graph.front_end.gate import read_usable_log
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry, covariances_of, cycles_of
+from pathspace_graph.io.parsing import Table, read_table, shown
+from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN, label_from_name
 from pathspace_graph.lengths import scaled
 from pathspace_graph.scale import scale_of
+from pathspace_graph.settings.online import LimitSettings
 
-from .hint import Hint, told
-from .hypotheses import (
-    LEAST_SHARE,
-    Frame,
-    Mounting,
-    Trial,
-    Trials,
-    Verdict,
-    best_lateness,
-    mounting_of,
-    verdict,
-)
+from . import hypotheses
+from .hint import Hint, because, told
+from .hypotheses import LEAST_SHARE, Frame, Mounting, Trial, Trials, Verdict, verdict
 from .noise import noise_hints
 from .pairs import DEGREE, GAPS, Meaning, Pairs, motions, pairs_of
 
-LEAST_TWISTS: Final = 20
-"""Least number of twists of a log of which anything is said."""
-OVERLAP: Final = 0.5
-"""Share of a cycle's detections that another could have seen, from which the two are compared."""
-SHORTEST_STEP: Final = 2e-4
-"""Shortest usual time between rows (s)."""
-LONGEST_STEP: Final = 5.0
-"""Longest usual time between rows (s)."""
-FARTHEST: Final = 120.0
-"""Usual greatest range of a detector of cones (m)."""
-FAR: Final = 20.0
-"""Range within which cones decide between two units that both give possible positions (m)."""
-NEAREST: Final = 0.05
-"""Usual least range of cones (m)."""
-FASTEST: Final = 100.0
-"""Speed that no vehicle exceeds in a tenth of its time (m/s)."""
-FASTEST_TURN: Final = 8.0
-"""Yaw rate that no vehicle exceeds in a tenth of its time (rad/s)."""
-TURNED: Final = 5.0
-"""Turn of the sensor beyond which it is told (degrees)."""
-TURNED_SIGMA: Final = 1.0
-"""Largest standard deviation of the turn at which it is told (degrees)."""
-ARM: Final = 1.0
-"""Distance of the sensor from the point that the odometry describes beyond which it is told (m)."""
-ARM_SIGMA: Final = 0.2
-"""Largest standard deviation of its place at which it is told, as a share of the distance."""
-CLAIMED_LESS: Final = 10.0
-"""Ratio of one cone's scatter to the claimed one from which covariances are too small."""
-CLAIMED_MORE: Final = 30.0
-"""Ratio of the claimed scatter to one cone's from which covariances are too large."""
-LEAST_SCATTER: Final = 0.02
-"""Scatter that detections which scatter less count as (m)."""
-BOTH_SIDES: Final = 0.15
-"""Distance from a half of the share of a label's cones on its own side at which they are on both."""
-NEAR: Final = 0.25
-"""Move by a share of the usual range, and turn (rad), below which two cycles see the same cones."""
-MANY: Final = 6
-"""Least number of detections that such cycles have together."""
-LEAST_NEAR: Final = 30
-"""Least number of such pairs of cycles that are counted."""
-UNEXPLAINED: Final = 0.15
-"""Share of the detections that the best motion must explain, or else none does."""
-LINE_RATIO: Final = 0.1
-"""Ratio of the variations of two coordinates below which detections lie on a line."""
-TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
-"""Units of stamps by their size in s."""
-LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}
-"""Units of positions by their size in m."""
+LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is said
+OVERLAP: Final = 0.5  # share of its detections that another cycle sees, from which they are compared
+SHORTEST_STEP: Final = 2e-4  # shortest usual time between rows (s)
+LONGEST_STEP: Final = 5.0  # longest usual time between rows (s)
+FARTHEST: Final = 120.0  # usual greatest range of a detector of cones (m)
+FAR: Final = 20.0  # range within which cones decide between two units that both give possible positions (m)
+NEAREST: Final = 0.05  # usual least range of cones (m)
+FASTEST: Final = 100.0  # speed that no vehicle exceeds in a tenth of its time (m/s)
+FASTEST_TURN: Final = 8.0  # yaw rate that no vehicle exceeds in a tenth of its time (rad/s)
+TURNED: Final = 5.0  # turn of the sensor beyond which it is told (degrees)
+TURNED_SIGMA: Final = 1.0  # largest standard deviation of the turn at which it is told (degrees)
+ARM: Final = 1.0  # distance of sensor and odometry's point beyond which it is told (m)
+ARM_SIGMA: Final = 0.2  # largest sigma of its place at which it is told, by the distance
+CLAIMED_LESS: Final = 10.0  # one cone's scatter by the claimed one: covariances too small
+CLAIMED_MORE: Final = 30.0  # ratio of the claimed scatter to one cone's from which covariances are too large
+LEAST_SCATTER: Final = 0.02  # scatter that detections which scatter less count as (m)
+BOTH_SIDES: Final = 0.15  # distance from a half of the share of a label on its side: it is on both
+NEAR: Final = 0.25  # move by the usual range, and turn (rad), below which cycles see the same cones
+MANY: Final = 6  # least number of detections that such cycles have together
+LEAST_NEAR: Final = 30  # least number of such pairs of cycles that are counted
+UNEXPLAINED: Final = 0.15  # share of the detections that the best motion must explain, or else none does
+LINE_RATIO: Final = 0.1  # ratio of the variations of two coordinates below which detections lie on a line
+TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size in s
+LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # units of positions by their size in m
 SPEEDS: Final = {
     1.0 / 3.6: "are in km/h, not in m/s",
     0.44704: "are in miles per hour, not in m/s",
@@ -98,16 +71,11 @@ FRAMES: Final = {
     Frame(-90.0, True): "the sensor's frame has x to the right and y to the rear",
 }
 """What a frame in quarter turns means; the one with y to the right has its own hint."""
-MIRRORED: Final = Frame(0.0, True)
-"""Frame in which y points to the right and x ahead."""
+MIRRORED: Final = Frame(0.0, True)  # frame in which y points to the right and x ahead
 
 
 def hints(log: Log) -> list[Hint]:
-    """Return the likely mistakes in a log, each with its figure; there are none in a good one.
-
-    Only the readings are looked at, never the truth. Where a log is short, or stands still, or goes straight
-    on, the evidence is weak, and nothing is said.
-    """
+    """Return the likely mistakes in a log by its readings; there are none where evidence is weak."""
     if len(log.odometry.t) < LEAST_TWISTS:
         return []
     scale = scale_of(log)
@@ -115,7 +83,6 @@ def hints(log: Log) -> list[Hint]:
 
 
 def _hints(log: Log) -> list[Hint]:
-    """Return the hints about a log at scale 1."""
     of_parts = whole_stamps(log)
     if of_parts:
         return of_parts
@@ -167,7 +134,6 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def one_clock(log: Log) -> list[Hint]:
-    """Return a hint where the stamps of all cycles are before or after those of the odometry."""
     if not log.cycles:
         return []
     first, last = float(log.odometry.t[0]), float(log.odometry.t[-1])
@@ -178,7 +144,6 @@ def one_clock(log: Log) -> list[Hint]:
 
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
-    """Return the log with its detections in metres, and a hint where they were not."""
     typical = _median(np.concatenate([np.zeros(0), *(np.hypot(*c.points_vehicle.T) for c in log.cycles)]))
     if typical > FARTHEST:
         fitting = [unit for unit in LENGTHS if typical * unit <= FAR] or [min(LENGTHS)]
@@ -193,7 +158,6 @@ def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def beyond_any_vehicle(odometry: Odometry) -> list[Hint]:
-    """Return hints about speeds and yaw rates that no vehicle has."""
     speed = float(np.quantile(np.hypot(odometry.twist[:, 0], odometry.twist[:, 1]), 0.9))
     rate = float(np.quantile(np.abs(odometry.twist[:, 2]), 0.9))
     found = [told("too fast", speed=speed)] if speed > FASTEST else []
@@ -201,7 +165,6 @@ def beyond_any_vehicle(odometry: Odometry) -> list[Hint]:
 
 
 def _stamps(log: Log) -> dict[str, Array]:
-    """Return the stamps (s) of the rows of odometry and of the cycles, by file."""
     return {ODOMETRY_FILE: log.odometry.t, DETECTIONS_FILE: np.array([cycle.t for cycle in log.cycles])}
 
 
@@ -215,8 +178,8 @@ def _median(values: Array) -> float:
 def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
     """Return the pairs of cycles that see the same cones if the odometry is right.
 
-    One stretch of a track looks like the next. So cycles without cones in common agree best with a vehicle
-    that does not move. Where the odometry is impossible anyway, the pairs are those that follow each other.
+    Cycles without cones in common would agree best with a vehicle that does not move, as one stretch looks
+    like the next. Where the odometry is impossible anyway, the pairs are those that follow each other.
     """
     if beyond_any_vehicle(log.odometry):
         return pairs.chosen(pairs.gap <= GAPS[1])
@@ -225,7 +188,6 @@ def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
 
 
 def _by_motion(trials: Trials) -> list[Hint]:
-    """Return the hints about frame, odometry, clocks, mounting, covariances and labels."""
     if len(trials.pairs) == 0:
         return beyond_any_vehicle(trials.log.odometry)
     best, found = _meant(trials)
@@ -234,7 +196,7 @@ def _by_motion(trials: Trials) -> list[Hint]:
     late, of_clocks = _late(trials, best)
     if best.share < LEAST_SHARE and late is best:
         return found + (_unexplained(trials, best) if not found else [])
-    mounting = mounting_of(trials, late.hypothesis)
+    mounting = hypotheses.mounting_of(trials, late.hypothesis)
     found += of_clocks
     if mounting is not None:
         found = _turned(found, late, mounting)
@@ -243,7 +205,6 @@ def _by_motion(trials: Trials) -> list[Hint]:
 
 
 def _meant(trials: Trials) -> tuple[Trial, list[Hint]]:
-    """Return the hypothesis that explains the log, and what it says of frame and odometry."""
     best = trials.best()
     compared = verdict(best, trials.as_written)
     if best is trials.as_written or not compared.is_clear():
@@ -254,11 +215,7 @@ def _meant(trials: Trials) -> tuple[Trial, list[Hint]]:
 
 
 def _of_frame(best: Trial, trials: Trials, compared: Verdict) -> list[Hint]:
-    """Return a hint about the frame of the detections, where it is not the vehicle's.
-
-    Where detections turn the other way than the odometry, colours tell which is wrong. The odometry may also
-    be the one that goes backward or to a side.
-    """
+    """Return a hint about the frame of the detections, or an odometry that goes backward or to a side."""
     frame = best.hypothesis.frame
     vx, vy = np.median(trials.log.odometry.twist[:, :2], axis=0)
     sees_ahead = np.nanmedian(trials.pairs.before[..., 0]) > 0.0
@@ -279,15 +236,11 @@ def _of_frame(best: Trial, trials: Trials, compared: Verdict) -> list[Hint]:
 
 
 def _mended(frame: Frame) -> str:
-    """Return how to turn detections into the vehicle's frame."""
     matrix = frame.matrix
     if np.allclose(matrix, np.round(matrix), atol=1e-9):
         signs = {1: "", -1: "-"}
-        terms = [
-            f"{signs[int(row[k])]}{'xy'[k]}"
-            for row in np.round(matrix)
-            for k in np.flatnonzero(np.round(row))
-        ]
+        rows = np.round(matrix)
+        terms = [f"{signs[int(row[k])]}{'xy'[k]}" for row in rows for k in np.flatnonzero(row)]
         return f"put {terms[0]} into column x and {terms[1]} into column y"
     mirror = "negate column y, then " if frame.mirrored else ""
     return f"{mirror}turn the detections by {_angle(frame.turn)}"
@@ -313,8 +266,7 @@ def _of_odometry(meaning: Meaning, compared: Verdict) -> list[Hint]:
 
 
 def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
-    """Return the trial with the lateness of the detections, and a hint where there is a large one."""
-    late = best_lateness(trials, best)
+    late = hypotheses.best_lateness(trials, best)
     compared = verdict(late, best)
     if not compared.is_clear():
         return best, []
@@ -324,23 +276,18 @@ def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
 
 
 def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
-    """Return the hints with one about a sensor that is turned by an angle that is no quarter turn."""
     yaw, sigma = mounting.yaw
     frame = best.hypothesis.frame
     if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURNED or sigma > TURNED_SIGMA):
         return found
-    hint = told(
-        "turned",
-        angle=_angle(frame.turn + yaw, 1),
-        side=", with y to the right" if frame.mirrored else "",
-    )
+    side = ", with y to the right" if frame.mirrored else ""
+    hint = told("turned", angle=_angle(frame.turn + yaw, 1), side=side)
     figure = next((one.found for one in found if one.cause == "sensor frame"), hint.found)
     others = [one for one in found if one.cause not in ("sensor frame", "y to the right")]
     return [*others, replace(hint, found=figure)]
 
 
 def _placed(mounting: Mounting) -> list[Hint]:
-    """Return a hint where the sensor sits metres away from the point that the odometry describes."""
     length, sigma = mounting.arm
     if length < ARM or sigma > ARM_SIGMA * length:
         return []
@@ -351,7 +298,6 @@ def _placed(mounting: Mounting) -> list[Hint]:
 
 
 def _certain(mounting: Mounting) -> list[Hint]:
-    """Return a hint where the covariances are far from how detections of one cone scatter."""
     scatter, claimed = mounting.scatter, mounting.claimed
     if claimed * CLAIMED_LESS < scatter:
         unit = "another unit"
@@ -363,7 +309,6 @@ def _certain(mounting: Mounting) -> list[Hint]:
 
 
 def _labelled(trials: Trials, best: Trial) -> list[Hint]:
-    """Return a hint where one label stands for cones on both sides of the vehicle."""
     labels = np.concatenate([cycle.labels for cycle in trials.log.cycles])
     present = [label for label in (LEFT, RIGHT) if (labels == label).any()]
     if len(present) != 1 or (labels == UNKNOWN).any() or abs(best.sided - 0.5) > BOTH_SIDES:
@@ -372,7 +317,6 @@ def _labelled(trials: Trials, best: Trial) -> list[Hint]:
 
 
 def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
-    """Return a hint where detections of cycles close to each other agree with no motion at all."""
     pairs = trials.pairs
     motion = trials.motion(best.hypothesis)
     ranges = np.nanmedian(np.hypot(pairs.before[..., 0], pairs.before[..., 1]))
@@ -386,7 +330,6 @@ def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
 
 
 def is_a_line(pairs: Pairs) -> bool:
-    """Return whether one coordinate of all detections hardly varies beside the other."""
     spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
     return bool(spread.min() < LINE_RATIO * spread.max())
 
@@ -394,3 +337,50 @@ def is_a_line(pairs: Pairs) -> bool:
 def _optical(pairs: Pairs) -> Hint:
     spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
     return told("camera", thin="xy"[int(spread.argmin())], least=spread.min(), most=spread.max())
+
+
+MOST: Final = 1e20  # largest number that is read, to say what it means
+NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
+SHOWN_WORDS: Final = 3  # most foreign labels that are shown
+
+
+def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[Hint]]:
+    """Read and judge a log; an InputError names file, row, what was expected, and the likely cause."""
+    try:
+        log = read_usable_log(folder, limits)
+    except InputError as error:
+        of_data = error.file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
+        causes = because(refused_hints(folder)) if of_data else ""
+        if not causes:
+            raise
+        raise InputError(error.file, f"{error.message}; {causes}", error.row) from error
+    return log, hints(log) + _foreign_labels(folder, log)
+
+
+def refused_hints(folder: Path) -> list[Hint]:
+    """Return the hints about a log that was refused; there are none where it cannot even be parsed."""
+    try:
+        odometry = read_table(folder / ODOMETRY_FILE, ("t", "vx", "vy", "wz"))
+        detections = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))
+        return hints(_unchecked(odometry, detections))
+    except InputError:
+        return []
+
+
+def _unchecked(odometry: Table, detections: Table) -> Log:
+    twists = Odometry(odometry.numbers("t", MOST), odometry.stack(("vx", "vy", "wz"), MOST))
+    stamps, points = detections.numbers("t", MOST), detections.stack(("x", "y"), MOST)
+    covariances = covariances_of(*(detections.numbers(name, MOST) for name in ("xx", "xy", "yy")))
+    labels = np.array([label_from_name(name) for name in detections.columns["label"]], dtype=int)
+    cycles = cycles_of(stamps, points, covariances, labels)
+    return Log(twists, cycles, np.ones(3), odometry_stated=False, detections_stated=False)
+
+
+def _foreign_labels(folder: Path, log: Log) -> list[Hint]:
+    if not log.cycles or any((cycle.labels != UNKNOWN).any() for cycle in log.cycles):
+        return []
+    words = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])
+    foreign = [word for word, _ in words.most_common() if word.strip().lower() not in NO_LABEL]
+    if not foreign:
+        return []
+    return [told("foreign labels", words=", ".join(shown(word) for word in foreign[:SHOWN_WORDS]))]

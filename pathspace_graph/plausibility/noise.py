@@ -14,17 +14,11 @@ from pathspace_graph.io.log import Log
 
 from .hint import Hint, told
 
-NOISE_FACTOR: Final = 1.5
-"""Factor between measured and stated noise of the odometry from which the stated one is wrong."""
-NOISE_AGREEMENT: Final = 1.2
-"""Largest factor between the noise by differences of different orders where odometry has white noise."""
-SCATTER_FACTOR: Final = 2.0
-"""Factor between the scatter of detections and their covariances from which these are wrong; it is told
-less well, from a few cones, and with the errors of odometry and stamps in it."""
-NOISE_SHARE: Final = 0.75
-"""Share of the detections from which on wrong covariances are told."""
-NOISE_CYCLES: Final = 300
-"""Most cycles on which the noise of detections is measured."""
+NOISE_FACTOR: Final = 1.5  # of measured and stated noise of the odometry, from which it is wrong
+NOISE_AGREEMENT: Final = 1.2  # most between differences of different orders of white noise
+SCATTER_FACTOR: Final = 2.0  # of scatter and covariances, which a few cones and odometry tell less well
+NOISE_SHARE: Final = 0.75  # share of the detections from which on wrong covariances are told
+NOISE_CYCLES: Final = 300  # most cycles on which the noise of detections is measured
 TWIST: Final = (("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s"))
 
 
@@ -37,8 +31,8 @@ def noise_hints(log: Log) -> list[Hint]:
 def _odometry(log: Log) -> list[Hint]:
     """Return a hint where noise from sample to sample contradicts the stated one.
 
-    Motion is in the differences of readings as well. So the stated noise is too small only where differences
-    of all orders agree, and too large only beside the least slow errors of any odometry.
+    Motion is in the differences too: noise is too small only where all orders agree, too large only beside
+    the least slow errors of any odometry.
     """
     twists = TwistRecord()
     twists.add(log.odometry)
@@ -64,7 +58,6 @@ def _odometry(log: Log) -> list[Hint]:
 
 
 def _detections(log: Log) -> list[Hint]:
-    """Return hints where covariances contradict how single detections of a cone scatter, by range."""
     cycles = log.cycles[:NOISE_CYCLES]
     measured = measure_log(replace(log, cycles=cycles))
     if measured is None or measured.along is None or measured.across is None:
@@ -88,8 +81,7 @@ def _detections(log: Log) -> list[Hint]:
 def _contradicted(ranges: Array, stated: Array, ray: RayNoise, axis: int) -> str:
     """Return whether the stated standard deviations (m,) are too small or too large in most detections.
 
-    A cone is no point, which bounds the scatter from below. Detections count as those of a cone only within a
-    gate, so that only a scatter far below it says that the stated one is too large.
+    A cone is no point, which bounds the scatter from below, and a gate bounds it from above.
     """
     measured = ray.sigmas(ranges)
     floor = np.array([np.full(len(ranges), LEAST[0]), LEAST[1] * ranges])[axis]

@@ -1,10 +1,8 @@
 """Pairs of nearby cycles, and motions: cones stand still, so a right one lays detections on each other."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final, Literal, Self
 
 import numpy as np
 
@@ -12,53 +10,36 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import se2_exp, wrap_angle
 from pathspace_graph.io.log import Detections, Odometry
 
-MIN_DETECTIONS: Final = 2
-"""Least number of detections of a cycle that is compared."""
-MOST_DETECTIONS: Final = 14
-"""Most detections of a cycle that are compared, the nearest ones."""
-SOME_CYCLES: Final = 200
-"""Approximate number of cycles from which the spacing of the cones is told."""
-GAPS: Final = (1, 2, 4, 8)
-"""Numbers of cycles between the two that are compared."""
-PAIRS_OF_GAP: Final = 60
-"""Approximate number of pairs of cycles that are compared for each of the gaps."""
-LONGEST: Final = 1.3
-"""Longest time between the cycles of a pair (s), if cycles do not come more rarely."""
-REACH: Final = 0.2
-"""Distance from another detection, over the cones' spacing, that counts as the same by `exp(-1/2)`."""
-SEEN: Final = 0.95
-"""Share of the detections within the range, and between the bearings, that a cycle sees."""
-ROUND: Final = 0.1
-"""Length of the mean direction to the detections below which a sensor sees all around."""
+MIN_DETECTIONS: Final = 2  # least number of detections of a cycle that is compared
+MOST_DETECTIONS: Final = 14  # most detections of a cycle that are compared, the nearest ones
+SOME_CYCLES: Final = 200  # approximate number of cycles from which the spacing of the cones is told
+GAPS: Final = (1, 2, 4, 8)  # numbers of cycles between the two that are compared
+PAIRS_OF_GAP: Final = 60  # approximate number of pairs of cycles that are compared for each of the gaps
+LONGEST: Final = 1.3  # longest time between the cycles of a pair (s), if cycles do not come more rarely
+REACH: Final = 0.2  # distance that counts as the same by `exp(-1/2)`, over the cones' spacing
+SEEN: Final = 0.95  # share of the detections within the range, and between the bearings, that a cycle sees
+ROUND: Final = 0.1  # length of the mean direction to the detections below which a sensor sees all around
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
     """Pairs of cycles, whose detections are in the frame of the log; what is not there is NaN."""
 
-    begin: Array
-    """Stamps (P,) of the earlier cycles (s)."""
-    end: Array
-    """Stamps (P,) of the later cycles (s)."""
-    before: Array
-    """Detections (P, m, 2) of the earlier cycles (m)."""
-    after: Array
-    """Detections (P, m, 2) of the later cycles (m)."""
-    variances: Array
-    """Variances (P, m, m) of one coordinate of each difference of two detections (m^2)."""
-    gap: IntArray
-    """Number (P,) of cycles from the earlier to the later one."""
-    reach: float
-    """A detection explains another one at distance d with the weight `exp(-d^2 / 2 reach^2)`."""
+    begin: Array  # stamps (P,) of the earlier cycles (s)
+    end: Array  # stamps (P,) of the later cycles (s)
+    before: Array  # detections (P, m, 2) of the earlier cycles (m)
+    after: Array  # detections (P, m, 2) of the later cycles (m)
+    variances: Array  # variances (P, m, m) of one coordinate of each difference of two detections (m^2)
+    gap: IntArray  # number (P,) of cycles from the earlier to the later one
+    reach: float  # a detection explains another one at distance d with the weight `exp(-d^2 / 2 reach^2)`
 
     def __len__(self) -> int:
         return len(self.begin)
 
     def distances(self, frame: Array, motion: Array) -> Array:
-        """Return the squared distances (P, m, m) of earlier from later detections, laid on them by a motion.
+        """Return the squared distances (P, m, m) of earlier from later detections, infinite without any.
 
-        frame (2, 2) leads from the frame of the log to the vehicle's, and motion (P, 3) from the later to the
-        earlier vehicle frame. Where there is no detection the distance is infinite.
+        frame (2, 2) leads from the log's frame to the vehicle's, motion (P, 3) from the later to the earlier.
         """
         laid = self.laid(frame, motion)
         off = (self.before @ frame.T)[:, :, None] - laid[:, None]
@@ -77,16 +58,12 @@ class Pairs:
         total = weights.max(axis=2).sum(axis=1) + weights.max(axis=1).sum(axis=1)
         return np.asarray(total / np.maximum(self.count, 1))
 
-    def chosen(self, rows: BoolArray) -> Pairs:
-        """Return the pairs (P,) that are flagged."""
+    def chosen(self, rows: BoolArray) -> Self:
         arrays = {name: value[rows] for name, value in vars(self).items() if name != "reach"}
         return replace(self, **arrays)
 
     def overlap(self, motion: Array) -> Array:
-        """Return the share (P,) of the later detections that the earlier cycle could have seen.
-
-        What a cycle sees is told from all detections: up to which range, and to both sides of which bearing.
-        """
+        """Return the share (P,) of the later detections that the earlier cycle could have seen."""
         ranges, bearings = _polar(self.before)
         vector = np.nanmean(np.exp(1j * bearings))
         middle = float(np.angle(vector)) if abs(vector) > ROUND else 0.0
@@ -98,7 +75,6 @@ class Pairs:
 
     @property
     def count(self) -> IntArray:
-        """Number (P,) of detections of both cycles."""
         before, after = (np.isfinite(points[..., 0]).sum(axis=1) for points in (self.before, self.after))
         return np.asarray(before + after)
 
@@ -122,15 +98,9 @@ def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
     if len(first) == 0:
         return None
     points, variances = padded(full, MOST_DETECTIONS)
-    return Pairs(
-        stamps[first],
-        stamps[second],
-        points[first],
-        points[second],
-        variances[first][:, :, None] + variances[second][:, None],
-        gaps,
-        REACH * spacing,
-    )
+    both = variances[first][:, :, None] + variances[second][:, None]
+    begin, end = stamps[first], stamps[second]
+    return Pairs(begin, end, points[first], points[second], both, gaps, REACH * spacing)
 
 
 def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:
@@ -157,7 +127,6 @@ def spacing_of(cycles: Sequence[Detections]) -> float | None:
 
 
 def _polar(points: Array) -> tuple[Array, Array]:
-    """Return ranges and bearings (P, m) of points (P, m, 2)."""
     return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
 
 
@@ -165,18 +134,15 @@ def _polar(points: Array) -> tuple[Array, Array]:
 
 Content = Literal["twist", "twist in the map frame", "pose", "nothing"]
 """What the columns of the odometry hold; with `nothing` the vehicle does not move at all."""
-DEGREE: Final = float(np.pi / 180.0)
-"""A degree in radians."""
+DEGREE: Final = float(np.pi / 180.0)  # a degree in radians
 
 
 @dataclass(frozen=True)
 class Meaning:
     """What the columns of the odometry mean."""
 
-    speed: float = 1.0
-    """Unit of the speeds (m/s)."""
-    rate: float = 1.0
-    """Unit of the yaw rate (rad/s)."""
+    speed: float = 1.0  # unit of the speeds (m/s)
+    rate: float = 1.0  # unit of the yaw rate (rad/s)
     content: Content = "twist"
 
     def poses(self, odometry: Odometry) -> Array:
@@ -196,10 +162,7 @@ class Meaning:
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
-    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning.
-
-    Between the stamps (N,) of the poses (N, 3) the motion is even.
-    """
+    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning."""
     first, last = _at(odometry_t, poses, begin), _at(odometry_t, poses, end)
     moved = _turned(last[:, :2] - first[:, :2], -first[:, 2])
     return np.column_stack([moved, last[:, 2] - first[:, 2]])
@@ -211,6 +174,5 @@ def _at(odometry_t: Array, poses: Array, stamps: Array) -> Array:
 
 
 def _turned(vectors: Array, angles: Array) -> Array:
-    """Return vectors (n, 2), each turned by its angle (n,)."""
     c, s = np.cos(angles), np.sin(angles)
     return np.column_stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]])

@@ -41,9 +41,6 @@ class FitSettings:
     breaks: BreakSettings = BreakSettings()
 
 
-# --- the batch over a log --------------------------------------------------------------------------------
-
-
 Start = Literal["online", "odometry"]
 
 
@@ -120,9 +117,6 @@ class BatchSettings(Positive):
     """Width of Tukey's loss: distance beyond which a detection has no weight, in standard deviations."""
     association: AssociationSettings = field(default_factory=AssociationSettings)
     closure: ClosureSettings = field(default_factory=ClosureSettings)
-
-
-# --- estimators to compare with --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ a drive does not show stays at its prior.
 
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Final, Literal, Self
+from typing import ClassVar, Final, Literal, Self
 
 from .checked import Positive
 
@@ -14,8 +14,6 @@ WIDE_ODOMETRY: Final = 10.0
 """Standard deviations of the odometry's wide priors by those of a calibrated one."""
 WIDE_SENSOR: Final = 20.0
 """Standard deviations of the sensor's wide priors by those of a calibrated one."""
-SIGMAS_START: Final = (1e-4, 1e-4, 1e-5)
-"""Standard deviations (m, m, rad) of the first pose: zero by definition, but that has no information."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +22,9 @@ class OdometrySettings(Positive):
 
     UNLIMITED = ("doubt",)
     SIGNED = ("scale", "bias")
+
+    sigmas_start: ClassVar = (1e-4, 1e-4, 1e-5)
+    """Standard deviations (m, m, rad) of the first pose: zero by definition, but that has no information."""
 
     scale: float = 0.0
     """Known scale error of the speeds (-): mean of its prior."""
@@ -52,11 +53,6 @@ class OdometrySettings(Positive):
     def calibration(self) -> tuple[float, float]:
         """Known scale error (-) and yaw-rate bias (rad/s)."""
         return self.scale, self.bias
-
-    @property
-    def sigmas_start(self) -> tuple[float, float, float]:
-        """Standard deviations (m, m, rad) of the pose at the first odometry stamp."""
-        return SIGMAS_START
 
 
 @dataclass(frozen=True)

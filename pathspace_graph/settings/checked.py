@@ -83,9 +83,6 @@ def _in_words(kind: Any) -> str:
     return {bool: "True or False", NoneType: "None"}.get(kind) or f"a {getattr(kind, '__name__', kind)}"
 
 
-# --- settings that are gone ------------------------------------------------------------------------------
-
-
 GONE: Final = """
 : sigma_step 0.5
 limits: stamp 1e11, interval 1e-3, twists 100000, detections 500, range_min 0.01, sigma_min 1e-6,

@@ -49,8 +49,7 @@ class SplineSettings(Positive):
     refine_iterations: int = 1
     """Newton steps that refine each foot point in a Gauss-Newton step."""
 
-    min_size: ClassVar[int] = 8
-    """Least number of control points of a closed boundary."""
+    min_size: ClassVar[int] = 8  # least number of control points of a closed boundary
     sigma_simplify: ClassVar[float] = 0.1
     """Standard deviation of a control point's move by simplification, m; it loosens the prior."""
     confirmed_margin: ClassVar[float] = 0.5
@@ -72,9 +71,7 @@ class GaugeSettings(Positive):
     sigma_smoothness: float = 1.0
     """Standard deviation of the second difference of control points, as a share of their spacing."""
 
-    sigma_anchor: ClassVar[float] = 1e4
-    """Standard deviation of the prior that holds each control point at its place, m: it keeps the system
-    regular, and is too weak to be noticed even by a thousand of them together."""
+    sigma_anchor: ClassVar[float] = 1e4  # of each control point's place, m, which keeps the system regular
 
 
 @dataclass(frozen=True)
@@ -90,27 +87,23 @@ class GateSettings(Positive):
     view_ahead: float = 25.0
     """Farthest place on a curve that a detection may belong to, m ahead of the vehicle along the curve."""
 
-    view_behind: ClassVar[float] = 4.0
-    """Farthest such place behind the vehicle, m."""
-    chi_unknown: ClassVar[float] = 1.5
-    """Gate of a detection of unknown colour, in standard deviations of its own: cones of a start line, beside
-    the boundary, would bend it."""
+    view_behind: ClassVar[float] = 4.0  # farthest such place behind the vehicle, m
+    chi_unknown: ClassVar[float] = (
+        1.5  # gate of unknown colour, own sigmas: cones of a start line would bend it
+    )
     sigma_floor: ClassVar[float] = 0.1
     """Standard deviation of errors that the model does not know, added in the gate, m."""
-    rough: ClassVar[float] = 3.0
-    """Distance from a curve beyond which no detection is associated with it, m."""
-    station_step: ClassVar[float] = 1.5
-    """Way driven in a cycle up to which the foot point of the newest pose is refined from that of the last
-    one, m; beyond, it is searched for."""
+    rough: ClassVar[float] = 3.0  # distance from a curve beyond which no detection is associated with it, m
+    station_step: ClassVar[float] = (
+        1.5  # way of a cycle beyond which the pose's foot point is searched for, m
+    )
     station_ahead: ClassVar[float] = 8.0
     station_behind: ClassVar[float] = 3.0
     """How far that search goes ahead of the last foot point, and back, m along the curve."""
     station_lateral: ClassVar[float] = 10.0
-    """Distance from a curve at which the vehicle has lost its place on it, m; so it has where the curve leads
-    in the opposite direction. Its place is then searched for on the whole of a closed curve, or at the end of
-    an open one."""
-    station_room: ClassVar[float] = 40.0
-    """Length at the end of an open curve that is searched then, m."""
+    """Distance from a curve at which the vehicle has lost its place, m, as where it leads the other way:
+    the whole of a closed curve is searched then, or the end of an open one."""
+    station_room: ClassVar[float] = 40.0  # length of that end, m
 
 
 @dataclass(frozen=True)
@@ -174,9 +167,7 @@ class MapperSettings(Positive):
     ckf: CkfSettings = field(default_factory=CkfSettings)
     centerline: CenterlineSettings = field(default_factory=CenterlineSettings)
 
-    sigma_step: ClassVar[float] = 0.5
-    """Standard deviation of a control point's move in a step, m: damps sliding along the curve, and leaves
-    the optimum where it is."""
+    sigma_step: ClassVar[float] = 0.5  # of a control point's move in a step, m: damps sliding along the curve
 
     @property
     def calibrations(self) -> tuple[float, ...]:

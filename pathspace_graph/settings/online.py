@@ -31,9 +31,6 @@ class GrowthSettings(Positive):
     """Longest stretch of an open curve without any cone (m)."""
 
 
-# --- closing ---------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ClosingSettings(Positive):
     """When the loop may close, and how certain its registration must be."""
@@ -71,9 +68,6 @@ class ClosingSettings(Positive):
     """Laps on the closed map after which its position and heading as a whole are held; `inf` for never."""
 
 
-# --- health ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class HealthSettings(Positive):
     """Limits of a good, a degraded and a lost estimate.
@@ -103,9 +97,6 @@ class HealthSettings(Positive):
     """Position's largest standard deviation on a closed map beyond which an estimate is degraded (m)."""
     sigma_lost: float = 5.0
     """The same standard deviation beyond which the vehicle is lost (m)."""
-
-
-# --- front end -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,12 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from .centre_line import points_across
 from .planning import MOST_POINTS, check_length
 
-_SAMPLE_STEP: Final = 0.5
-"""Approximate distance of boundary samples (m). The circle at a sample is right to a millimetre."""
+_SAMPLE_STEP: Final = 0.5  # of boundaries (m); the circle at a sample is right to a millimetre
 _ACROSS: Final = 2  # stride of the samples among which the points across are searched
 _BEHIND: Final = 3.0  # distance behind the vehicle at which the samples begin (m), since it may stand askew
 _OUTER: Final = 1.8  # largest ratio of the length of a turn's outer boundary to that of the centre line
 _SETTLING_STEPS: Final = 8  # largest number of Newton steps that settle the stations; mostly two are enough
-_SETTLED: Final = 1e-3
-"""Largest difference of a point's distances from both boundaries where it is on the line (m)."""
+_SETTLED: Final = 1e-3  # largest difference of the distances from both boundaries on the line (m)
 _LARGEST_GAP: Final = 2.0  # largest number of steps between neighbours
 
 
@@ -94,10 +92,9 @@ class TrackAhead:
 
 
 def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:
-    """Return the next `distance` metres of a track from a pose (x, y, theta), at points `step` (m) apart.
+    """Return the next `distance` metres from a pose (x, y, theta), at points `step` (m) apart.
 
-    `curves` are the boundaries by label, as far as they are known. SettingsError is raised where a length is
-    out of its range.
+    `curves` are the known boundaries by label. SettingsError where a length is out of its range.
     """
     check_length("step", step)
     if not 0.0 < distance < np.inf:
@@ -118,9 +115,6 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     return _settled(samples[LEFT], samples[RIGHT], line, pose, step, sides)
 
 
-# --- samples of the boundaries ---------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class _Samples:
     """A boundary at n places, map frame; stations count from beside the vehicle."""
@@ -132,13 +126,11 @@ class _Samples:
     confirmed: BoolArray
 
     def beside(self, distance: float) -> Array:
-        """Return the points (k, 2) from beside the vehicle on, along a distance (m)."""
         wanted = (self.station >= -_SETTLED) & (self.station <= distance + _SETTLED)
         return self.points[wanted][::_ACROSS]
 
 
 def _sampled(curve: CurveAhead, distance: float) -> _Samples:
-    """Return samples from behind the vehicle to where the curve is no longer needed."""
     tables = curve.tables
     begin, end = curve.beside - _BEHIND, curve.beside + _OUTER * distance + _BEHIND
     if tables.periodic:
@@ -167,10 +159,7 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
 
 
 def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Return the positions and two derivatives (n, 2) of a cubic from an end (2,) through points (k, 2).
-
-    It begins with the slope of the curve (2,), and has the slopes of Catmull and Rom at the points.
-    """
+    """Return positions and two derivatives (n, 2) of a Catmull-Rom cubic from an end (2,) through points."""
     nodes = np.concatenate([end[None], points])
     edges = np.diff(nodes, axis=0)
     lengths = np.hypot(edges[:, 0], edges[:, 1])
@@ -189,13 +178,8 @@ def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Arra
     return position, (m + x * (2.0 * bend + 3.0 * x * twist)) / h, (2.0 * bend + 6.0 * x * twist) / h**2
 
 
-# --- the first line --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """Points (n, 2) near the centre line, with the stations (n,) of their foot points."""
-
     points: Array
     left: Array
     right: Array
@@ -230,9 +214,6 @@ def _from_beside(line: _Line, position: Array, distance: float, step: float) -> 
     at = begin + step * np.arange(count + 1)
     x, y, u, v = (np.interp(at, lengths, values) for values in (*line.points.T, line.left, line.right))
     return _Line(np.column_stack([x, y]), u, v)
-
-
-# --- on both boundaries ----------------------------------------------------------------------------------
 
 
 def _settled(

@@ -17,26 +17,19 @@ from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
 from .bspline import BSpline, side_of
 
-ROUND_OFF = 1e-9
-"""Largest difference from a knot of parameters that lie on it (m)."""
-SAME_DIRECTION = 0.5
-"""Least cosine of the angle between the curve beside a vehicle and the vehicle's heading."""
+ROUND_OFF = 1e-9  # largest difference from a knot of parameters that lie on it (m)
+SAME_DIRECTION = 0.5  # least cosine of the angle between the curve beside a vehicle and the vehicle's heading
 
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
     """Spacing and smoothness priors of a stretch of control points, by their indices."""
 
-    points: IntArray
-    """(k,) Control points in driving order."""
-    pairs: IntArray
-    """(r, 2) Each row is a control point and the next one."""
-    nominal: Array
-    """(r,) Nominal distance of each pair (m)."""
-    triples: IntArray
-    """(t, 3) Three control points in a row that follow one another."""
-    bending: Array
-    """(t, 3) Coefficients of a triple's second difference in sigmas (1/m)."""
+    points: IntArray  # (k,) control points in driving order
+    pairs: IntArray  # (r, 2) each row is a control point and the next one
+    nominal: Array  # (r,) nominal distance of each pair (m)
+    triples: IntArray  # (t, 3) three control points in a row that follow one another
+    bending: Array  # (t, 3) coefficients of a triple's second difference in sigmas (1/m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +40,11 @@ class Placement:
     differences that the fit assumes to be zero would move them by `by_bend`.
     """
 
-    first: int
-    """Index from which on the fit depends on the known control points."""
-    kept: int
-    """Index before which the control points stay where they are."""
-    by_known: Array
-    """(f, n - first) Derivative of the placed control points by the known ones."""
-    by_target: Array
-    """(f, k) Their derivative by the targets."""
-    by_bend: Array
-    """(f, t) Their derivative by the second differences."""
+    first: int  # index from which on the fit depends on the known control points
+    kept: int  # index before which the control points stay where they are
+    by_known: Array  # (f, n - first) derivative of the placed control points by the known ones
+    by_target: Array  # (f, k) their derivative by the targets
+    by_bend: Array  # (f, t) their derivative by the second differences
 
     def place(self, known: Array, targets: Array) -> Array:
         """Return all control points (n', 2), from the known ones (n, 2) and the targets (k, 2)."""
@@ -67,39 +55,32 @@ class Placement:
 class Boundary:
     """A B-spline that grows until the loop closes; its control points are graph variables.
 
-    An open boundary has uniform, floating (unclamped) knots whose interval is the spacing of its control
-    points, so the parameter is roughly a length in metres, 0 at the first cone.
+    An open one has uniform, floating (unclamped) knots, so that its parameter is about a length in m from the
+    first cone.
     """
 
     def __init__(
         self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings, first: int = 0
     ) -> None:
-        self.first = first
-        """Number of the first control point's key; new knots have keys with new numbers."""
+        self.first = first  # number of the first control point's key; new knots have keys with new numbers
         self.settings = settings
         self.gauge = gauge
         self.degree = settings.degree
         self.periodic = periodic
-        self.confirmed_end = 0.0
-        """Parameter up to which confirmed cones support the curve (m); beyond, it is extrapolated."""
-        self.observed: list[Array] = []
-        """Cones (2,) that the curve was extended through, in m, map frame, as they were placed then."""
-        self.cone_parameters: list[float] = []
-        """Parameter of each of the `observed` cones on the curve (m)."""
+        self.confirmed_end = 0.0  # parameter up to which cones support the curve, not extrapolated (m)
+        self.observed: list[Array] = []  # (2,) cones that the curve was extended through, map frame (m)
+        self.cone_parameters: list[float] = []  # parameter of each of the `observed` cones on the curve (m)
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
     def _set_tables(self, tables: SpanPolynomials) -> None:
         self.tables, knots = tables, tables.knots
         n = len(knots) - self.degree - 1
-        self.size = n - self.degree if self.periodic else n
-        """Number of distinct control points."""
-        self.abscissae = greville(knots, self.degree)[: self.size]
-        """(m,) Greville abscissae of the control points: the parameters about which they act (m)."""
+        self.size = n - self.degree if self.periodic else n  # number of distinct control points
+        self.abscissae = greville(knots, self.degree)[: self.size]  # (m,) where control points act (m)
         following = self.abscissae[1:]
         if self.periodic:
             following = np.append(following, self.abscissae[0] + self.length)
-        self.nominal = following - self.abscissae[: len(following)]
-        """Nominal distance of each control point to the next one (m)."""
+        self.nominal = following - self.abscissae[: len(following)]  # (m) from control point to point
         self.everything = np.arange(self.size)
         self._gauge: Gauge | None = None
 
@@ -110,7 +91,6 @@ class Boundary:
         return self._gauge
 
     def _new_gauge(self, points: IntArray) -> Gauge:
-        """Build the priors: the second differences D are weighted by `1 / (sigma_smoothness spacing)`."""
         whole = self.periodic and len(points) == self.size
         abscissae = self.abscissae[points]
         abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # a stretch past the seam
@@ -166,7 +146,6 @@ class Boundary:
         return joint_foot_points(spans, control_points, points, alone, low, high, *search)
 
     def find_anywhere(self, control_points: Array, points: Array) -> FootPoints:
-        """Search the foot points of points (m, 2) on the whole curve."""
         low, high = (np.full(len(points), end) for end in (self.tables.low, self.tables.high))
         return self.find(control_points, points, low, high)
 
@@ -192,7 +171,6 @@ class Boundary:
         return np.minimum(high, self.trusted)
 
     def evaluate(self, control_points: Array, u: Array, derivative: int = 0) -> Array:
-        """Return S(u) or a derivative of it as (m, 2)."""
         values, span = self.tables.evaluate(np.asarray(u, float), derivative)
         return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
@@ -205,19 +183,17 @@ class Boundary:
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
         """Extend the curve through targets (k, 2) at parameters (k,); return its control points (n', 2).
 
-        Knots are appended until the domain holds the last parameter, the new `confirmed_end`; old basis
-        functions stay. The control points that act only beyond the last cone before are placed again: the
-        direction at the end was a guess.
+        Knots are appended until the domain holds the last parameter, the new `confirmed_end`. Control points
+        that act only beyond the last cone before are placed again: the direction at the end was a guess.
         """
         before = int(np.searchsorted(self.cone_parameters, self.confirmed_end - ROUND_OFF))
         from_u = self.cone_parameters[before - 1] if before else self.confirmed_end
         return self.extend(len(control_points), targets_u, from_u).place(control_points, targets)
 
     def extend(self, old: int, targets_u: Array, from_u: float | None = None) -> Placement:
-        """Extend a curve of `old` control points to targets at parameters (k,), as `grow` does.
+        """Extend a curve of `old` control points to targets at parameters (k,); return how to place them.
 
-        The curve is placed anew from `from_u` on, by default from its confirmed end on; its end stays where
-        it is. Returns how the control points are to be placed.
+        It is placed anew from `from_u` on, by default from its confirmed end on; its end stays where it is.
         """
         spacing = self.settings.spacing
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
@@ -235,12 +211,10 @@ class Boundary:
         return max(int(np.searchsorted(self.knots[:size], u - ROUND_OFF)) - 1, 0)
 
     def move(self, motion: Array) -> None:
-        """Move the observed cones by a rigid motion (3,) of the map frame."""
         if self.observed:
             self.observed = [*move_points(motion, np.array(self.observed))]
 
     def add_cones(self, points: Array, u: Array) -> None:
-        """Add observed cones (k, 2) that the curve has grown through, at parameters (k,) in m."""
         self.observed.extend(points)
         self.cone_parameters.extend(u.tolist())
 
@@ -273,7 +247,6 @@ class Boundary:
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
-    """Return an open boundary of one span, from parameter 0 to the spacing."""
     p = settings.degree
     knots = settings.spacing * np.arange(-p, p + 2, dtype=float)
     return Boundary(knots, False, settings, gauge)
@@ -282,7 +255,7 @@ def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
     """Return the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
 
-    A closed curve is searched everywhere, an open one on its last `room` metres, whose end is the default.
+    A closed curve is searched everywhere, an open one on its last `room` metres, by default its end.
     """
     low, high = boundary.tables.low, boundary.tables.high
     if not boundary.periodic:
@@ -303,12 +276,9 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
 
 
 NO_PATH: Final = np.zeros((0, 2))
-PATH_STEP: Final = 1.0
-"""Step at which a driven path is looked at for crossings with itself (m)."""
-LEVEL_SINE: Final = 0.7
-"""Least sine of the angle of a level crossing: laps over the same road meet at smaller ones."""
-LEVEL_CROSSING: Final = 8.0
-"""Largest distance of the crossing boundaries from where the driven path crosses itself there (m)."""
+PATH_STEP: Final = 1.0  # step at which a driven path is looked at for crossings with itself (m)
+LEVEL_SINE: Final = 0.7  # of the angle of a level crossing, at least: laps over one road meet at less
+LEVEL_CROSSING: Final = 8.0  # largest distance of crossing boundaries from that of the path (m)
 
 
 def sampled(spline: BSpline, step: float) -> Array:
@@ -336,10 +306,7 @@ def at_level_crossing(points: Array, path: Array) -> BoolArray:
 
 
 def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
-    """Return the points (k, 2) where segments of the polyline a (n, 2) cross those of the polyline b (m, 2).
-
-    Only those count whose angle has at least this sine.
-    """
+    """Return the points (k, 2) where two polylines cross at an angle of at least this sine."""
     middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
     reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
     near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)

@@ -19,13 +19,11 @@ from pathspace_graph.factors.bspline import (
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
 
-_PERIODIC_TOLERANCE: Final = 1e-9
-"""Largest difference of repeated values of a periodic spline, over (1 + largest value)."""
+_PERIODIC_TOLERANCE: Final = 1e-9  # of repeated values, over (1 + the largest)
 _GRID_PER_SPAN: Final = 8  # grid points on each span of a foot-point search over the whole curve
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
 _ARC_NEWTON_STEPS: Final = 4  # Newton steps that invert the arc length, from a table with the same grid
-_SHORTEST_EXTENSION: Final = 1e-3
-"""Least knot interval of an extension over the mean one, even if the point is the old end."""
+_SHORTEST_EXTENSION: Final = 1e-3  # knot interval over the mean one, where the point is the end
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -275,33 +273,11 @@ class BSpline:
         return np.concatenate([kept, np.full(self.degree + 1, new_end)])
 
     def extend_to(self, point: Array) -> "BSpline":
-        """Return the curve extended to a point (2,), unchanged on its old domain and clamped at the point.
-
-        The old end is unclamped, and the point becomes the last control point (Hu et al. 2002).
-        """
+        """Return the curve extended to a point (2,), its last control point (Hu et al. 2002)."""
         self._refuse_periodic("extend")
         knots = self.extension_knots(point)
         kept = end_change_matrix(self.knots, self.degree, knots) @ self.control_points
         return BSpline(knots, np.concatenate([kept, np.reshape(point, (1, 2))]), self.degree)
-
-    def grow(self, control_points: Array, interval: float | None = None) -> "BSpline":
-        """Return the curve with control points (k, 2) appended at its floating end.
-
-        No basis function and no other control point changes. Each new point appends a knot, `interval` after
-        the last one (by default the last interval), and the domain advances by one knot. A clamped end would
-        not advance: SettingsError is raised.
-        """
-        self._refuse_periodic("grow")
-        step = self.knots[-1] - self.knots[-2] if interval is None else interval
-        if step <= 0.0:
-            raise SettingsError("a clamped end cannot grow: unclamp it first")
-        added = self.knots[-1] + step * np.arange(1, len(control_points) + 1)
-        knots = np.concatenate([self.knots, added])
-        return BSpline(knots, np.concatenate([self.control_points, control_points]), self.degree)
-
-    def reversed(self) -> "BSpline":
-        """Return the same curve in the opposite direction: S(-u) on [-high, -low]."""
-        return BSpline(-self.knots[::-1], self.control_points[::-1], self.degree, self.periodic)
 
     def covariance_at(self, u: Array, joint_covariance: Array) -> Array:
         """Return cov S(u) = B Sigma B^T (k, 2, 2), cross terms between control points included.
@@ -349,10 +325,7 @@ def end_change_matrix(knots: Array, degree: int, new_knots: Array) -> Array:
 
 
 def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
-    """Return the weights (p + 1,) of a span's control points in the blossom of its polynomial.
-
-    They follow from de Boor's recurrence, with another argument at each level.
-    """
+    """Return the weights (p + 1,) of a span's control points in its blossom, by de Boor's recurrence."""
     weights = np.eye(degree + 1)
     for r, x in enumerate(arguments, start=1):
         lower = knots[span - degree + r : span + 1]

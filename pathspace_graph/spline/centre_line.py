@@ -18,12 +18,9 @@ from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline, side_of
 
-SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}
-"""Side of the centre line on which the edge of each label is."""
-SAMPLE_STEP: Final = 0.5
-"""Distance of the samples of boundaries, of lines, and of edges that are fitted (m)."""
-_EDGE_BREAKS: Final = 2
-"""Knot intervals of an edge for each one of the ribbon, since it is no B-spline itself."""
+SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line on which the edge of each label is
+SAMPLE_STEP: Final = 0.5  # distance of the samples of boundaries, of lines, and of edges that are fitted (m)
+_EDGE_BREAKS: Final = 2  # knot intervals of an edge for each of the ribbon: it is no B-spline itself
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -37,7 +34,6 @@ class Ribbon(BSpline):
 
     @cached_property
     def centre(self) -> BSpline:
-        """The centre line alone."""
         centre = BSpline(self.knots, self.control_points[:, :2], self.degree, self.periodic)
         centre.__dict__["tables"] = self.tables
         return centre
@@ -90,22 +86,17 @@ class Ribbon(BSpline):
 
 # --- the line between two boundaries ---------------------------------------------------------------------
 
-SPACING: Final = 3.0
-"""Distance of the knots of a planner's line (m); shorter kinks of the boundaries are smoothed."""
-MOST_SAMPLES: Final = 200_000
-"""Largest number of samples of a boundary, which bounds the memory."""
+SPACING: Final = 3.0  # of the knots of a planner's line (m); shorter kinks are smoothed
+MOST_SAMPLES: Final = 200_000  # largest number of samples of a boundary, which bounds the memory
 _FEWEST: Final = 4  # smallest number of samples of a boundary and of knot intervals of a line
 _STARTS: Final = 200  # number of samples of the left boundary among which the march begins
 _NEAR: Final = 12  # distance in samples from a pair within which segments are tested for a crossing
-_ROUNDS: Final = 3
-"""Number of times that the line is moved to the middle between the crossings of its normals."""
-_SMOOTHNESS: Final = 1e-3
-"""Weight of second differences in the fit, which decides only what the samples leave open."""
+_ROUNDS: Final = 3  # moves of the line to the middle between the crossings of its normals
+_SMOOTHNESS: Final = 1e-3  # weight of second differences, for what the samples leave open
 _CROSSING_STEPS: Final = 8  # number of Newton steps to the crossing of a normal and a boundary
 _CROSSED: Final = 1e-6  # distance of the point found from a boundary below which a normal crosses it (m)
 _LEAST_COSINE: Final = 0.1  # least cosine of the angle between boundary and line at a crossing
-_FARTHEST: Final = 1.5
-"""Distance of a crossing, over that of the paired sample, beyond which it belongs to another stretch."""
+_FARTHEST: Final = 1.5  # of a crossing over the paired sample; beyond, it is of another stretch
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,16 +104,12 @@ class CentreCurve:
     """A ribbon between two boundaries, with samples that lead from its parameter to theirs."""
 
     ribbon: Ribbon
-    u: Array
-    """(k,) Parameters of the ribbon, about evenly spaced; those of a loop end before its beginning."""
-    sides: tuple[BSpline, BSpline]
-    """Left and right boundary."""
-    beside: tuple[Array, Array]
-    """(k,) Their parameters beside each sample, not wrapped."""
+    u: Array  # (k,) parameters of the ribbon, about evenly spaced; those of a loop end before its beginning
+    sides: tuple[BSpline, BSpline]  # left and right boundary
+    beside: tuple[Array, Array]  # (k,) their parameters beside each sample, not wrapped
 
     @property
     def size(self) -> int:
-        """Number of control points of both boundaries."""
         return self.sides[0].size + self.sides[1].size
 
     def table(self, side: int) -> Array:
@@ -142,7 +129,6 @@ class CentreCurve:
         return np.interp(u, table[:, 0], table[:, 1])
 
     def crossings(self, u: Array) -> "list[Crossing]":
-        """Return where the normals at parameters u (k,) of the line cross the left and the right boundary."""
         found = []
         for side, spline in enumerate(self.sides):
             own, at = self.table(side).T
@@ -171,14 +157,10 @@ class Crossing:
     """The points where normals of a line cross a boundary."""
 
     spline: BSpline
-    u: Array
-    """(k,) Parameters of the boundary, not wrapped; of the sample beside where a normal misses it."""
-    normal: Array
-    """(k, 2) Unit normals of the line, to the left."""
-    offset: Array
-    """(k,) Signed distance along the normal, positive to the left (m)."""
-    good: BoolArray
-    """(k,) Whether the normal crosses the boundary there."""
+    u: Array  # (k,) parameters of the boundary, not wrapped; of the sample beside where a normal misses it
+    normal: Array  # (k, 2) unit normals of the line, to the left
+    offset: Array  # (k,) signed distance along the normal, positive to the left (m)
+    good: BoolArray  # (k,) whether the normal crosses the boundary there
 
     @cached_property
     def own_normal(self) -> Array:
@@ -199,11 +181,9 @@ class Crossing:
 def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPACING) -> CentreCurve:
     """Return the line between two boundaries, on knots about `spacing` (m) apart.
 
-    Samples of both boundaries are paired along the strip between them, always over the shorter diagonal. A
-    ribbon is fitted to the middles of the pairs. Then each sample is moved to the middle between the points
-    where its normal crosses the boundaries, and the ribbon is fitted again. An open line leads from where
-    both boundaries begin to where both end. SettingsError is raised where a boundary is too long, the left
-    one is not on the left, or they cross.
+    Samples of both are paired along the strip between them, always over the shorter diagonal. A ribbon is
+    fitted to the middles, then to the middles between the crossings of its normals with the boundaries. An
+    open line ends where both end. SettingsError where a boundary is too long, or they cross or change sides.
     """
     longest = max(left.length(), right.length())
     if not longest <= MOST_SAMPLES * SAMPLE_STEP:
@@ -273,7 +253,6 @@ class _Fit:
         self._factor: SuperLU = splu(csc_array(self._basis.T @ self._basis + _SMOOTHNESS**2 * (D.T @ D)))
 
     def solve(self, values: Array) -> Array:
-        """Return the control points (m, d) nearest to values (k, d)."""
         return np.asarray(self._factor.solve(np.asarray(self._basis.T @ values)))
 
 
@@ -281,7 +260,6 @@ class _Fit:
 
 
 def _samples(spline: BSpline, closed: bool) -> Array:
-    """Return parameters (k,) evenly spaced by arc length, without the last one of a loop."""
     length = spline.length()
     count = max(int(np.ceil(length / SAMPLE_STEP)), _FEWEST)
     return spline.parameters_at(np.linspace(0.0, length, count + 1)[: count if closed else None])
@@ -386,7 +364,6 @@ def _check_apart(lefts: Array, rights: Array, i: IntArray, j: IntArray, closed: 
 
 
 def _segments(points: Array, index: IntArray, closed: bool) -> tuple[Array, Array]:
-    """Return both ends of the segments that begin at some indices; beyond an open end they are points."""
     if closed:
         return points[index % len(points)], points[(index + 1) % len(points)]
     last = len(points) - 1

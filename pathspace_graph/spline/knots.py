@@ -16,16 +16,15 @@ from pathspace_graph.spline.bspline import BSpline
 
 _SAMPLES_PER_BREAK: Final = 40  # equally spaced samples of the curvature for each requested break
 _SAMPLES_PER_SPAN: Final = 8  # least-squares samples of a refit on each span: enough for any degree up to 7
-_BRIDGE: Final = 1e-3
-"""Weight of second derivatives beside the samples of a refit, on spans that have too few samples."""
+_BRIDGE: Final = 1e-3  # weight of second derivatives on spans with too few samples of a refit
 _BENDING_PER_SPAN: Final = 3  # places on each such span at which the second derivative is taken
 
 
 def quantile_breaks(u: Array, curvature: Array, count: int, settings: BreakSettings) -> Array:
     """Return breaks (count + 1,) at equal quantiles of (1 - b) |kappa| / sum |kappa| + b / N.
 
-    The N intervals between the increasing parameters u (N + 1,) have equal lengths; kappa (N,) is their
-    curvature in 1/m, and b is the linear baseline. SettingsError is raised if `count` is less than 1.
+    The N equally long intervals between parameters u (N + 1,) have curvature kappa (N,) in 1/m; b is the
+    linear baseline. SettingsError if `count` is less than 1.
     """
     if count < 1:
         raise SettingsError(f"at least one knot interval is needed, not {count}")
@@ -44,9 +43,8 @@ def curvature_weighted_breaks(
 ) -> Array:
     """Return breaks (count + 1,) in the spline's own parameter between low and high (default: its domain).
 
-    The paper's Simplification: the curvature at equal distances along the curve, plus the linear baseline, is
-    a density, and the knots are its quantiles. An open curve counts as straight beyond its ends.
-    SettingsError is raised if the stretch is empty.
+    The curvature at equal distances, plus the linear baseline, is a density, and the knots are its quantiles
+    (paper: Simplification). An open curve is straight beyond its ends. SettingsError on an empty stretch.
     """
     first, last = spline.domain
     low, high = first if low is None else low, last if high is None else high
@@ -77,10 +75,8 @@ def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Arra
 class Refit:
     """Change of basis between an old and a new spline; it is the same for both coordinates."""
 
-    new_from_old: Array
-    """(m_new, m_old) Matrix F that fits the new curve to samples of the old one: C_new = F C_old."""
-    old_from_new: Array
-    """(m_old, m_new) Matrix E that fits the old curve to samples of the new one: C_old ~ E C_new."""
+    new_from_old: Array  # (m_new, m_old) F of the least-squares fit C_new = F C_old
+    old_from_new: Array  # (m_old, m_new) E of the least-squares fit C_old ~ E C_new
 
 
 def refit(
@@ -91,9 +87,9 @@ def refit(
 ) -> Refit:
     """Fit the bases of two splines to each other; only the knots of `new` are used, not its control points.
 
-    `u_map` maps increasing parameters of the old spline to those of the new one (default: the same), wrapped
-    if that is periodic. Where the new domain has no sample, F fills the gap smoothly. What lies outside the
-    parameters `within` of the old spline doesn't count for F.
+    `u_map` maps increasing parameters of the old to those of the new one (default: the same). Where the new
+    domain has no sample, F fills the gap smoothly. What is not `within` these old parameters counts for E
+    only.
     """
     u = _refit_samples(old, new)
     inside = (u >= within[0]) & (u <= within[1])
@@ -143,10 +139,9 @@ def fit_spline(
 ) -> BSpline:
     """Fit a spline of `size` distinct control points to ordered points (k, 2) in m, by least squares.
 
-    Parameters begin as chord lengths and move to the foot points. Knots follow the curvature, unless `breaks`
-    are given (in chord lengths). The fit with the smallest rmse is returned; a weak bending energy makes two
-    points enough (three for a periodic curve). SettingsError is raised if there are fewer distinct points, or
-    too few control points for the degree.
+    Parameters move from chord lengths to the foot points, knots to the curvature unless `breaks` are given,
+    and the fit with the smallest rmse is returned. Bending energy makes two points enough, or three on a
+    loop. SettingsError where there are fewer, or too few control points for the degree.
     """
     settings = FitSettings() if settings is None else settings
     u, high = _chord_lengths(points, periodic)
@@ -165,7 +160,6 @@ def fit_spline(
 
 
 def _chord_lengths(points: Array, periodic: bool) -> tuple[Array, float]:
-    """Return the chord length (k,) from the first point to each point, and that of the whole curve."""
     following = np.roll(points, -1, axis=0) if periodic else points[1:]
     chords = np.linalg.norm(following - points[: len(following)], axis=1)
     along = np.concatenate([[0.0], np.cumsum(chords)])
@@ -177,7 +171,6 @@ def _chord_lengths(points: Array, periodic: bool) -> tuple[Array, float]:
 def _fit_on(
     points: Array, u: Array, breaks: Array, periodic: bool, settings: FitSettings
 ) -> tuple[BSpline, Array, float]:
-    """Fit on given breaks and refresh foot points; return spline, parameters (k,) and rmse (m)."""
     frame = _frame(breaks, periodic, settings.degree)
     bending = np.sqrt(settings.smoothness) * energy_rows(frame)
     zeros = np.zeros((len(bending), 2))
@@ -206,25 +199,19 @@ def energy_rows(spline: BSpline) -> Array:
 # --- knots where cones ask for them ----------------------------------------------------------------------
 
 
-EVEN: Final = 1e-9
-"""Weight of the square of the interval (m^2) that a removal leaves against its cost (m^2), for ties."""
-MARGIN: Final = 0.1
-"""Least share by which the sum of squares of a smaller curve must be smaller for it to be chosen."""
-COINCIDENT: Final = 1e-9
-"""Largest difference of parameters of cones that share one knot (m); the cost of a second would be 0 / 0."""
+EVEN: Final = 1e-9  # weight of the square of the interval left by a removal against its cost, for ties
+MARGIN: Final = 0.1  # least share by which a smaller curve's sum of squares must be smaller
+COINCIDENT: Final = 1e-9  # difference of parameters of cones that share one knot (m), lest 0 / 0
 
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
     """Least-squares spline through ordered points, after the removal of some knots."""
 
-    breaks: Array
-    """(b + 1,) Knots that remain, in the parameter of the points (m)."""
+    breaks: Array  # (b + 1,) knots that remain, in the parameter of the points (m)
     size: int
-    residual: Array
-    """(k, 2) Offset from the spline to each point, at the point's parameter (m)."""
-    leverage: Array
-    """(k,) Share of each point in the curve there: the diagonal of the hat matrix."""
+    residual: Array  # (k, 2) offset from the spline to each point, at the point's parameter (m)
+    leverage: Array  # (k,) share of each point in the curve there: the diagonal of the hat matrix
 
     @property
     def crossed(self) -> float:
@@ -235,9 +222,8 @@ class Thinned:
 def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, most: int) -> Thinned:
     """Choose, among the curves of `thin` with `least` to `most` control points, by cross-validation.
 
-    The largest curve is chosen, unless a smaller one predicts a point left out better by `MARGIN`. BIC, `n
-    log(rss / n) + p log(n)`, took a knot for every cone on all 22 boundaries of eleven tracks: rss vanishes.
-    Knots by curvature leave 0.107 m to cones with 3 cm of noise, these 0.066 m at the same size.
+    The largest is chosen, unless a smaller one predicts a point left out better by `MARGIN`. BIC takes a knot
+    for every cone, since rss vanishes; knots by curvature leave 0.107 m to cones where these leave 0.066 m.
     """
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
@@ -285,7 +271,6 @@ def thin(
 
 
 def _breaks(u: Array, high: float) -> Array:
-    """Return the distinct parameters among 0, u (k,) and `high`."""
     inner = np.unique(u[(u > COINCIDENT) & (u < high - COINCIDENT)])
     inner = inner[np.diff(inner, prepend=0.0) > COINCIDENT]
     return np.concatenate([[0.0], inner, [high]])

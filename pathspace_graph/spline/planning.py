@@ -120,13 +120,8 @@ def _square(speed: float | None) -> float:
     return speed**2
 
 
-# --- the sampled centre line -----------------------------------------------------------------------------
-
-
-LEAST_STEP: Final = 0.01
-"""Least distance of the points of a line (m)."""
-MOST_POINTS: Final = 200_000
-"""Largest number of points of a line, which bounds the memory."""
+LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
+MOST_POINTS: Final = 200_000  # largest number of points of a line, which bounds the memory
 _FEWEST: Final = 4  # smallest number of points of a line
 _NEIGHBOURS: Final = 10  # number of points apart up to which normals must not cross
 _SHORT: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
@@ -193,11 +188,10 @@ def check_length(name: str, length: float) -> None:
 def centre_line(
     left: BSpline, right: BSpline, covariance: Array | None, closed: bool, step: float
 ) -> CentreLine:
-    """Return the centre line between two boundaries at points `step` (m) apart, see `find_line`.
+    """Return the centre line between two boundaries at points about `step` (m) apart, see `find_line`.
 
-    A line has a whole number of steps, as near to `step` as can be. The joint covariance is of the distinct
-    control points of the left and then the right boundary, in the order x0, y0, x1, y1 and so on (m^2). It is
-    propagated to first order. SettingsError is raised where the step is out of its range, and by `find_line`.
+    The joint covariance of the control points of the left and then the right boundary, in the order x0, y0,
+    x1 and so on (m^2), is propagated to first order. SettingsError where the step is out of its range.
     """
     check_length("step", step)
     most, longest = MOST_POINTS * step, max(left.length(), right.length())
@@ -253,9 +247,6 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
             np.minimum.at(width, i[meet], _SHORT * np.abs(a[meet]))
             np.minimum.at(width, j[meet], _SHORT * np.abs(b[meet]))
     return [left, right]
-
-
-# --- standard deviations ---------------------------------------------------------------------------------
 
 
 def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: Array | None) -> list[Array]:

@@ -100,14 +100,14 @@ def test_a_ribbon_is_found_again_from_its_own_edges() -> None:
     ribbon = ring_ribbon()
     covariance = 0.01**2 * np.eye(3 * ribbon.size)
     track = map_of(ribbon, covariance, SIGMA, {})
-    fitted = ribbon_of(track, SETTINGS)
+    fitted, known, _ = ribbon_of(track, SETTINGS)
     u = np.linspace(0.0, ribbon.tables.high, 100)
-    radius = np.hypot(*fitted.ribbon.centre.evaluate(u).T)
+    radius = np.hypot(*fitted.centre.evaluate(u).T)
     np.testing.assert_allclose(radius, 20.0, atol=0.01)
-    width = fitted.ribbon.half_width(u)
+    width = fitted.half_width(u)
     np.testing.assert_allclose(width, 2.0, atol=0.01)
-    assert fitted.covariance is not None
-    again = map_of(fitted.ribbon, fitted.covariance, 0.0, {})
+    assert known is not None
+    again = map_of(fitted, known, 0.0, {})
     for label in BOUNDARIES:
         sigmas = []
         for one in (track, again):
@@ -122,9 +122,9 @@ def test_an_outline_has_no_covariance() -> None:
     bare = Map(
         True, {b: replace(ring_map().curve(b, "a test"), covariance=np.zeros((0, 0))) for b in BOUNDARIES}
     )
-    fitted = ribbon_of(bare, SETTINGS)
-    assert fitted.covariance is None
-    edges = map_of(fitted.ribbon, None, SIGMA, {})
+    fitted, covariance, _ = ribbon_of(bare, SETTINGS)
+    assert covariance is None
+    edges = map_of(fitted, None, SIGMA, {})
     boundary = edges.boundaries[RIGHT]
     assert isinstance(boundary, SplineBoundary)
     assert boundary.covariance.shape == (0, 0)

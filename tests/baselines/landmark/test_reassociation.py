@@ -22,8 +22,7 @@ from .scenes import normal_equations_of, oracle_system
 
 
 def reassociate(system: LandmarkSystem, state: LandmarkState) -> None:
-    problem = system.eliminated(state)
-    Reassociation(state, system.detections, problem, system.settings, system.chain.stamps).run()
+    Reassociation(state, system, system.settings).run()
 
 
 @pytest.fixture
