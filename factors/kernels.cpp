@@ -461,44 +461,117 @@ class RowColumns {
   std::vector<Index> wanted_, begin_, columns_;
 };
 
-void add_rows(Columns hessian, Array gradient, const Ints& keys, const Ints& starts, const Ints& sought,
-              const Ints& key, const Ints& entry, const Array& jacobian, const Array& residual,
-              const Array& change) {
-  const Index rows = jacobian.shape(0), width = jacobian.shape(1), n = gradient.shape(0);
-  expect(hessian.size() == n * n && change.size() == n && residual.size() == rows);
-  expect(sought.shape(0) == rows && key.size() == width);
-  double* H = hessian.mutable_data();
-  double* g = gradient.mutable_data();
-  RowColumns columns(keys, starts, sought, key, entry);
-  for (Index i = 0; i < rows; ++i) {
+// Rows of one pattern: the keys of each, and the key and the entry that each of its columns is by.
+struct Rows {
+  explicit Rows(const py::handle& rows) {
+    const py::tuple own = rows.cast<py::tuple>();
+    sought = own[0].cast<Ints>(), key = own[1].cast<Ints>(), entry = own[2].cast<Ints>();
+    jacobian = own[3].cast<Array>(), residual = own[4].cast<Array>();
+    expect(sought.shape(0) == size() && jacobian.size() == size() * width());
+  }
+  Index size() const { return residual.shape(0); }
+  Index width() const { return key.shape(0); }
+  bool same_keys(Index row, Index other) const {
+    const Index k = sought.shape(1);
+    return std::equal(sought.data() + row * k, sought.data() + (row + 1) * k, sought.data() + other * k);
+  }
+
+  Ints sought, key, entry;
+  Array jacobian, residual;
+};
+
+void add_rows(double* H, double* g, Index n, const Rows& rows, const Ints& keys, const Ints& starts,
+              const double* change) {
+  RowColumns columns(keys, starts, rows.sought, rows.key, rows.entry);
+  const Index width = rows.width();
+  std::vector<Index> places(width * (width + 1) / 2);
+  for (Index i = 0; i < rows.size(); ++i) {
     const std::vector<Index>& at = columns.known(i);
-    const double* J = jacobian.data() + i * width;
-    double r = residual.data()[i];
-    for (Index a = 0; a < width; ++a) r += J[a] * change.data()[at[a]];
+    const double* J = rows.jacobian.data() + i * width;
+    if (i == 0 || !rows.same_keys(i, i - 1))
+      for (Index a = 0, k = 0; a < width; ++a)
+        for (Index b = 0; b <= a; ++b, ++k) places[k] = std::max(at[a], at[b]) + std::min(at[a], at[b]) * n;
+    double r = rows.residual.data()[i];
+    for (Index a = 0; a < width; ++a) r += J[a] * change[at[a]];
+    const Index* place = places.data();
     for (Index a = 0; a < width; ++a) {
       g[at[a]] -= J[a] * r;
-      for (Index b = 0; b <= a; ++b) {
-        const Index high = std::max(at[a], at[b]), low = std::min(at[a], at[b]);
-        H[high + low * n] += J[a] * J[b];
-      }
+      for (Index b = 0; b <= a; ++b) H[*place++] += J[a] * J[b];
     }
   }
 }
 
-void add_prior(Columns hessian, Array gradient, const Columns& information, const Array& vector,
-               const Ints& entries, const Array& change) {
-  const Index n = gradient.shape(0), m = entries.shape(0);
-  expect(hessian.size() == n * n && change.size() == n && vector.size() == m && information.size() == m * m);
-  const Index* at = entries.data();
+// Add a factor with `[[L, g], [g', f]]` on some keys.
+void add_factor(double* H, double* g, Index n, const Ints& sought, const Columns& matrix, const Ints& keys,
+                const Ints& starts, const Ints& widths, const double* change) {
+  std::vector<Index> at;
+  for (Index k = 0; k < sought.shape(0); ++k) {
+    const Index place = std::lower_bound(keys.data(), keys.data() + keys.shape(0), sought.data()[k]) - keys.data();
+    if (place == keys.shape(0) || keys.data()[place] != sought.data()[k])
+      throw py::value_error("expected a prior on known variables, found others");
+    for (Index j = 0; j < widths.data()[place]; ++j) at.push_back(starts.data()[place] + j);
+  }
+  const Index m = static_cast<Index>(at.size());
+  expect(matrix.size() == (m + 1) * (m + 1));
+  const double* vector = matrix.data() + m * (m + 1);
+  for (Index a = 0; a < m; ++a) g[at[a]] += vector[a];
+  for (Index b = 0; b < m; ++b) {
+    const double* column = matrix.data() + b * (m + 1);
+    const double by = change[at[b]];
+    for (Index a = 0; a < m; ++a) g[at[a]] -= column[a] * by;
+    for (Index a = b; a < m; ++a) H[std::max(at[a], at[b]) + std::min(at[a], at[b]) * n] += column[a];
+  }
+}
+
+py::tuple summed(const Ints& keys, const Ints& starts, const Ints& widths, const py::list& factors,
+                 const py::list& groups, const Array& change) {
+  const Index n = change.shape(0);
+  Columns hessian(Shape{n, n});
+  Array gradient(n);
   double* H = hessian.mutable_data();
   double* g = gradient.mutable_data();
-  for (Index a = 0; a < m; ++a) g[at[a]] += vector.data()[a];
-  for (Index b = 0; b < m; ++b) {
-    const double* column = information.data() + b * m;
-    const double by = change.data()[at[b]];
-    for (Index a = 0; a < m; ++a) g[at[a]] -= column[a] * by;
-    for (Index a = b; a < m; ++a) H[at[a] + at[b] * n] += column[a];
+  std::fill_n(H, n * n, 0.0);
+  std::fill_n(g, n, 0.0);
+  expect(starts.size() == keys.size() && widths.size() == keys.size());
+  for (const py::handle& factor : factors) {
+    const py::tuple own = factor.cast<py::tuple>();
+    add_factor(H, g, n, own[0].cast<Ints>(), own[1].cast<Columns>(), keys, starts, widths, change.data());
   }
+  for (const py::handle& rows : groups) add_rows(H, g, n, Rows(rows), keys, starts, change.data());
+  return py::make_tuple(hessian, gradient);
+}
+
+// The rows `[A b]` of some groups on the variables that they hold, and the places of these variables.
+py::tuple block_of(const Ints& keys, const Ints& widths, const py::list& groups) {
+  std::vector<Rows> all(groups.begin(), groups.end());
+  Index height = 0, width = 0;
+  std::vector<Index> first(keys.shape(0), -1), held;
+  const auto place_of = [&](Index key) {
+    const Index place = std::lower_bound(keys.data(), keys.data() + keys.shape(0), key) - keys.data();
+    if (place == keys.shape(0) || keys.data()[place] != key)
+      throw py::value_error("expected rows on known variables, found others");
+    return place;
+  };
+  for (const Rows& rows : all) {
+    height += rows.size();
+    for (Index i = 0; i < rows.sought.size(); ++i) first[place_of(rows.sought.data()[i])] = 0;
+  }
+  for (Index k = 0; k < keys.shape(0); ++k)
+    if (first[k] == 0) held.push_back(k), first[k] = width, width += widths.data()[k];
+  Columns block(Shape{height, width + 1});
+  double* at = block.mutable_data();
+  std::fill_n(at, height * (width + 1), 0.0);
+  for (const Rows& rows : all)
+    for (Index i = 0; i < rows.size(); ++i, ++at) {
+      const Index* own = rows.sought.data() + i * rows.sought.shape(1);
+      Index key = -1, begin = 0;
+      for (Index j = 0; j < rows.width(); ++j) {
+        if (rows.key.data()[j] != key) key = rows.key.data()[j], begin = first[place_of(own[key])];
+        at[(begin + rows.entry.data()[j]) * height] = rows.jacobian.data()[i * rows.width() + j];
+      }
+      at[width * height] = -rows.residual.data()[i];
+    }
+  return py::make_tuple(Ints(Shape{static_cast<Index>(held.size())}, held.data()), block);
 }
 
 Ints columns_of(const Ints& keys, const Ints& starts, const Ints& sought, const Ints& key,
@@ -528,49 +601,78 @@ Array moved_residual(const Ints& keys, const Ints& starts, const Ints& sought, c
   return out;
 }
 
-py::tuple parted(const Ints& keys, const Array& jacobian, const Array& residual, const Ints& owner,
-                 const Ints& gone) {
-  const Index rows = owner.shape(0), k = keys.shape(1), width = jacobian.shape(1);
-  expect(keys.shape(0) == rows && jacobian.shape(0) == rows && residual.size() == rows);
-  std::vector<bool> goes(rows);
-  Index count = 0;
-  for (Index i = 0; i < rows; ++i) {
-    goes[i] = std::binary_search(gone.data(), gone.data() + gone.shape(0), owner.data()[i]);
-    count += goes[i];
+// Columns of rows: keys, derivatives, residuals and owners.
+struct Kept {
+  explicit Kept(const py::tuple& rows)
+      : keys(rows[0].cast<Ints>()), jacobian(rows[1].cast<Array>()), residual(rows[2].cast<Array>()),
+        owner(rows[3].cast<Ints>()) {
+    expect(keys.shape(0) == size() && jacobian.shape(0) == size() && residual.size() == size());
   }
-  py::tuple out(8);
-  for (const bool which : {false, true}) {
-    const Index size = which ? count : rows - count;
-    Ints own_keys(Shape{size, k}), own_owner(size);
-    Array own_jacobian(Shape{size, width}), own_residual(size);
-    Index* to_keys = own_keys.mutable_data();
-    Index* to_owner = own_owner.mutable_data();
-    double* to_jacobian = own_jacobian.mutable_data();
-    double* to_residual = own_residual.mutable_data();
-    for (Index i = 0; i < rows; ++i) {
-      if (goes[i] != which) continue;
-      to_keys = std::copy_n(keys.data() + i * k, k, to_keys);
-      to_jacobian = std::copy_n(jacobian.data() + i * width, width, to_jacobian);
-      *to_residual++ = residual.data()[i];
-      *to_owner++ = owner.data()[i];
-    }
-    const int at = which ? 4 : 0;
-    out[at] = own_keys, out[at + 1] = own_jacobian, out[at + 2] = own_residual, out[at + 3] = own_owner;
+  Kept(Index rows, Index k, Index width)
+      : keys(Shape{rows, k}), jacobian(Shape{rows, width}), residual(rows), owner(rows) {}
+
+  Index size() const { return owner.shape(0); }
+  void set(Index at, const Kept& from, Index row) {
+    const Index k = keys.shape(1), width = jacobian.shape(1);
+    std::copy_n(from.keys.data() + row * k, k, keys.mutable_data() + at * k);
+    std::copy_n(from.jacobian.data() + row * width, width, jacobian.mutable_data() + at * width);
+    residual.mutable_data()[at] = from.residual.data()[row];
+    owner.mutable_data()[at] = from.owner.data()[row];
   }
-  return out;
+  py::tuple columns() const { return py::make_tuple(keys, jacobian, residual, owner); }
+
+  Ints keys;
+  Array jacobian, residual;
+  Ints owner;
+};
+
+std::vector<bool> owned_by(const Kept& rows, const Ints& owners) {
+  std::vector<bool> is(rows.size());
+  for (Index i = 0; i < rows.size(); ++i)
+    is[i] = std::binary_search(owners.data(), owners.data() + owners.shape(0), rows.owner.data()[i]);
+  return is;
 }
 
-py::array_t<bool> rows_holding(const Ints& keys, const Ints& ascending) {
+py::tuple parted(const py::tuple& rows, const Ints& gone) {
+  const Kept all(rows);
+  const std::vector<bool> goes = owned_by(all, gone);
+  const Index count = std::count(goes.begin(), goes.end(), true);
+  Kept stay(all.size() - count, all.keys.shape(1), all.jacobian.shape(1));
+  Kept leave(count, all.keys.shape(1), all.jacobian.shape(1));
+  for (Index i = 0, kept = 0; i < all.size(); ++i)
+    goes[i] ? leave.set(i - kept, all, i) : stay.set(kept++, all, i);
+  return py::make_tuple(stay.columns(), leave.columns());
+}
+
+py::tuple replaced(const py::tuple& rows, const Ints& gone, const py::tuple& fresh, const Ints& keys,
+                   const Ints& starts, const Ints& key, const Ints& entry, const Array& change) {
+  const Kept old(rows), added(fresh);
+  const std::vector<bool> goes = owned_by(old, gone);
+  const Array residual = moved_residual(keys, starts, added.keys, key, entry, added.jacobian, added.residual, change);
+  Index at = old.size() - std::count(goes.begin(), goes.end(), true);
+  Kept out(at + added.size(), added.keys.shape(1), added.jacobian.shape(1));
+  for (Index i = 0; i < added.size(); ++i) {
+    out.set(at + i, added, i);
+    out.residual.mutable_data()[at + i] = residual.data()[i];
+  }
+  at = 0;
+  for (Index i = 0; i < old.size(); ++i)
+    if (!goes[i]) out.set(at++, old, i);
+  return out.columns();
+}
+
+Ints owners_holding(const Ints& keys, const Ints& owner, const Ints& ascending) {
   const Index rows = keys.shape(0), k = keys.shape(1);
   const Index* first = ascending.data();
   const Index* last = first + ascending.shape(0);
-  py::array_t<bool> out(rows);
+  std::vector<Index> found;
+  expect(owner.size() == rows);
   for (Index i = 0; i < rows; ++i) {
     const Index* own = keys.data() + i * k;
-    out.mutable_data()[i] =
-        std::any_of(own, own + k, [&](Index key) { return std::binary_search(first, last, key); });
+    if (std::any_of(own, own + k, [&](Index one) { return std::binary_search(first, last, one); }))
+      found.push_back(owner.data()[i]);
   }
-  return out;
+  return Ints(Shape{static_cast<Index>(found.size())}, found.data());
 }
 
 py::tuple relative_rows(const Array& root, const Array& right, const Array& local, const Array& values,
@@ -617,6 +719,19 @@ Ints spread(const Ints& starts, const Ints& widths) {
   for (Index i = 0; i < count; ++i)
     for (Index j = 0; j < widths.data()[i]; ++j) *at++ = starts.data()[i] + j;
   return out;
+}
+
+py::tuple laid_out(const Ints& keys, Index sensor_key, Index first_pose, const py::tuple& sizes) {
+  const Index count = keys.shape(0);
+  const Index point = sizes[0].cast<Index>(), sensor = sizes[1].cast<Index>(), pose = sizes[2].cast<Index>();
+  Ints widths(count), starts(count);
+  Index total = 0;
+  for (Index i = 0; i < count; ++i) {
+    const Index key = keys.data()[i];
+    starts.mutable_data()[i] = total;
+    total += widths.mutable_data()[i] = key >= first_pose ? pose : key == sensor_key ? sensor : point;
+  }
+  return py::make_tuple(widths, starts, total);
 }
 
 // --- detections -------------------------------------------------------------------------------------------
@@ -1121,15 +1236,14 @@ PYBIND11_MODULE(_kernels, module) {
   module.doc() = "Kernels over rows; pathspace_graph.factors.kernels says which functions they take the place of.";
   module.def("searched", &searched);
   module.def("refined", &refined);
-  module.def("add_rows", &add_rows, py::arg("hessian").noconvert(), py::arg("gradient").noconvert(),
-             py::arg("keys"), py::arg("starts"), py::arg("sought"), py::arg("key"), py::arg("entry"),
-             py::arg("jacobian"), py::arg("residual"), py::arg("change"));
-  module.def("add_prior", &add_prior, py::arg("hessian").noconvert(), py::arg("gradient").noconvert(),
-             py::arg("information"), py::arg("vector"), py::arg("entries"), py::arg("change"));
+  module.def("summed", &summed);
+  module.def("block_of", &block_of);
   module.def("moved_residual", &moved_residual);
   module.def("parted", &parted);
   module.def("relative_rows", &relative_rows);
-  module.def("rows_holding", &rows_holding);
+  module.def("replaced", &replaced);
+  module.def("owners_holding", &owners_holding);
+  module.def("laid_out", &laid_out);
   module.def("columns_of", &columns_of);
   module.def("by_sensor", &by_sensor);
   module.def("shifted", &shifted);

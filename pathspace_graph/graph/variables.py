@@ -62,6 +62,7 @@ def letter_keys(letter: str) -> tuple[int, int]:
 
 FIRST_POSE: Final = letter_keys(POSE_LETTER)[0]
 """Poses have the last keys: every key from this one on belongs to a pose."""
+_SIZES: Final = (POINT, SENSOR_SIZE, POSE)
 ORIGIN_KEY: Final = int(gtsam.symbol("y", 0))
 """Key of the origin of the map frame, which is a pose at (0, 0, 0) by definition."""
 _FIRST_LANDMARK: Final = letter_keys(LANDMARK_LETTER)[0]
@@ -105,8 +106,21 @@ def are_poses(keys: IntArray) -> BoolArray:
 
 def sizes(keys: IntArray) -> IntArray:
     """Return the number of entries of each key's variable, which its letter determines."""
-    wider = (POSE - POINT) * are_poses(keys) + (SENSOR_SIZE - POINT) * (keys == SENSOR_KEY)
-    return np.asarray(POINT + wider)
+    return _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES)[0]
+
+
+@compiled
+def _laid_out(
+    keys: IntArray, sensor_key: int, first_pose: int, sizes: tuple[int, int, int]
+) -> tuple[IntArray, IntArray, int]:
+    """Return the widths (k,) and the first columns (k,) of variables, and their number of columns.
+
+    The sizes are those of a point, of the sensor's calibration, and of a pose.
+    """
+    point, sensor, pose = sizes
+    widths = np.where(keys >= first_pose, pose, np.where(keys == sensor_key, sensor, point))
+    ends = widths.cumsum()
+    return widths, ends - widths, int(widths.sum())
 
 
 def name(key: int) -> str:
@@ -133,12 +147,8 @@ class Layout:
 
     def __init__(self, keys: IntArray) -> None:
         self.keys = keys
-        self.widths: IntArray = sizes(keys)
-        """Each key has this number of columns (K,)."""
-        ends = self.widths.cumsum()
-        self.starts: IntArray = ends - self.widths
-        """Each key begins at this column (K,)."""
-        self.size = int(ends[-1]) if len(keys) else 0
+        self.widths, self.starts, self.size = _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES)
+        """Each key has this number of columns (K,), and begins at this one (K,)."""
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
