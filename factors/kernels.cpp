@@ -838,6 +838,259 @@ py::tuple detection_rows(const Array& points, const Array& covariances, const Ar
   return py::make_tuple(residual, sigma, jacobian);
 }
 
+// Detections chosen by row, and the poses at which they were made.
+struct Seen {
+  Seen(const Ints& rows, const Ints& cycles, const Array& measured, const Array& twists, const Array& poses,
+       Index first_cycle, const Array& sensor)
+      : cycle(rows.shape(0)), measured(Shape{rows.shape(0), 2}), twist(Shape{rows.shape(0), 3}),
+        pose(Shape{rows.shape(0), 3}) {
+    const Index all = cycles.shape(0);
+    expect(measured.size() == 2 * all && twists.size() == 3 * all);
+    for (Index i = 0; i < rows.shape(0); ++i) {
+      const Index row = rows.data()[i];
+      expect(row >= 0 && row < all);
+      const Index slot = cycles.data()[row] - first_cycle;
+      expect(slot >= 0 && slot < poses.shape(0));
+      cycle.mutable_data()[i] = cycles.data()[row];
+      std::copy_n(measured.data() + 2 * row, 2, this->measured.mutable_data() + 2 * i);
+      std::copy_n(twists.data() + 3 * row, 3, twist.mutable_data() + 3 * i);
+      std::copy_n(poses.data() + 3 * slot, 3, pose.mutable_data() + 3 * i);
+    }
+    points = to_map(sensor.size() ? shifted(this->measured, twist, sensor) : this->measured, pose);
+  }
+
+  Ints cycle;
+  Array measured, twist, pose, points;
+};
+
+Array placed(const Ints& rows, const Ints& cycles, const Array& measured, const Array& twists,
+             const Array& poses, Index first_cycle, const Array& sensor) {
+  return rows.size() ? Seen(rows, cycles, measured, twists, poses, first_cycle, sensor).points
+                     : Array(Shape{0, 2});
+}
+
+Array covariances_of(const Ints& rows, const Array& covariances) {
+  Array out(Shape{rows.shape(0), 2, 2});
+  for (Index i = 0; i < rows.shape(0); ++i)
+    std::copy_n(covariances.data() + 4 * rows.data()[i], 4, out.mutable_data() + 4 * i);
+  return out;
+}
+
+py::tuple curve_rows(const py::object& spans, const py::tuple& curves, const py::tuple& table, const Ints& cycles,
+                     const Array& poses, Index first_cycle, const Array& sensor, const py::tuple& limits,
+                     const py::tuple& names, const py::tuple& tolerances) {
+  const Array control_points = curves[0].cast<Array>(), trusted = curves[3].cast<Array>();
+  const Ints labels = curves[1].cast<Ints>(), control_keys = curves[2].cast<Ints>();
+  const Array active_from = curves[4].cast<Array>();
+  const Ints cycle = table[0].cast<Ints>(), boundary = table[1].cast<Ints>();
+  const py::array_t<bool> used = table[2].cast<py::array_t<bool>>();
+  const Array all_u = table[3].cast<Array>();
+  const double room = limits[0].cast<double>(), sigma_model = limits[3].cast<double>();
+  const double huber = limits[4].cast<double>();
+  const Index first_pose = names[0].cast<Index>(), sensor_key = names[1].cast<Index>();
+  expect(boundary.size() == cycle.size() && used.size() == cycle.size() && all_u.size() == cycle.size());
+  std::vector<Index> chosen;
+  for (Index i = 0; i < cycle.shape(0); ++i)
+    if (used.data()[i] && std::binary_search(cycles.data(), cycles.data() + cycles.shape(0), cycle.data()[i]))
+      chosen.push_back(i);
+  const Index m = static_cast<Index>(chosen.size());
+  const Ints rows(Shape{m}, chosen.data());
+  const Seen seen(rows, cycle, table[4].cast<Array>(), table[5].cast<Array>(), poses, first_cycle, sensor);
+  Ints curve(m);
+  Array u(m), low(m), high(m);
+  for (Index i = 0; i < m; ++i) {
+    const Index k = std::lower_bound(labels.data(), labels.data() + labels.shape(0), boundary.data()[chosen[i]]) -
+                    labels.data();
+    expect(k < labels.shape(0));
+    const double at = all_u.data()[chosen[i]];
+    curve.mutable_data()[i] = k;
+    u.mutable_data()[i] = at;
+    low.mutable_data()[i] = at - room;
+    high.mutable_data()[i] = std::min(at + room, trusted.data()[k]);
+  }
+  const py::tuple foot = refined(spans, control_points, seen.points, curve, u, low, high, limits[1].cast<int>(),
+                                 limits[2].cast<int>(), tolerances);
+  const Array found = foot[0].cast<Array>(), basis = foot[6].cast<Array>();
+  const py::array_t<bool> interior = foot[5].cast<py::array_t<bool>>();
+  const Ints columns = foot[8].cast<Ints>();
+  const py::tuple terms =
+      detection_rows(seen.points, covariances_of(rows, table[6].cast<Array>()), seen.pose, foot[3].cast<Array>(),
+                     foot[4].cast<Array>(), basis, seen.measured, seen.twist, sensor, sigma_model);
+  Array residual = terms[0].cast<Array>(), jacobian = terms[2].cast<Array>();
+  const Array sigma = terms[1].cast<Array>();
+  const Index p = basis.shape(1), width = jacobian.shape(1), head = sensor.size() ? 2 : 1;
+  Ints keys(Shape{m, head + p});
+  bool reached = false;
+  const bool periodic = spans.attr("periodic").cast<bool>();
+  for (Index i = 0; i < m; ++i) {
+    const double r = residual.data()[i], s = sigma.data()[i];
+    double weight = std::sqrt(1.0 / std::max(std::abs(r / s) / huber, 1.0));
+    weight *= (interior.data()[i] ? 1.0 : 0.0) / s;
+    residual.mutable_data()[i] = r * weight;
+    for (Index j = 0; j < width; ++j) jacobian.mutable_data()[i * width + j] *= weight;
+    Index* own = keys.mutable_data() + i * (head + p);
+    own[0] = first_pose + seen.cycle.data()[i];
+    if (head == 2) own[1] = sensor_key;
+    for (Index j = 0; j < p; ++j) own[head + j] = control_keys.data()[columns.data()[i * p + j]];
+    reached |= !periodic && found.data()[i] <= active_from.data()[curve.data()[i]];
+  }
+  return py::make_tuple(rows, found, reached, py::make_tuple(keys, jacobian, residual, seen.cycle));
+}
+
+// --- association ------------------------------------------------------------------------------------------
+
+py::tuple open_rows(const Ints& labels, const Ints& since, const Ints& label, const Ints& boundary,
+                    const py::array_t<bool>& used, Index unknown) {
+  std::vector<Index> rows, curve;
+  expect(boundary.size() == label.size() && used.size() == label.size() && since.size() == labels.size());
+  for (Index k = 0; k < labels.shape(0); ++k)
+    for (Index i = since.data()[k]; i < label.shape(0); ++i) {
+      const bool colourless = label.data()[i] == unknown;
+      const bool is_open = used.data()[i] ? colourless && boundary.data()[i] != labels.data()[k]
+                                          : colourless || label.data()[i] == labels.data()[k];
+      if (is_open) rows.push_back(i), curve.push_back(k);
+    }
+  const Shape shape{static_cast<Index>(rows.size())};
+  return py::make_tuple(Ints(shape, rows.data()), Ints(shape, curve.data()));
+}
+
+py::tuple in_view(const py::object& spans, const Array& control_points, const Array& trusted, const Array& points,
+                  const Ints& curve, const Ints& slot, const py::list& pose_u, const Array& pose,
+                  const py::tuple& rooms, double step, int iterations, const py::tuple& tolerances) {
+  const Index m = points.shape(0), curves = static_cast<Index>(pose_u.size());
+  const double room[4] = {rooms[0].cast<double>(), rooms[1].cast<double>(), rooms[2].cast<double>(),
+                          rooms[3].cast<double>()};
+  expect(points.size() == 2 * m && curve.size() == m && slot.size() == m && trusted.size() == curves);
+  expect(pose.size() == 3);
+  std::vector<Array> beside;
+  for (const py::handle& own : pose_u) beside.push_back(own.cast<Array>()), expect(beside.back().size() > 0);
+  Array all(Shape{m + curves, 2}), low(m + curves), high(m + curves);
+  Ints number(m + curves);
+  for (Index i = 0; i < m + curves; ++i) {
+    const Index k = i < m ? curve.data()[i] : i - m;
+    expect(k >= 0 && k < curves);
+    const Array& own = beside[k];
+    const Index last = own.shape(0) - 1;
+    const double u = own.data()[i < m ? std::min(slot.data()[i], last) : last];
+    const double* point = i < m ? points.data() + 2 * i : pose.data();
+    std::copy_n(point, 2, all.mutable_data() + 2 * i);
+    number.mutable_data()[i] = k;
+    low.mutable_data()[i] = u - room[i < m ? 0 : 2];
+    high.mutable_data()[i] = std::min(u + room[i < m ? 1 : 3], trusted.data()[k]);
+  }
+  const py::tuple foot = searched(spans, control_points, all, number, low, high, step, iterations, tolerances);
+  const Array u = foot[0].cast<Array>(), tangent = foot[2].cast<Array>(), distance = foot[4].cast<Array>();
+  py::tuple of_rows(9);
+  for (int j = 0; j < 9; ++j) of_rows[j] = foot[j][py::slice(0, m, 1)];
+  py::list along;
+  const Turn turn(pose.data()[2]);
+  for (Index i = m; i < m + curves; ++i) {
+    const double* t = tangent.data() + 2 * i;
+    along.append(py::make_tuple(u.data()[i], t[0] * turn.c + t[1] * turn.s, distance.data()[i]));
+  }
+  return py::make_tuple(of_rows, along);
+}
+
+double variance_across(const double* n, const double* K, double theta) {
+  const Turn turn(theta);
+  const double x = turn.c * n[0] + turn.s * n[1], y = -turn.s * n[0] + turn.c * n[1];
+  return x * x * K[0] + 2.0 * x * y * K[1] + y * y * K[3];
+}
+
+py::tuple gated(const Ints& rows, const Ints& cycle, const Ints& label, const Array& covariances, const Array& poses,
+                Index first_cycle, const py::tuple& foot, const py::tuple& limits) {
+  const Index m = rows.shape(0);
+  const Array normals = foot[0].cast<Array>(), distances = foot[1].cast<Array>();
+  const py::array_t<bool> interior = foot[2].cast<py::array_t<bool>>();
+  const double sigma_model = limits[0].cast<double>(), floor = limits[1].cast<double>();
+  const double rough = limits[2].cast<double>(), chi = limits[3].cast<double>();
+  const double chi_unknown = limits[4].cast<double>();
+  const Index unknown = limits[5].cast<Index>();
+  expect(normals.size() == 2 * m && distances.size() == m && interior.size() == m);
+  Array variances(m);
+  py::array_t<bool> accepted(m), doubtful(m);
+  for (Index i = 0; i < m; ++i) {
+    const Index row = rows.data()[i];
+    const double theta = poses.data()[3 * (cycle.data()[row] - first_cycle) + 2];
+    const double across = std::sqrt(
+        variance_across(normals.data() + 2 * i, covariances.data() + 4 * row, theta) + sigma_model * sigma_model);
+    const double variance = across * across + floor * floor, d = distances.data()[i];
+    const bool colourless = label.data()[row] == unknown, near = interior.data()[i] && std::abs(d) < rough;
+    const double limit = colourless ? chi_unknown : chi;
+    variances.mutable_data()[i] = variance;
+    accepted.mutable_data()[i] = near && d * d < limit * limit * variance;
+    doubtful.mutable_data()[i] = near && !accepted.data()[i] && !colourless;
+  }
+  return py::make_tuple(variances, accepted, doubtful);
+}
+
+// --- tentative tracks -------------------------------------------------------------------------------------
+
+void inverse2(const double* A, double* out);
+
+// The tracks with detections merged into them; the new ones come last.
+py::tuple merged(const py::tuple& known, const Array& points, const Array& covariances, double t,
+                 const py::tuple& limits) {
+  const Array place = known[0].cast<Array>(), inform = known[1].cast<Array>(), stamps = known[3].cast<Array>();
+  const Ints number = known[2].cast<Ints>();
+  const double radius = limits[0].cast<double>(), most = limits[1].cast<double>(), chi = limits[2].cast<double>();
+  const Index n = place.shape(0), m = points.shape(0);
+  expect(inform.size() == 4 * n && number.size() == n && stamps.size() == n);
+  expect(points.size() == 2 * m && covariances.size() == 4 * m);
+  std::vector<Index> track(m, -1);
+  Index count = n;
+  for (Index i = 0; i < m; ++i) {
+    const double* z = points.data() + 2 * i;
+    double least = kInfinity;
+    for (Index j = 0; j < n; ++j) {
+      const double distance = std::hypot(z[0] - place.data()[2 * j], z[1] - place.data()[2 * j + 1]);
+      if (distance < least) least = distance, track[i] = j;
+    }
+    if (least < radius) continue;
+    track[i] = -1, least = chi * chi;
+    for (Index j = 0; j < n; ++j) {
+      const double dx = z[0] - place.data()[2 * j], dy = z[1] - place.data()[2 * j + 1];
+      if (!(dx * dx + dy * dy < most * radius * (most * radius))) continue;
+      double joint[4], weight[4];
+      inverse2(inform.data() + 4 * j, joint);
+      for (int k = 0; k < 4; ++k) joint[k] += covariances.data()[4 * i + k];
+      inverse2(joint, weight);
+      const double square = dx * (weight[0] * dx + weight[1] * dy) + dy * (weight[2] * dx + weight[3] * dy);
+      if (square < least) least = square, track[i] = j;
+    }
+    if (track[i] < 0) ++count;
+  }
+  Array place_out(Shape{count, 2}), inform_out(Shape{count, 2, 2}), stamps_out(count);
+  Ints number_out(count);
+  std::copy_n(place.data(), 2 * n, place_out.mutable_data());
+  std::copy_n(inform.data(), 4 * n, inform_out.mutable_data());
+  std::copy_n(stamps.data(), n, stamps_out.mutable_data());
+  std::copy_n(number.data(), n, number_out.mutable_data());
+  for (Index i = 0, next = n; i < m; ++i) {
+    const double* z = points.data() + 2 * i;
+    double weight[4];
+    inverse2(covariances.data() + 4 * i, weight);
+    if (track[i] < 0) {
+      std::copy_n(z, 2, place_out.mutable_data() + 2 * next);
+      std::copy_n(weight, 4, inform_out.mutable_data() + 4 * next);
+      number_out.mutable_data()[next] = 1, stamps_out.mutable_data()[next++] = t;
+      continue;
+    }
+    double* at = place_out.mutable_data() + 2 * track[i];
+    double* sum = inform_out.mutable_data() + 4 * track[i];
+    double gain[4];
+    for (int k = 0; k < 4; ++k) sum[k] += weight[k];
+    const double dx = z[0] - at[0], dy = z[1] - at[1];
+    const double gx = weight[0] * dx + weight[1] * dy, gy = weight[2] * dx + weight[3] * dy;
+    inverse2(sum, gain);
+    at[0] += gain[0] * gx + gain[1] * gy, at[1] += gain[2] * gx + gain[3] * gy;
+    ++number_out.mutable_data()[track[i]];
+    double& last = stamps_out.mutable_data()[track[i]];
+    last = std::max(last, t);  // a late detection makes no track older
+  }
+  return py::make_tuple(place_out, inform_out, number_out, stamps_out);
+}
+
 // --- odometry and path ------------------------------------------------------------------------------------
 
 py::tuple along_and_across(const Array& points, const Array& path, const Array& stations) {
@@ -977,6 +1230,32 @@ py::tuple odometry_residuals(const Array& starts, const Array& ends, const Array
     S[5] += -a * along - h * across;
   }
   return py::make_tuple(residuals, by_start, by_end);
+}
+
+py::tuple whitened_odometry(const Array& starts, const Array& ends, const Array& deltas, const Array& whiteners,
+                            const Array& by_calibration, const Array& calibration, double series_below) {
+  const Index m = deltas.shape(0);
+  expect(whiteners.size() == 9 * m && by_calibration.size() == 6 * m && calibration.size() == 2);
+  const py::tuple own = odometry_residuals(starts, ends, deltas, series_below);
+  const Array plain = own[0].cast<Array>(), by_start = own[1].cast<Array>(), by_end = own[2].cast<Array>();
+  Array residual(Shape{m, 3}), jacobian(Shape{m, 3, 8});
+  for (Index i = 0; i < m; ++i) {
+    const double* G = by_calibration.data() + 6 * i;
+    double D[3][9];
+    for (int r = 0; r < 3; ++r) {
+      std::copy_n(G + 2 * r, 2, D[r]);
+      std::copy_n(by_start.data() + 9 * i + 3 * r, 3, D[r] + 2);
+      std::copy_n(by_end.data() + 9 * i + 3 * r, 3, D[r] + 5);
+      D[r][8] = plain.data()[3 * i + r] + (G[2 * r] * calibration.data()[0] + G[2 * r + 1] * calibration.data()[1]);
+    }
+    for (int r = 0; r < 3; ++r) {
+      const double* W = whiteners.data() + 9 * i + 3 * r;
+      double* J = jacobian.mutable_data() + 24 * i + 8 * r;
+      for (int c = 0; c < 8; ++c) J[c] = W[0] * D[0][c] + W[1] * D[1][c] + W[2] * D[2][c];
+      residual.mutable_data()[3 * i + r] = W[0] * D[0][8] + W[1] * D[1][8] + W[2] * D[2][8];
+    }
+  }
+  return py::make_tuple(residual, jacobian);
 }
 
 // --- scan matching ----------------------------------------------------------------------------------------
@@ -1249,6 +1528,13 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("shifted", &shifted);
   module.def("to_map", &to_map);
   module.def("detection_rows", &detection_rows);
+  module.def("placed", &placed);
+  module.def("curve_rows", &curve_rows);
+  module.def("open_rows", &open_rows);
+  module.def("in_view", &in_view);
+  module.def("gated", &gated);
+  module.def("merged", &merged);
+  module.def("whitened_odometry", &whitened_odometry);
   module.def("along_and_across", &along_and_across);
   module.def("odometry_residuals", &odometry_residuals);
   module.def("integrated", &integrated);

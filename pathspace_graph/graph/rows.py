@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import cast
+from typing import Final, cast
 
 import gtsam
 import numpy as np
@@ -20,7 +20,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.linear import keys_of_factor
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, whitened_odometry
 from pathspace_graph.factors.se2 import compose, rotation
 
 from .gaussian import FactoredSystem, factors_of, half_solve
@@ -348,6 +348,11 @@ def _summed(
     return hessian, gradient
 
 
+_FIRST_KEYS: Final = np.array([CALIBRATION_KEY, pose_key(0), pose_key(1)])
+_ON_POSE: Final = np.array([0, 1, 1])
+"""The keys of a row of odometry at the first cycle, and which of them count the cycles."""
+
+
 class OdometryChain:
     """Odometry from each pose to the next: m stacked intervals, in the order of the drive."""
 
@@ -384,12 +389,8 @@ class OdometryChain:
         The poses x (P, 3) are in the map frame, and b (2,) is the calibration. The derivatives (m, 3, 8) are
         by [calibration | pose | next pose].
         """
-        whiteners, by_calibration = self.whiteners[slots], self.by_calibration[slots]
-        start, end = poses[:-1][slots], poses[1:][slots]
-        residual, by_start, by_end = odometry_residuals(start, end, self.deltas[slots])
-        residual = residual + by_calibration @ calibration
-        jacobian = whiteners @ np.concatenate([by_calibration, by_start, by_end], axis=2)
-        return (whiteners @ residual[:, :, None])[:, :, 0], jacobian
+        measured = self.deltas[slots], self.whiteners[slots], self.by_calibration[slots]
+        return whitened_odometry(poses[:-1][slots], poses[1:][slots], *measured, calibration)
 
     def rows(self, variables: Variables, cycles: IntArray) -> list[Rows]:
         """Return the rows from the poses of some cycles (m,) to the next poses; each cycle owns its rows.
@@ -408,9 +409,9 @@ class OdometryChain:
 def odometry_rows(cycles: IntArray, terms: tuple[Array, Array], owner: IntArray) -> Rows:
     """Return the result of `OdometryChain.terms` for cycles (m,) as rows with these owners (m,)."""
     residual, jacobian = terms
-    keys = np.stack([np.full(len(cycles), CALIBRATION_KEY), pose_keys(cycles), pose_keys(cycles + 1)], axis=1)
+    keys = _FIRST_KEYS + np.repeat(cycles, POSE)[:, None] * _ON_POSE
     flat = jacobian.reshape(residual.size, CALIBRATION_SIZE + 2 * POSE)
-    return Rows(np.repeat(keys, POSE, axis=0), flat, residual.ravel(), np.repeat(owner, POSE))
+    return Rows(keys, flat, residual.ravel(), np.repeat(owner, POSE))
 
 
 def odometry_factor(cycle: int, interval: IntegratedOdometry) -> gtsam.CustomFactor:

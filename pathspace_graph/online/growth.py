@@ -1,5 +1,6 @@
 """Growth of the open curves through confirmed tentative tracks ahead of their ends (paper: Expansion)."""
 
+from statistics import median
 from typing import Final
 
 import numpy as np
@@ -241,7 +242,7 @@ class Growth:
         side = SIDES[label] * float(lateral[0])
         if len(boundary.observed) >= NEWEST:
             _, beside = path_ahead.locate(np.array(boundary.observed[-NEWEST:]))
-            side = float(np.median(np.append(SIDES[label] * beside, side)))
+            side = median([*(SIDES[label] * beside).tolist(), side])
         return End(position[0], float(station[0]), side)
 
     # --- bounds ------------------------------------------------------------------------------------------
