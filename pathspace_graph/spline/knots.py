@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy.linalg
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.blas import dger
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
@@ -105,18 +105,19 @@ def refit(
         within_new = begin + np.mod(within_new - begin, end - begin)
     sparse = np.histogram(within_new, new.breaks)[0] <= new.degree  # fewer samples than control points
     bridge = _BRIDGE * _bending_rows(new)[np.repeat(sparse, _BENDING_PER_SPAN)]
-    stacked = np.concatenate([B_new[inside], bridge])
-    target = np.concatenate([B_old[inside], np.zeros((len(bridge), old.size))])
-    return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
+    crossed = B_new.T @ B_old
+    F, G = (B_new, crossed) if inside.all() else (B_new[inside], B_new[inside].T @ B_old[inside])
+    new_from_old = _normal_solution(F.T @ F + bridge.T @ bridge, G)
+    return Refit(new_from_old, old_from_new=_normal_solution(B_old.T @ B_old, crossed.T))
 
 
-def _least_squares(matrix: Array, right: Array) -> Array:
-    """Return argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned."""
+def _normal_solution(normal: Array, right: Array) -> Array:
+    """Return N^+ R of normal equations, which a sampled B-spline basis keeps well conditioned."""
     try:
-        factor = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+        factor = cho_factor(normal, check_finite=False)
     except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.lstsq(matrix, right)[0])
-    return np.asarray(scipy.linalg.cho_solve(factor, matrix.T @ right, check_finite=False))
+        return np.asarray(np.linalg.lstsq(normal, right)[0])
+    return np.asarray(cho_solve(factor, right, check_finite=False))
 
 
 def _refit_samples(old: BSpline, new: BSpline) -> Array:
@@ -269,7 +270,8 @@ def thin(
     jumps = np.diff(highest, axis=0)  # of the highest derivative at each inner break, by control point
     factor = cho_factor(B.T @ B + fit.smoothness * bending.T @ bending)
     watched, n, remaining = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
-    spread, values = watched @ cho_solve(factor, jumps.T), watched @ cho_solve(factor, B.T @ points)
+    spread = np.asfortranarray(watched @ cho_solve(factor, jumps.T))
+    values = watched @ cho_solve(factor, B.T @ points)
     leverage = np.einsum("kn,nk->k", B, cho_solve(factor, B.T))
     for size in range(B.shape[1], max(min(least, B.shape[1]), B.shape[1] - n) - 1, -1):
         kept = breaks[np.concatenate([[0], 1 + remaining, [-1]])]
@@ -280,7 +282,7 @@ def thin(
             k, column = remaining[removed], spread[:, remaining[removed]].copy()
             leverage = leverage - column[n:] ** 2 / column[k]
             values = values - np.outer(column / column[k], values[k])
-            spread -= np.outer(column / column[k], spread[k])
+            spread = dger(-1.0, column / column[k], spread[k], a=spread, overwrite_a=1)
             remaining = np.delete(remaining, removed)
 
 
