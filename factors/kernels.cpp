@@ -675,10 +675,10 @@ Ints owners_holding(const Ints& keys, const Ints& owner, const Ints& ascending) 
   return Ints(Shape{static_cast<Index>(found.size())}, found.data());
 }
 
-py::tuple relative_rows(const Array& root, const Array& right, const Array& local, const Array& values,
-                        const Ints& turning, const Ints& headings) {
+Columns relative_block(const Array& root, const Array& right, const Array& local, const Array& values,
+                       const Array& change, const Ints& turning, const Ints& headings) {
   const Index r = root.shape(0), q = local.shape(0), width = q + 3;
-  expect(root.size() == r * q && right.size() == r && values.size() == width);
+  expect(root.size() == r * q && right.size() == r && values.size() == width && change.size() == width);
   const double* frame = values.data() + q;
   const Turn turn(frame[2]);
   std::vector<double> there(values.data(), frame), off(q);
@@ -689,11 +689,12 @@ py::tuple relative_rows(const Array& root, const Array& right, const Array& loca
   }
   for (Index k = 0; k < headings.size(); ++k) there[headings.data()[k]] -= frame[2];
   for (Index j = 0; j < q; ++j) off[j] = there[j] - local.data()[j];
-  Array jacobian(Shape{r, width}), residual(r);
+  Columns block(Shape{r, width + 1});
+  std::vector<double> row(width);
+  double* J = row.data();
   for (Index i = 0; i < r; ++i) {
     const double* A = root.data() + i * q;
-    double* J = jacobian.mutable_data() + i * width;
-    double sum = -right.data()[i], by[3] = {0.0, 0.0, 0.0};
+    double sum = -right.data()[i], by[3] = {0.0, 0.0, 0.0}, now = 0.0;
     for (Index j = 0; j < q; ++j) sum += A[j] * off[j];
     std::copy_n(A, q, J);
     for (Index k = 0; k < turning.size(); ++k) {
@@ -704,9 +705,13 @@ py::tuple relative_rows(const Array& root, const Array& right, const Array& loca
     }
     for (Index k = 0; k < headings.size(); ++k) by[2] -= A[headings.data()[k]];
     std::copy_n(by, 3, J + q);
-    residual.mutable_data()[i] = sum;
+    for (Index j = 0; j < width; ++j) {
+      now += J[j] * change.data()[j];
+      block.mutable_data()[i + j * r] = J[j];
+    }
+    block.mutable_data()[i + width * r] = now - sum;
   }
-  return py::make_tuple(jacobian, residual);
+  return block;
 }
 
 Ints spread(const Ints& starts, const Ints& widths) {
@@ -1519,7 +1524,7 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("block_of", &block_of);
   module.def("moved_residual", &moved_residual);
   module.def("parted", &parted);
-  module.def("relative_rows", &relative_rows);
+  module.def("relative_block", &relative_block);
   module.def("replaced", &replaced);
   module.def("owners_holding", &owners_holding);
   module.def("laid_out", &laid_out);

@@ -124,7 +124,18 @@ class NoiseLearner:
         """
         if self.of_odometry and self.measured is not None:
             motions = [motion.with_sigma(self.twist_sigma) for motion in motions]
-        return list(motions), [self.for_map(cycle) for cycle in detections]
+        counts = [len(cycle.labels) for cycle in detections]
+        stated = Detections(
+            0.0,
+            np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in detections)]),
+            np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in detections)]),
+            np.zeros(sum(counts), np.intp),
+        )
+        used = np.split(self.for_map(stated).covariances, np.cumsum(counts)[:-1])
+        return list(motions), [
+            Detections(cycle.t, cycle.points_vehicle, covariances, cycle.labels)
+            for cycle, covariances in zip(detections, used, strict=True)
+        ]
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
         """Return settings with measured priors of the calibrations where one of the old ones is contradicted.

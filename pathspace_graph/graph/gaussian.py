@@ -301,7 +301,7 @@ def substitute_points(
     H, g = np.zeros((widths.sum(), widths.sum())), np.zeros(widths.sum())
     H[np.ix_(at, at)], g[at] = information[np.ix_(own, own)], vector[own]
     H[:count, :count] += weight * np.eye(count)
-    H[:count, -added:], H[-added:, -added:] = -weight * E, weight * E.T @ E
+    H[:count, -added:], H[-added:, -added:] = -weight * E, np.kron(weight * change.T @ change, np.eye(POINT))
     g[:count] += weight * offset
     g[-added:] -= weight * offset @ E
     root = cholesky(np.asfortranarray(H[:count, :count]))

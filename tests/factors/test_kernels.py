@@ -213,10 +213,10 @@ CASES: dict[str, Arguments] = {
         poses(rng, 1)[0],
         information(rng, 3),
     ),
-    "relative_rows": lambda rng: (
+    "relative_block": lambda rng: (
         rng.normal(size=(COUNT, 9)),
         rng.normal(size=COUNT),
-        *(rng.normal(size=size) for size in (9, 12)),
+        *(rng.normal(size=size) for size in (9, 12, 12)),
         np.array([2, 4, 6]),
         np.array([8]),
     ),
