@@ -94,10 +94,11 @@ class NoiseLearner:
         if not self.of_sensor or measured is None or measured.along is None:
             return detections
         covariances = measured.covariances(points, inflated=False) if self.of_detections else None
-        return replace(
-            detections,
-            points_vehicle=measured.corrected(points, twist, shown=True),
-            covariances=detections.covariances if covariances is None else covariances,
+        return Detections(
+            detections.t,
+            measured.corrected(points, twist, shown=True),
+            detections.covariances if covariances is None else covariances,
+            detections.labels,
         )
 
     def for_map(self, detections: Detections) -> Detections:
@@ -111,7 +112,7 @@ class NoiseLearner:
         covariances = measured.covariances(points, inflated=True) if self.of_detections else None
         if covariances is None:
             covariances = measured.inflated(points, detections.covariances)
-        return replace(detections, covariances=covariances)
+        return Detections(detections.t, points, covariances, detections.labels)
 
     def for_lap(
         self, motions: Sequence[MeasuredMotion], detections: Sequence[Detections]

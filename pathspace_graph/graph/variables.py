@@ -149,6 +149,7 @@ class Layout:
         self.keys = keys
         self.widths, self.starts, self.size = _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES)
         """Each key has this number of columns (K,), and begins at this one (K,)."""
+        self._begins: list[int] | None = None
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
@@ -194,12 +195,11 @@ class Layout:
 
     def block(self, letter: str) -> slice:
         """Return the columns of all keys of a letter."""
-        return self._blocks[letter]
-
-    @cached_property
-    def _blocks(self) -> dict[str, slice]:
-        begins = np.append(self.starts, self.size)[self.keys.searchsorted(_LETTER_ENDS)].tolist()
-        return {letter: slice(*begins[k : k + 2]) for letter, k in _LETTER_PLACES.items()}
+        k = _LETTER_PLACES[letter]
+        if self._begins is None:
+            places = np.concatenate([self.starts, [self.size]])
+            self._begins = places[self.keys.searchsorted(_LETTER_ENDS)].tolist()
+        return slice(self._begins[k], self._begins[k + 1])
 
     def begin(self, key: int) -> int:
         """Return the first column of a key, or where it would be if the layout held the key."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
 from typing import Self
 
 import numpy as np
@@ -68,15 +69,17 @@ class DetectionColumns:
 
         The vehicle moved with this twist (3,), in m/s, m/s and rad/s; by default it stood still.
         """
-        start = int(self.cycle.searchsorted(cycle, side="right"))
-        new = type(self).of([detections], cycle, None if twist is None else twist[None])
+        start, columns = int(self.cycle.searchsorted(cycle, side="right")), vars(self)
+        new = vars(type(self).of([detections], cycle, None if twist is None else twist[None]))
         for column in self._columns():
-            known, added = getattr(self, column), getattr(new, column)
-            setattr(self, column, np.concatenate([known[:start], added, known[start:]]))
-        return slice(start, start + len(new))
+            known = columns[column]
+            columns[column] = np.concatenate([known[:start], new[column], known[start:]])
+        return slice(start, start + len(detections.labels))
 
-    def _columns(self) -> list[str]:
-        return [column.name for column in fields(self) if column.name != "sensor"]
+    @classmethod
+    @cache
+    def _columns(cls) -> list[str]:
+        return [column.name for column in fields(cls) if column.name != "sensor"]
 
     def corrected(self, rows: IntArray | slice, sensor: Array) -> Array:
         """Return positions (m, 2), vehicle frame, corrected by the sensor's calibration: (5,) or empty."""
@@ -115,7 +118,7 @@ class DetectionColumns:
         """Remove the detections of all cycles before `cycle`."""
         first = int(self.cycle.searchsorted(cycle))
         for column in self._columns():
-            setattr(self, column, getattr(self, column)[first:])
+            vars(self)[column] = vars(self)[column][first:]
 
     def in_cycles(self, cycles: IntArray) -> BoolArray:
         """Return (m,) whether each detection was made in one of the ascending cycles (k,)."""

@@ -241,7 +241,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         high = float(pose_u.max()) + gate.view_ahead + gate.station_ahead + slide + room
         if boundary.periodic and high - low >= boundary.length:
             return boundary.everything
-        first, last = boundary.tables.locate(np.array([low, high]))[0]
+        first, last = boundary.tables.span_of(low), boundary.tables.span_of(high)
         if not boundary.periodic:
             return np.arange(first, boundary.size)
         last += boundary.degree + (boundary.size if last < first else 0)
