@@ -111,12 +111,10 @@ class Follower:
         detections, pose = cycle.detections, cycle.pose
         self._follow_bias(detections.t, pose)
         keep = self._last > detections.t - MAX_AGE
-        self._points, self._labels, self._nearest = (
-            self._points[keep],
-            self._labels[keep],
-            self._nearest[keep],
-        )
-        self._last, self._cones = self._last[keep], self._cones[keep]
+        if not keep.all():
+            self._points, self._labels = self._points[keep], self._labels[keep]
+            self._nearest, self._last = self._nearest[keep], self._last[keep]
+            self._cones = self._cones[keep]
         ranges = np.hypot(*detections.points_vehicle.T)
         order = np.argsort(ranges, kind="stable")
         order = order[ranges[order] < MAX_RANGE]
@@ -128,9 +126,7 @@ class Follower:
             cones,
             np.full(count, detections.t),
             measured[rows],
-            np.tile(cycle.twist, (count, 1)),
-            np.tile(pose, (count, 1)),
-            np.tile(self._by_bias, (count, 1)),
+            *(one[None].repeat(count, axis=0) for one in (cycle.twist, pose, self._by_bias)),
         )
 
     def _follow_bias(self, t: float, pose: Array) -> None:
@@ -148,7 +144,8 @@ class Follower:
             round_gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
             return round_gate, round_gate
         along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
-        return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
+        along, across = (np.minimum(np.maximum(one, GATE_LEAST), GATE_MOST) for one in (along, across))
+        return along, across
 
     def _assign(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float
@@ -170,14 +167,15 @@ class Follower:
             FOLLOWING,
         )
         new = np.flatnonzero(place >= count)
-        own, first = np.unique(place[new], return_index=True)
-        first = new[first]
-        self._points = np.concatenate([self._points, points[first]])
-        self._labels = np.concatenate([self._labels, labels[first]])
-        self._nearest = np.concatenate([self._nearest, ranges[first]])
-        self._last = np.concatenate([self._last, np.full(len(first), t)])
-        self._cones = np.concatenate([self._cones, self._count + np.arange(len(own))])
-        self._count += len(own)
+        if len(new):
+            own, first = np.unique(place[new], return_index=True)
+            first = new[first]
+            self._points = np.concatenate([self._points, points[first]])
+            self._labels = np.concatenate([self._labels, labels[first]])
+            self._nearest = np.concatenate([self._nearest, ranges[first]])
+            self._last = np.concatenate([self._last, np.full(len(first), t)])
+            self._cones = np.concatenate([self._cones, self._count + np.arange(len(own))])
+            self._count += len(own)
         rows = np.concatenate([np.flatnonzero((place >= 0) & (place < count)), new])
         self._last[place[rows]] = t
         return rows, self._cones[place[rows]]

@@ -234,6 +234,7 @@ class KeptRows:
             placed = layout.keys, layout.starts, *_pattern(widths), change
             rows = Rows(*_replaced(old.parts, gone, fresh.parts, *placed))
             if len(rows):
+                rows.__dict__["widths"] = widths
                 self.groups.append(rows)
 
     def drop(self, owners: IntArray) -> list[Rows]:

@@ -285,10 +285,11 @@ class Variables:
         self.linearized = _inserted(self.linearized, at, values)
 
     def remove(self, keys: IntArray) -> None:
-        kept_entries = np.ones(self.layout.size, bool)
-        kept_entries[self.layout.entries(keys)] = False
+        if len(keys) == 0:
+            return
         kept_keys = np.ones(len(self.layout.keys), bool)
-        kept_keys[self.layout.positions(keys)] = False
+        kept_keys[self.layout.places(keys)] = False
+        kept_entries = kept_keys.repeat(self.layout.widths)
         self.layout = Layout(self.layout.keys[kept_keys])
         self.values, self.reference = self.values[kept_entries], self.reference[kept_entries]
         self.linearized = self.linearized[kept_entries]
