@@ -21,7 +21,7 @@ from pathspace_graph.front_end.sightings import SeenCycle, Sightings, follow
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.plausibility.reading import read_plausible_log
+from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .experiment.cells import run_estimator

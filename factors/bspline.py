@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import factorial
+from math import factorial, floor
 from typing import Final
 
 import numpy as np
@@ -248,6 +248,12 @@ class SpanPolynomials:
         inside = self.inside(u)
         number = self._breaks.searchsorted(inside, side="right")
         return number, (inside - self.starts.take(number)) * self.inverse_widths.take(number)
+
+    def span_of(self, u: float) -> int:
+        """Return the span number of one parameter, as `locate` does."""
+        if self.periodic:
+            u -= self.length * floor((u - self.low) / self.length)
+        return int(self._breaks.searchsorted(min(max(u, self.low), self.high), side="right"))
 
     def evaluate(self, u: Array, derivatives: int = 0) -> tuple[Array, IntArray]:
         """Return values (derivatives + 1, m, p + 1) and spans (m,) as `basis` does, by Horner's rule.

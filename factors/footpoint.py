@@ -23,7 +23,7 @@ _NO_TANGENT: Final = 1e-12
 """The tangent vanishes where |S'| <= tolerance * largest coordinate / length of the domain."""
 _TINY: Final = 1e-300
 """Smallest divisor of a step; the numerator vanishes before it does."""
-_TOLERANCES: Final = (_STEP_TOLERANCE, _FLAT, _EQUAL_SQUARE, _END_TOLERANCE, _NO_TANGENT, _TINY)
+TOLERANCES: Final = (_STEP_TOLERANCE, _FLAT, _EQUAL_SQUARE, _END_TOLERANCE, _NO_TANGENT, _TINY)
 """These, as they are handed to the compiled versions."""
 _CHUNK: Final = 1 << 20
 """At most this number of point-to-grid distances are held in memory at once."""
@@ -205,7 +205,7 @@ def joint_foot_points(
     """Return `foot_points` on several curves; `curve` (m,) is the number of each row's own."""
     stretch = (curve, u_low, u_high)
     return FootPoints(
-        *_searched(spans, control_points, points, *stretch, coarse_step, iterations, _TOLERANCES)
+        *_searched(spans, control_points, points, *stretch, coarse_step, iterations, TOLERANCES)
     )
 
 
@@ -242,7 +242,7 @@ def refine_joint_foot_points(
     """Return `refine_foot_points` on several curves; `curve` (m,) is the number of each row's own."""
     steps = (iterations, SEARCH_ITERATIONS)
     return FootPoints(
-        *_refined(spans, control_points, points, curve, u_start, u_low, u_high, *steps, _TOLERANCES)
+        *_refined(spans, control_points, points, curve, u_start, u_low, u_high, *steps, TOLERANCES)
     )
 
 

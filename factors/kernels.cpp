@@ -461,44 +461,117 @@ class RowColumns {
   std::vector<Index> wanted_, begin_, columns_;
 };
 
-void add_rows(Columns hessian, Array gradient, const Ints& keys, const Ints& starts, const Ints& sought,
-              const Ints& key, const Ints& entry, const Array& jacobian, const Array& residual,
-              const Array& change) {
-  const Index rows = jacobian.shape(0), width = jacobian.shape(1), n = gradient.shape(0);
-  expect(hessian.size() == n * n && change.size() == n && residual.size() == rows);
-  expect(sought.shape(0) == rows && key.size() == width);
-  double* H = hessian.mutable_data();
-  double* g = gradient.mutable_data();
-  RowColumns columns(keys, starts, sought, key, entry);
-  for (Index i = 0; i < rows; ++i) {
+// Rows of one pattern: the keys of each, and the key and the entry that each of its columns is by.
+struct Rows {
+  explicit Rows(const py::handle& rows) {
+    const py::tuple own = rows.cast<py::tuple>();
+    sought = own[0].cast<Ints>(), key = own[1].cast<Ints>(), entry = own[2].cast<Ints>();
+    jacobian = own[3].cast<Array>(), residual = own[4].cast<Array>();
+    expect(sought.shape(0) == size() && jacobian.size() == size() * width());
+  }
+  Index size() const { return residual.shape(0); }
+  Index width() const { return key.shape(0); }
+  bool same_keys(Index row, Index other) const {
+    const Index k = sought.shape(1);
+    return std::equal(sought.data() + row * k, sought.data() + (row + 1) * k, sought.data() + other * k);
+  }
+
+  Ints sought, key, entry;
+  Array jacobian, residual;
+};
+
+void add_rows(double* H, double* g, Index n, const Rows& rows, const Ints& keys, const Ints& starts,
+              const double* change) {
+  RowColumns columns(keys, starts, rows.sought, rows.key, rows.entry);
+  const Index width = rows.width();
+  std::vector<Index> places(width * (width + 1) / 2);
+  for (Index i = 0; i < rows.size(); ++i) {
     const std::vector<Index>& at = columns.known(i);
-    const double* J = jacobian.data() + i * width;
-    double r = residual.data()[i];
-    for (Index a = 0; a < width; ++a) r += J[a] * change.data()[at[a]];
+    const double* J = rows.jacobian.data() + i * width;
+    if (i == 0 || !rows.same_keys(i, i - 1))
+      for (Index a = 0, k = 0; a < width; ++a)
+        for (Index b = 0; b <= a; ++b, ++k) places[k] = std::max(at[a], at[b]) + std::min(at[a], at[b]) * n;
+    double r = rows.residual.data()[i];
+    for (Index a = 0; a < width; ++a) r += J[a] * change[at[a]];
+    const Index* place = places.data();
     for (Index a = 0; a < width; ++a) {
       g[at[a]] -= J[a] * r;
-      for (Index b = 0; b <= a; ++b) {
-        const Index high = std::max(at[a], at[b]), low = std::min(at[a], at[b]);
-        H[high + low * n] += J[a] * J[b];
-      }
+      for (Index b = 0; b <= a; ++b) H[*place++] += J[a] * J[b];
     }
   }
 }
 
-void add_prior(Columns hessian, Array gradient, const Columns& information, const Array& vector,
-               const Ints& entries, const Array& change) {
-  const Index n = gradient.shape(0), m = entries.shape(0);
-  expect(hessian.size() == n * n && change.size() == n && vector.size() == m && information.size() == m * m);
-  const Index* at = entries.data();
+// Add a factor with `[[L, g], [g', f]]` on some keys.
+void add_factor(double* H, double* g, Index n, const Ints& sought, const Columns& matrix, const Ints& keys,
+                const Ints& starts, const Ints& widths, const double* change) {
+  std::vector<Index> at;
+  for (Index k = 0; k < sought.shape(0); ++k) {
+    const Index place = std::lower_bound(keys.data(), keys.data() + keys.shape(0), sought.data()[k]) - keys.data();
+    if (place == keys.shape(0) || keys.data()[place] != sought.data()[k])
+      throw py::value_error("expected a prior on known variables, found others");
+    for (Index j = 0; j < widths.data()[place]; ++j) at.push_back(starts.data()[place] + j);
+  }
+  const Index m = static_cast<Index>(at.size());
+  expect(matrix.size() == (m + 1) * (m + 1));
+  const double* vector = matrix.data() + m * (m + 1);
+  for (Index a = 0; a < m; ++a) g[at[a]] += vector[a];
+  for (Index b = 0; b < m; ++b) {
+    const double* column = matrix.data() + b * (m + 1);
+    const double by = change[at[b]];
+    for (Index a = 0; a < m; ++a) g[at[a]] -= column[a] * by;
+    for (Index a = b; a < m; ++a) H[std::max(at[a], at[b]) + std::min(at[a], at[b]) * n] += column[a];
+  }
+}
+
+py::tuple summed(const Ints& keys, const Ints& starts, const Ints& widths, const py::list& factors,
+                 const py::list& groups, const Array& change) {
+  const Index n = change.shape(0);
+  Columns hessian(Shape{n, n});
+  Array gradient(n);
   double* H = hessian.mutable_data();
   double* g = gradient.mutable_data();
-  for (Index a = 0; a < m; ++a) g[at[a]] += vector.data()[a];
-  for (Index b = 0; b < m; ++b) {
-    const double* column = information.data() + b * m;
-    const double by = change.data()[at[b]];
-    for (Index a = 0; a < m; ++a) g[at[a]] -= column[a] * by;
-    for (Index a = b; a < m; ++a) H[at[a] + at[b] * n] += column[a];
+  std::fill_n(H, n * n, 0.0);
+  std::fill_n(g, n, 0.0);
+  expect(starts.size() == keys.size() && widths.size() == keys.size());
+  for (const py::handle& factor : factors) {
+    const py::tuple own = factor.cast<py::tuple>();
+    add_factor(H, g, n, own[0].cast<Ints>(), own[1].cast<Columns>(), keys, starts, widths, change.data());
   }
+  for (const py::handle& rows : groups) add_rows(H, g, n, Rows(rows), keys, starts, change.data());
+  return py::make_tuple(hessian, gradient);
+}
+
+// The rows `[A b]` of some groups on the variables that they hold, and the places of these variables.
+py::tuple block_of(const Ints& keys, const Ints& widths, const py::list& groups) {
+  std::vector<Rows> all(groups.begin(), groups.end());
+  Index height = 0, width = 0;
+  std::vector<Index> first(keys.shape(0), -1), held;
+  const auto place_of = [&](Index key) {
+    const Index place = std::lower_bound(keys.data(), keys.data() + keys.shape(0), key) - keys.data();
+    if (place == keys.shape(0) || keys.data()[place] != key)
+      throw py::value_error("expected rows on known variables, found others");
+    return place;
+  };
+  for (const Rows& rows : all) {
+    height += rows.size();
+    for (Index i = 0; i < rows.sought.size(); ++i) first[place_of(rows.sought.data()[i])] = 0;
+  }
+  for (Index k = 0; k < keys.shape(0); ++k)
+    if (first[k] == 0) held.push_back(k), first[k] = width, width += widths.data()[k];
+  Columns block(Shape{height, width + 1});
+  double* at = block.mutable_data();
+  std::fill_n(at, height * (width + 1), 0.0);
+  for (const Rows& rows : all)
+    for (Index i = 0; i < rows.size(); ++i, ++at) {
+      const Index* own = rows.sought.data() + i * rows.sought.shape(1);
+      Index key = -1, begin = 0;
+      for (Index j = 0; j < rows.width(); ++j) {
+        if (rows.key.data()[j] != key) key = rows.key.data()[j], begin = first[place_of(own[key])];
+        at[(begin + rows.entry.data()[j]) * height] = rows.jacobian.data()[i * rows.width() + j];
+      }
+      at[width * height] = -rows.residual.data()[i];
+    }
+  return py::make_tuple(Ints(Shape{static_cast<Index>(held.size())}, held.data()), block);
 }
 
 Ints columns_of(const Ints& keys, const Ints& starts, const Ints& sought, const Ints& key,
@@ -528,55 +601,84 @@ Array moved_residual(const Ints& keys, const Ints& starts, const Ints& sought, c
   return out;
 }
 
-py::tuple parted(const Ints& keys, const Array& jacobian, const Array& residual, const Ints& owner,
-                 const Ints& gone) {
-  const Index rows = owner.shape(0), k = keys.shape(1), width = jacobian.shape(1);
-  expect(keys.shape(0) == rows && jacobian.shape(0) == rows && residual.size() == rows);
-  std::vector<bool> goes(rows);
-  Index count = 0;
-  for (Index i = 0; i < rows; ++i) {
-    goes[i] = std::binary_search(gone.data(), gone.data() + gone.shape(0), owner.data()[i]);
-    count += goes[i];
+// Columns of rows: keys, derivatives, residuals and owners.
+struct Kept {
+  explicit Kept(const py::tuple& rows)
+      : keys(rows[0].cast<Ints>()), jacobian(rows[1].cast<Array>()), residual(rows[2].cast<Array>()),
+        owner(rows[3].cast<Ints>()) {
+    expect(keys.shape(0) == size() && jacobian.shape(0) == size() && residual.size() == size());
   }
-  py::tuple out(8);
-  for (const bool which : {false, true}) {
-    const Index size = which ? count : rows - count;
-    Ints own_keys(Shape{size, k}), own_owner(size);
-    Array own_jacobian(Shape{size, width}), own_residual(size);
-    Index* to_keys = own_keys.mutable_data();
-    Index* to_owner = own_owner.mutable_data();
-    double* to_jacobian = own_jacobian.mutable_data();
-    double* to_residual = own_residual.mutable_data();
-    for (Index i = 0; i < rows; ++i) {
-      if (goes[i] != which) continue;
-      to_keys = std::copy_n(keys.data() + i * k, k, to_keys);
-      to_jacobian = std::copy_n(jacobian.data() + i * width, width, to_jacobian);
-      *to_residual++ = residual.data()[i];
-      *to_owner++ = owner.data()[i];
-    }
-    const int at = which ? 4 : 0;
-    out[at] = own_keys, out[at + 1] = own_jacobian, out[at + 2] = own_residual, out[at + 3] = own_owner;
+  Kept(Index rows, Index k, Index width)
+      : keys(Shape{rows, k}), jacobian(Shape{rows, width}), residual(rows), owner(rows) {}
+
+  Index size() const { return owner.shape(0); }
+  void set(Index at, const Kept& from, Index row) {
+    const Index k = keys.shape(1), width = jacobian.shape(1);
+    std::copy_n(from.keys.data() + row * k, k, keys.mutable_data() + at * k);
+    std::copy_n(from.jacobian.data() + row * width, width, jacobian.mutable_data() + at * width);
+    residual.mutable_data()[at] = from.residual.data()[row];
+    owner.mutable_data()[at] = from.owner.data()[row];
   }
-  return out;
+  py::tuple columns() const { return py::make_tuple(keys, jacobian, residual, owner); }
+
+  Ints keys;
+  Array jacobian, residual;
+  Ints owner;
+};
+
+std::vector<bool> owned_by(const Kept& rows, const Ints& owners) {
+  std::vector<bool> is(rows.size());
+  for (Index i = 0; i < rows.size(); ++i)
+    is[i] = std::binary_search(owners.data(), owners.data() + owners.shape(0), rows.owner.data()[i]);
+  return is;
 }
 
-py::array_t<bool> rows_holding(const Ints& keys, const Ints& ascending) {
+py::tuple parted(const py::tuple& rows, const Ints& gone) {
+  const Kept all(rows);
+  const std::vector<bool> goes = owned_by(all, gone);
+  const Index count = std::count(goes.begin(), goes.end(), true);
+  Kept stay(all.size() - count, all.keys.shape(1), all.jacobian.shape(1));
+  Kept leave(count, all.keys.shape(1), all.jacobian.shape(1));
+  for (Index i = 0, kept = 0; i < all.size(); ++i)
+    goes[i] ? leave.set(i - kept, all, i) : stay.set(kept++, all, i);
+  return py::make_tuple(stay.columns(), leave.columns());
+}
+
+py::tuple replaced(const py::tuple& rows, const Ints& gone, const py::tuple& fresh, const Ints& keys,
+                   const Ints& starts, const Ints& key, const Ints& entry, const Array& change) {
+  const Kept old(rows), added(fresh);
+  const std::vector<bool> goes = owned_by(old, gone);
+  const Array residual = moved_residual(keys, starts, added.keys, key, entry, added.jacobian, added.residual, change);
+  Index at = old.size() - std::count(goes.begin(), goes.end(), true);
+  Kept out(at + added.size(), added.keys.shape(1), added.jacobian.shape(1));
+  for (Index i = 0; i < added.size(); ++i) {
+    out.set(at + i, added, i);
+    out.residual.mutable_data()[at + i] = residual.data()[i];
+  }
+  at = 0;
+  for (Index i = 0; i < old.size(); ++i)
+    if (!goes[i]) out.set(at++, old, i);
+  return out.columns();
+}
+
+Ints owners_holding(const Ints& keys, const Ints& owner, const Ints& ascending) {
   const Index rows = keys.shape(0), k = keys.shape(1);
   const Index* first = ascending.data();
   const Index* last = first + ascending.shape(0);
-  py::array_t<bool> out(rows);
+  std::vector<Index> found;
+  expect(owner.size() == rows);
   for (Index i = 0; i < rows; ++i) {
     const Index* own = keys.data() + i * k;
-    out.mutable_data()[i] =
-        std::any_of(own, own + k, [&](Index key) { return std::binary_search(first, last, key); });
+    if (std::any_of(own, own + k, [&](Index one) { return std::binary_search(first, last, one); }))
+      found.push_back(owner.data()[i]);
   }
-  return out;
+  return Ints(Shape{static_cast<Index>(found.size())}, found.data());
 }
 
-py::tuple relative_rows(const Array& root, const Array& right, const Array& local, const Array& values,
-                        const Ints& turning, const Ints& headings) {
+Columns relative_block(const Array& root, const Array& right, const Array& local, const Array& values,
+                       const Array& change, const Ints& turning, const Ints& headings) {
   const Index r = root.shape(0), q = local.shape(0), width = q + 3;
-  expect(root.size() == r * q && right.size() == r && values.size() == width);
+  expect(root.size() == r * q && right.size() == r && values.size() == width && change.size() == width);
   const double* frame = values.data() + q;
   const Turn turn(frame[2]);
   std::vector<double> there(values.data(), frame), off(q);
@@ -587,11 +689,12 @@ py::tuple relative_rows(const Array& root, const Array& right, const Array& loca
   }
   for (Index k = 0; k < headings.size(); ++k) there[headings.data()[k]] -= frame[2];
   for (Index j = 0; j < q; ++j) off[j] = there[j] - local.data()[j];
-  Array jacobian(Shape{r, width}), residual(r);
+  Columns block(Shape{r, width + 1});
+  std::vector<double> row(width);
+  double* J = row.data();
   for (Index i = 0; i < r; ++i) {
     const double* A = root.data() + i * q;
-    double* J = jacobian.mutable_data() + i * width;
-    double sum = -right.data()[i], by[3] = {0.0, 0.0, 0.0};
+    double sum = -right.data()[i], by[3] = {0.0, 0.0, 0.0}, now = 0.0;
     for (Index j = 0; j < q; ++j) sum += A[j] * off[j];
     std::copy_n(A, q, J);
     for (Index k = 0; k < turning.size(); ++k) {
@@ -602,9 +705,13 @@ py::tuple relative_rows(const Array& root, const Array& right, const Array& loca
     }
     for (Index k = 0; k < headings.size(); ++k) by[2] -= A[headings.data()[k]];
     std::copy_n(by, 3, J + q);
-    residual.mutable_data()[i] = sum;
+    for (Index j = 0; j < width; ++j) {
+      now += J[j] * change.data()[j];
+      block.mutable_data()[i + j * r] = J[j];
+    }
+    block.mutable_data()[i + width * r] = now - sum;
   }
-  return py::make_tuple(jacobian, residual);
+  return block;
 }
 
 Ints spread(const Ints& starts, const Ints& widths) {
@@ -617,6 +724,19 @@ Ints spread(const Ints& starts, const Ints& widths) {
   for (Index i = 0; i < count; ++i)
     for (Index j = 0; j < widths.data()[i]; ++j) *at++ = starts.data()[i] + j;
   return out;
+}
+
+py::tuple laid_out(const Ints& keys, Index sensor_key, Index first_pose, const py::tuple& sizes) {
+  const Index count = keys.shape(0);
+  const Index point = sizes[0].cast<Index>(), sensor = sizes[1].cast<Index>(), pose = sizes[2].cast<Index>();
+  Ints widths(count), starts(count);
+  Index total = 0;
+  for (Index i = 0; i < count; ++i) {
+    const Index key = keys.data()[i];
+    starts.mutable_data()[i] = total;
+    total += widths.mutable_data()[i] = key >= first_pose ? pose : key == sensor_key ? sensor : point;
+  }
+  return py::make_tuple(widths, starts, total);
 }
 
 // --- detections -------------------------------------------------------------------------------------------
@@ -721,6 +841,259 @@ py::tuple detection_rows(const Array& points, const Array& covariances, const Ar
       for (int c = 0; c < 2; ++c) J[3 + sensed + 2 * j + c] = -factor * basis.data()[i * p + j] * n[c];
   }
   return py::make_tuple(residual, sigma, jacobian);
+}
+
+// Detections chosen by row, and the poses at which they were made.
+struct Seen {
+  Seen(const Ints& rows, const Ints& cycles, const Array& measured, const Array& twists, const Array& poses,
+       Index first_cycle, const Array& sensor)
+      : cycle(rows.shape(0)), measured(Shape{rows.shape(0), 2}), twist(Shape{rows.shape(0), 3}),
+        pose(Shape{rows.shape(0), 3}) {
+    const Index all = cycles.shape(0);
+    expect(measured.size() == 2 * all && twists.size() == 3 * all);
+    for (Index i = 0; i < rows.shape(0); ++i) {
+      const Index row = rows.data()[i];
+      expect(row >= 0 && row < all);
+      const Index slot = cycles.data()[row] - first_cycle;
+      expect(slot >= 0 && slot < poses.shape(0));
+      cycle.mutable_data()[i] = cycles.data()[row];
+      std::copy_n(measured.data() + 2 * row, 2, this->measured.mutable_data() + 2 * i);
+      std::copy_n(twists.data() + 3 * row, 3, twist.mutable_data() + 3 * i);
+      std::copy_n(poses.data() + 3 * slot, 3, pose.mutable_data() + 3 * i);
+    }
+    points = to_map(sensor.size() ? shifted(this->measured, twist, sensor) : this->measured, pose);
+  }
+
+  Ints cycle;
+  Array measured, twist, pose, points;
+};
+
+Array placed(const Ints& rows, const Ints& cycles, const Array& measured, const Array& twists,
+             const Array& poses, Index first_cycle, const Array& sensor) {
+  return rows.size() ? Seen(rows, cycles, measured, twists, poses, first_cycle, sensor).points
+                     : Array(Shape{0, 2});
+}
+
+Array covariances_of(const Ints& rows, const Array& covariances) {
+  Array out(Shape{rows.shape(0), 2, 2});
+  for (Index i = 0; i < rows.shape(0); ++i)
+    std::copy_n(covariances.data() + 4 * rows.data()[i], 4, out.mutable_data() + 4 * i);
+  return out;
+}
+
+py::tuple curve_rows(const py::object& spans, const py::tuple& curves, const py::tuple& table, const Ints& cycles,
+                     const Array& poses, Index first_cycle, const Array& sensor, const py::tuple& limits,
+                     const py::tuple& names, const py::tuple& tolerances) {
+  const Array control_points = curves[0].cast<Array>(), trusted = curves[3].cast<Array>();
+  const Ints labels = curves[1].cast<Ints>(), control_keys = curves[2].cast<Ints>();
+  const Array active_from = curves[4].cast<Array>();
+  const Ints cycle = table[0].cast<Ints>(), boundary = table[1].cast<Ints>();
+  const py::array_t<bool> used = table[2].cast<py::array_t<bool>>();
+  const Array all_u = table[3].cast<Array>();
+  const double room = limits[0].cast<double>(), sigma_model = limits[3].cast<double>();
+  const double huber = limits[4].cast<double>();
+  const Index first_pose = names[0].cast<Index>(), sensor_key = names[1].cast<Index>();
+  expect(boundary.size() == cycle.size() && used.size() == cycle.size() && all_u.size() == cycle.size());
+  std::vector<Index> chosen;
+  for (Index i = 0; i < cycle.shape(0); ++i)
+    if (used.data()[i] && std::binary_search(cycles.data(), cycles.data() + cycles.shape(0), cycle.data()[i]))
+      chosen.push_back(i);
+  const Index m = static_cast<Index>(chosen.size());
+  const Ints rows(Shape{m}, chosen.data());
+  const Seen seen(rows, cycle, table[4].cast<Array>(), table[5].cast<Array>(), poses, first_cycle, sensor);
+  Ints curve(m);
+  Array u(m), low(m), high(m);
+  for (Index i = 0; i < m; ++i) {
+    const Index k = std::lower_bound(labels.data(), labels.data() + labels.shape(0), boundary.data()[chosen[i]]) -
+                    labels.data();
+    expect(k < labels.shape(0));
+    const double at = all_u.data()[chosen[i]];
+    curve.mutable_data()[i] = k;
+    u.mutable_data()[i] = at;
+    low.mutable_data()[i] = at - room;
+    high.mutable_data()[i] = std::min(at + room, trusted.data()[k]);
+  }
+  const py::tuple foot = refined(spans, control_points, seen.points, curve, u, low, high, limits[1].cast<int>(),
+                                 limits[2].cast<int>(), tolerances);
+  const Array found = foot[0].cast<Array>(), basis = foot[6].cast<Array>();
+  const py::array_t<bool> interior = foot[5].cast<py::array_t<bool>>();
+  const Ints columns = foot[8].cast<Ints>();
+  const py::tuple terms =
+      detection_rows(seen.points, covariances_of(rows, table[6].cast<Array>()), seen.pose, foot[3].cast<Array>(),
+                     foot[4].cast<Array>(), basis, seen.measured, seen.twist, sensor, sigma_model);
+  Array residual = terms[0].cast<Array>(), jacobian = terms[2].cast<Array>();
+  const Array sigma = terms[1].cast<Array>();
+  const Index p = basis.shape(1), width = jacobian.shape(1), head = sensor.size() ? 2 : 1;
+  Ints keys(Shape{m, head + p});
+  bool reached = false;
+  const bool periodic = spans.attr("periodic").cast<bool>();
+  for (Index i = 0; i < m; ++i) {
+    const double r = residual.data()[i], s = sigma.data()[i];
+    double weight = std::sqrt(1.0 / std::max(std::abs(r / s) / huber, 1.0));
+    weight *= (interior.data()[i] ? 1.0 : 0.0) / s;
+    residual.mutable_data()[i] = r * weight;
+    for (Index j = 0; j < width; ++j) jacobian.mutable_data()[i * width + j] *= weight;
+    Index* own = keys.mutable_data() + i * (head + p);
+    own[0] = first_pose + seen.cycle.data()[i];
+    if (head == 2) own[1] = sensor_key;
+    for (Index j = 0; j < p; ++j) own[head + j] = control_keys.data()[columns.data()[i * p + j]];
+    reached |= !periodic && found.data()[i] <= active_from.data()[curve.data()[i]];
+  }
+  return py::make_tuple(rows, found, reached, py::make_tuple(keys, jacobian, residual, seen.cycle));
+}
+
+// --- association ------------------------------------------------------------------------------------------
+
+py::tuple open_rows(const Ints& labels, const Ints& since, const Ints& label, const Ints& boundary,
+                    const py::array_t<bool>& used, Index unknown) {
+  std::vector<Index> rows, curve;
+  expect(boundary.size() == label.size() && used.size() == label.size() && since.size() == labels.size());
+  for (Index k = 0; k < labels.shape(0); ++k)
+    for (Index i = since.data()[k]; i < label.shape(0); ++i) {
+      const bool colourless = label.data()[i] == unknown;
+      const bool is_open = used.data()[i] ? colourless && boundary.data()[i] != labels.data()[k]
+                                          : colourless || label.data()[i] == labels.data()[k];
+      if (is_open) rows.push_back(i), curve.push_back(k);
+    }
+  const Shape shape{static_cast<Index>(rows.size())};
+  return py::make_tuple(Ints(shape, rows.data()), Ints(shape, curve.data()));
+}
+
+py::tuple in_view(const py::object& spans, const Array& control_points, const Array& trusted, const Array& points,
+                  const Ints& curve, const Ints& slot, const py::list& pose_u, const Array& pose,
+                  const py::tuple& rooms, double step, int iterations, const py::tuple& tolerances) {
+  const Index m = points.shape(0), curves = static_cast<Index>(pose_u.size());
+  const double room[4] = {rooms[0].cast<double>(), rooms[1].cast<double>(), rooms[2].cast<double>(),
+                          rooms[3].cast<double>()};
+  expect(points.size() == 2 * m && curve.size() == m && slot.size() == m && trusted.size() == curves);
+  expect(pose.size() == 3);
+  std::vector<Array> beside;
+  for (const py::handle& own : pose_u) beside.push_back(own.cast<Array>()), expect(beside.back().size() > 0);
+  Array all(Shape{m + curves, 2}), low(m + curves), high(m + curves);
+  Ints number(m + curves);
+  for (Index i = 0; i < m + curves; ++i) {
+    const Index k = i < m ? curve.data()[i] : i - m;
+    expect(k >= 0 && k < curves);
+    const Array& own = beside[k];
+    const Index last = own.shape(0) - 1;
+    const double u = own.data()[i < m ? std::min(slot.data()[i], last) : last];
+    const double* point = i < m ? points.data() + 2 * i : pose.data();
+    std::copy_n(point, 2, all.mutable_data() + 2 * i);
+    number.mutable_data()[i] = k;
+    low.mutable_data()[i] = u - room[i < m ? 0 : 2];
+    high.mutable_data()[i] = std::min(u + room[i < m ? 1 : 3], trusted.data()[k]);
+  }
+  const py::tuple foot = searched(spans, control_points, all, number, low, high, step, iterations, tolerances);
+  const Array u = foot[0].cast<Array>(), tangent = foot[2].cast<Array>(), distance = foot[4].cast<Array>();
+  py::tuple of_rows(9);
+  for (int j = 0; j < 9; ++j) of_rows[j] = foot[j][py::slice(0, m, 1)];
+  py::list along;
+  const Turn turn(pose.data()[2]);
+  for (Index i = m; i < m + curves; ++i) {
+    const double* t = tangent.data() + 2 * i;
+    along.append(py::make_tuple(u.data()[i], t[0] * turn.c + t[1] * turn.s, distance.data()[i]));
+  }
+  return py::make_tuple(of_rows, along);
+}
+
+double variance_across(const double* n, const double* K, double theta) {
+  const Turn turn(theta);
+  const double x = turn.c * n[0] + turn.s * n[1], y = -turn.s * n[0] + turn.c * n[1];
+  return x * x * K[0] + 2.0 * x * y * K[1] + y * y * K[3];
+}
+
+py::tuple gated(const Ints& rows, const Ints& cycle, const Ints& label, const Array& covariances, const Array& poses,
+                Index first_cycle, const py::tuple& foot, const py::tuple& limits) {
+  const Index m = rows.shape(0);
+  const Array normals = foot[0].cast<Array>(), distances = foot[1].cast<Array>();
+  const py::array_t<bool> interior = foot[2].cast<py::array_t<bool>>();
+  const double sigma_model = limits[0].cast<double>(), floor = limits[1].cast<double>();
+  const double rough = limits[2].cast<double>(), chi = limits[3].cast<double>();
+  const double chi_unknown = limits[4].cast<double>();
+  const Index unknown = limits[5].cast<Index>();
+  expect(normals.size() == 2 * m && distances.size() == m && interior.size() == m);
+  Array variances(m);
+  py::array_t<bool> accepted(m), doubtful(m);
+  for (Index i = 0; i < m; ++i) {
+    const Index row = rows.data()[i];
+    const double theta = poses.data()[3 * (cycle.data()[row] - first_cycle) + 2];
+    const double across = std::sqrt(
+        variance_across(normals.data() + 2 * i, covariances.data() + 4 * row, theta) + sigma_model * sigma_model);
+    const double variance = across * across + floor * floor, d = distances.data()[i];
+    const bool colourless = label.data()[row] == unknown, near = interior.data()[i] && std::abs(d) < rough;
+    const double limit = colourless ? chi_unknown : chi;
+    variances.mutable_data()[i] = variance;
+    accepted.mutable_data()[i] = near && d * d < limit * limit * variance;
+    doubtful.mutable_data()[i] = near && !accepted.data()[i] && !colourless;
+  }
+  return py::make_tuple(variances, accepted, doubtful);
+}
+
+// --- tentative tracks -------------------------------------------------------------------------------------
+
+void inverse2(const double* A, double* out);
+
+// The tracks with detections merged into them; the new ones come last.
+py::tuple merged(const py::tuple& known, const Array& points, const Array& covariances, double t,
+                 const py::tuple& limits) {
+  const Array place = known[0].cast<Array>(), inform = known[1].cast<Array>(), stamps = known[3].cast<Array>();
+  const Ints number = known[2].cast<Ints>();
+  const double radius = limits[0].cast<double>(), most = limits[1].cast<double>(), chi = limits[2].cast<double>();
+  const Index n = place.shape(0), m = points.shape(0);
+  expect(inform.size() == 4 * n && number.size() == n && stamps.size() == n);
+  expect(points.size() == 2 * m && covariances.size() == 4 * m);
+  std::vector<Index> track(m, -1);
+  Index count = n;
+  for (Index i = 0; i < m; ++i) {
+    const double* z = points.data() + 2 * i;
+    double least = kInfinity;
+    for (Index j = 0; j < n; ++j) {
+      const double distance = std::hypot(z[0] - place.data()[2 * j], z[1] - place.data()[2 * j + 1]);
+      if (distance < least) least = distance, track[i] = j;
+    }
+    if (least < radius) continue;
+    track[i] = -1, least = chi * chi;
+    for (Index j = 0; j < n; ++j) {
+      const double dx = z[0] - place.data()[2 * j], dy = z[1] - place.data()[2 * j + 1];
+      if (!(dx * dx + dy * dy < most * radius * (most * radius))) continue;
+      double joint[4], weight[4];
+      inverse2(inform.data() + 4 * j, joint);
+      for (int k = 0; k < 4; ++k) joint[k] += covariances.data()[4 * i + k];
+      inverse2(joint, weight);
+      const double square = dx * (weight[0] * dx + weight[1] * dy) + dy * (weight[2] * dx + weight[3] * dy);
+      if (square < least) least = square, track[i] = j;
+    }
+    if (track[i] < 0) ++count;
+  }
+  Array place_out(Shape{count, 2}), inform_out(Shape{count, 2, 2}), stamps_out(count);
+  Ints number_out(count);
+  std::copy_n(place.data(), 2 * n, place_out.mutable_data());
+  std::copy_n(inform.data(), 4 * n, inform_out.mutable_data());
+  std::copy_n(stamps.data(), n, stamps_out.mutable_data());
+  std::copy_n(number.data(), n, number_out.mutable_data());
+  for (Index i = 0, next = n; i < m; ++i) {
+    const double* z = points.data() + 2 * i;
+    double weight[4];
+    inverse2(covariances.data() + 4 * i, weight);
+    if (track[i] < 0) {
+      std::copy_n(z, 2, place_out.mutable_data() + 2 * next);
+      std::copy_n(weight, 4, inform_out.mutable_data() + 4 * next);
+      number_out.mutable_data()[next] = 1, stamps_out.mutable_data()[next++] = t;
+      continue;
+    }
+    double* at = place_out.mutable_data() + 2 * track[i];
+    double* sum = inform_out.mutable_data() + 4 * track[i];
+    double gain[4];
+    for (int k = 0; k < 4; ++k) sum[k] += weight[k];
+    const double dx = z[0] - at[0], dy = z[1] - at[1];
+    const double gx = weight[0] * dx + weight[1] * dy, gy = weight[2] * dx + weight[3] * dy;
+    inverse2(sum, gain);
+    at[0] += gain[0] * gx + gain[1] * gy, at[1] += gain[2] * gx + gain[3] * gy;
+    ++number_out.mutable_data()[track[i]];
+    double& last = stamps_out.mutable_data()[track[i]];
+    last = std::max(last, t);  // a late detection makes no track older
+  }
+  return py::make_tuple(place_out, inform_out, number_out, stamps_out);
 }
 
 // --- odometry and path ------------------------------------------------------------------------------------
@@ -862,6 +1235,32 @@ py::tuple odometry_residuals(const Array& starts, const Array& ends, const Array
     S[5] += -a * along - h * across;
   }
   return py::make_tuple(residuals, by_start, by_end);
+}
+
+py::tuple whitened_odometry(const Array& starts, const Array& ends, const Array& deltas, const Array& whiteners,
+                            const Array& by_calibration, const Array& calibration, double series_below) {
+  const Index m = deltas.shape(0);
+  expect(whiteners.size() == 9 * m && by_calibration.size() == 6 * m && calibration.size() == 2);
+  const py::tuple own = odometry_residuals(starts, ends, deltas, series_below);
+  const Array plain = own[0].cast<Array>(), by_start = own[1].cast<Array>(), by_end = own[2].cast<Array>();
+  Array residual(Shape{m, 3}), jacobian(Shape{m, 3, 8});
+  for (Index i = 0; i < m; ++i) {
+    const double* G = by_calibration.data() + 6 * i;
+    double D[3][9];
+    for (int r = 0; r < 3; ++r) {
+      std::copy_n(G + 2 * r, 2, D[r]);
+      std::copy_n(by_start.data() + 9 * i + 3 * r, 3, D[r] + 2);
+      std::copy_n(by_end.data() + 9 * i + 3 * r, 3, D[r] + 5);
+      D[r][8] = plain.data()[3 * i + r] + (G[2 * r] * calibration.data()[0] + G[2 * r + 1] * calibration.data()[1]);
+    }
+    for (int r = 0; r < 3; ++r) {
+      const double* W = whiteners.data() + 9 * i + 3 * r;
+      double* J = jacobian.mutable_data() + 24 * i + 8 * r;
+      for (int c = 0; c < 8; ++c) J[c] = W[0] * D[0][c] + W[1] * D[1][c] + W[2] * D[2][c];
+      residual.mutable_data()[3 * i + r] = W[0] * D[0][8] + W[1] * D[1][8] + W[2] * D[2][8];
+    }
+  }
+  return py::make_tuple(residual, jacobian);
 }
 
 // --- scan matching ----------------------------------------------------------------------------------------
@@ -1121,20 +1520,26 @@ PYBIND11_MODULE(_kernels, module) {
   module.doc() = "Kernels over rows; pathspace_graph.factors.kernels says which functions they take the place of.";
   module.def("searched", &searched);
   module.def("refined", &refined);
-  module.def("add_rows", &add_rows, py::arg("hessian").noconvert(), py::arg("gradient").noconvert(),
-             py::arg("keys"), py::arg("starts"), py::arg("sought"), py::arg("key"), py::arg("entry"),
-             py::arg("jacobian"), py::arg("residual"), py::arg("change"));
-  module.def("add_prior", &add_prior, py::arg("hessian").noconvert(), py::arg("gradient").noconvert(),
-             py::arg("information"), py::arg("vector"), py::arg("entries"), py::arg("change"));
+  module.def("summed", &summed);
+  module.def("block_of", &block_of);
   module.def("moved_residual", &moved_residual);
   module.def("parted", &parted);
-  module.def("relative_rows", &relative_rows);
-  module.def("rows_holding", &rows_holding);
+  module.def("relative_block", &relative_block);
+  module.def("replaced", &replaced);
+  module.def("owners_holding", &owners_holding);
+  module.def("laid_out", &laid_out);
   module.def("columns_of", &columns_of);
   module.def("by_sensor", &by_sensor);
   module.def("shifted", &shifted);
   module.def("to_map", &to_map);
   module.def("detection_rows", &detection_rows);
+  module.def("placed", &placed);
+  module.def("curve_rows", &curve_rows);
+  module.def("open_rows", &open_rows);
+  module.def("in_view", &in_view);
+  module.def("gated", &gated);
+  module.def("merged", &merged);
+  module.def("whitened_odometry", &whitened_odometry);
   module.def("along_and_across", &along_and_across);
   module.def("odometry_residuals", &odometry_residuals);
   module.def("integrated", &integrated);

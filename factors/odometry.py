@@ -153,6 +153,40 @@ def _odometry_residuals(
     return residuals, by_start, by_end
 
 
+def whitened_odometry(
+    poses_start: Array,
+    poses_end: Array,
+    deltas: Array,
+    whiteners: Array,
+    by_calibration: Array,
+    calibration: Array,
+) -> tuple[Array, Array]:
+    """Return `W (r + G b)` (m, 3) with r of `odometry_residuals`, and its derivatives (m, 3, 8).
+
+    W (m, 3, 3) are whiteners, and G (m, 3, 2) the derivatives by the calibration b (2,). The results are
+    derivatives by [b | start | end].
+    """
+    measured = deltas, whiteners, by_calibration, calibration
+    return _whitened_odometry(poses_start, poses_end, *measured, _SERIES_BELOW)
+
+
+@compiled
+def _whitened_odometry(
+    poses_start: Array,
+    poses_end: Array,
+    deltas: Array,
+    whiteners: Array,
+    by_calibration: Array,
+    calibration: Array,
+    series_below: float,
+) -> tuple[Array, Array]:
+    """Return `whitened_odometry`, with a series where |phi| is below a limit (rad)."""
+    residual, *by_poses = _odometry_residuals(poses_start, poses_end, deltas, series_below)
+    residual = residual + by_calibration @ calibration
+    jacobian = whiteners @ np.concatenate([by_calibration, *by_poses], axis=2)
+    return (whiteners @ residual[:, :, None])[:, :, 0], jacobian
+
+
 def _inverse_left_terms(phi: Array, series_below: float) -> tuple[Array, Array]:
     """Return `a = (phi/2) cot(phi/2)` of SE(2)'s inverse left Jacobian, and da/dphi."""
     small = np.abs(phi) < series_below

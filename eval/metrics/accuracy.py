@@ -5,7 +5,7 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from scipy.interpolate import Akima1DInterpolator
+import scipy  # which imports its modules when they are used
 from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
@@ -138,7 +138,7 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     length = lengths_along(nodes)
     low, high = (length[_OVERLAP], length[-_OVERLAP - 1]) if closed else (length[0], length[-1])
     samples = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
-    return np.asarray(Akima1DInterpolator(length, nodes)(samples), dtype=float)
+    return np.asarray(scipy.interpolate.Akima1DInterpolator(length, nodes)(samples), dtype=float)
 
 
 def driving_order(truth: Truth, label: int) -> Array:

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import scipy  # which imports its modules when they are used
 from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
@@ -119,7 +119,7 @@ def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array
     out: it is a missed cone and a ghost, not an error.
     """
     distances = cdist(boundary.points, cones) if len(cones) and boundary.size else np.zeros((0, 0))
-    landmark, cone = linear_sum_assignment(np.minimum(distances, MISSED_DISTANCE))
+    landmark, cone = scipy.optimize.linear_sum_assignment(np.minimum(distances, MISSED_DISTANCE))
     paired = distances[landmark, cone] <= MISSED_DISTANCE
     landmark, cone = landmark[paired], cone[paired]
     columns = (2 * landmark[:, None] + np.arange(2)).ravel()

@@ -9,7 +9,7 @@ from functools import cache
 from typing import Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy  # which imports its modules when they are used
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
@@ -55,7 +55,7 @@ def associate(cost: Array, gates: Gates) -> Association:
     cost (m, n) holds squared Mahalanobis distances of detections to landmarks, infinite for other labels.
     """
     landmark = np.full(len(cost), UNASSOCIATED, np.intp)
-    rows, columns = linear_sum_assignment(np.minimum(cost, gates.match))
+    rows, columns = scipy.optimize.linear_sum_assignment(np.minimum(cost, gates.match))
     chosen = cost[rows, columns] < gates.match
     landmark[rows[chosen]] = columns[chosen]
     return Association(landmark, np.asarray((cost > gates.create).all(axis=1)))

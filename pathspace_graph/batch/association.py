@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import minimum_filter1d
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import project
@@ -85,7 +85,8 @@ def _along(square: Array, steps: Array) -> IntArray:
     """
     total, reach = square.copy(), np.ceil(steps).astype(np.intp)
     for k in range(1, len(total)):
-        total[k] += minimum_filter1d(total[k - 1], 2 * int(reach[k - 1]) + 1, mode="nearest")
+        padded = total[k - 1].take(np.arange(-reach[k - 1], total.shape[1] + reach[k - 1]), mode="clip")
+        total[k] += sliding_window_view(padded, 2 * int(reach[k - 1]) + 1).min(axis=1)
     samples = np.empty(len(total), np.intp)
     samples[-1:] = total[-1:].argmin(axis=1)
     for k in range(len(total) - 1, 0, -1):

@@ -91,14 +91,15 @@ class FrontEnd:
         sides = self._sides
         swapped, colourless = sides.swapped, sides.colourless
         labels = sides.update(self._motion.pose, motion.twists, checked, in_lane=in_lane).labels
+        columns = detections.points_vehicle, detections.covariances
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
-        judged = replace(noise.for_map(detections), labels=labels)
+        judged = noise.for_map(Detections(detections.t, *columns, labels))
         # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
         if not (self._sensor_doubted or noise.of_detections):
             self._sensor_doubted = self._motion.errors.contradict(self._settings.calibration)
         orange, seen, stated = noise.for_map(orange), self._motion.seen_again, detections.covariances
-        measured = self._measured(odometry, replace(detections, labels=labels), motion)
+        measured = self._measured(odometry, Detections(detections.t, *columns, labels), motion)
         doubted = self._sensor_doubted
         return Reading(motion, judged, seen, orange, stated, doubted, measured, "; ".join(notices))
 

@@ -35,6 +35,7 @@ MIN_SIGMA: Final = 1e-6
 MAX_SIGMA: Final = 100.0  # least and largest standard deviation of a detection in any direction, m
 MIN_DETERMINANT: Final = 1e-12  # least det of a covariance over xx * yy: singular to doubles below
 MAX_ASYMMETRY: Final = 1e-6  # largest |xy - yx| of a covariance by its larger eigenvalue
+_KNOWN_LABELS: Final = "one of " + ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
 _COVARIANCES: Final = (MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA, MAX_SIGMA)
 
 
@@ -209,9 +210,11 @@ def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, A
     twists = _numbers(odometry.twist, "odometry.twist", (len(stamps), len(TWIST)))
     if len(stamps) > MAX_TWISTS:
         raise ReadingError("odometry.t", f"at most {MAX_TWISTS} twists", len(stamps))
-    _require(np.abs(stamps) <= MAX_STAMP, "odometry.t", f"at most {MAX_STAMP:g} s ({UNITS})", stamps)
-    later = np.append(True, stamps[1:] > stamps[:-1])[: len(stamps)]
-    _require(later, "odometry.t", "a stamp later than the one before", stamps)
+    within, later = np.abs(stamps) <= MAX_STAMP, np.ones(len(stamps), bool)
+    later[1:] = stamps[1:] > stamps[:-1]
+    if not (within & later).all():
+        _require(within, "odometry.t", f"at most {MAX_STAMP:g} s ({UNITS})", stamps)
+        _require(later, "odometry.t", "a stamp later than the one before", stamps)
     most = limits.speed, limits.speed, limits.yaw_rate
     good = np.abs(twists) <= most
     if not good.all():
@@ -287,8 +290,7 @@ def _labels(values: Any, count: int) -> IntArray:
     labels = _array(values, field, (count,))
     if count and labels.dtype.kind not in "iu":
         raise ReadingError(field, "integers", labels.dtype)
-    known = ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
-    _require((labels >= LEFT) & (labels < len(NAMES)), field, f"one of {known}", labels)
+    _require((labels >= LEFT) & (labels < len(NAMES)), field, _KNOWN_LABELS, labels)
     return labels.astype(np.int_)
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
-from scipy.optimize import nnls
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights
@@ -205,15 +204,23 @@ def _ray_noise(cones: _Cones, left: _Residuals, axis: int) -> RayNoise:
     scatter = np.array([(MAD * np.median(np.abs(off[one]))) ** 2 for one in bins])
     known = np.array([reference[one].mean() for one in bins])
     sigma = np.sqrt(np.clip(scatter - known, 0.25 * scatter, 4.0 * scatter))
-    (begin, growth), _ = nnls(
-        np.stack([np.ones(len(middle)), middle], axis=1) / sigma[:, None], np.ones(len(sigma))
-    )
     least = (LEAST[0], 0.0) if axis == 0 else (0.0, LEAST[1])
-    found = RayNoise(np.maximum([begin, growth], least))
+    found = RayNoise(np.maximum(_line(middle, sigma), least))
     share, time = _staying(cones, left, axis, found)
     count = len(np.unique(cones.table.cone[left.rows]))
     share = (count * share + FIRST_CONES * FIRST_SHARE) / (count + FIRST_CONES)
     return replace(found, share=share, time=time)
+
+
+def _line(ranges: Array, sigma: Array) -> Array:
+    """Return `a, b >= 0` with the least `sum ((a + b r) / sigma - 1)^2` for sigmas (k,) at ranges r (k,)."""
+    columns = np.stack([np.ones(len(ranges)), ranges], axis=1) / sigma[:, None]
+    line = np.linalg.lstsq(columns, np.ones(len(sigma)))[0]
+    if (line >= 0.0).all():
+        return np.asarray(line)
+    share = columns.sum(axis=0) / (columns**2).sum(axis=0)  # of either alone
+    best = int(((share * columns - 1.0) ** 2).sum(axis=0).argmin())
+    return np.asarray(share * (np.arange(2) == best))
 
 
 def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tuple[float, float]:

@@ -7,7 +7,12 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrated_odometry
+from pathspace_graph.factors.odometry import (
+    CALIBRATION_SIZE,
+    IntegratedOdometry,
+    integrate_twists,
+    integrated_odometry,
+)
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, integrate_odometry
@@ -73,7 +78,8 @@ class MotionCheck:
         t, measured = detections.t, detections.points_vehicle
         motion = self._integrate(odometry, t)
         columns = by_errors(measured, motion.odometry.twist)
-        detections = replace(detections, points_vehicle=measured + columns @ self.errors.mean)
+        points, covariances = measured + columns @ self.errors.mean, detections.covariances
+        detections = Detections(t, points, covariances, detections.labels)
         variances = 0.5 * (detections.covariances[:, 0, 0] + detections.covariances[:, 1, 1])
         self._recent.forget(t)
         self._recent.correct(self.errors.mean)
@@ -108,16 +114,17 @@ class MotionCheck:
             return MeasuredMotion(none, odometry.twist, missing=self._t is not None)
         measured, (before, twist) = odometry.t, self._reading
         if self._t is not None and measured[0] <= self._t and (odometry.twist[0] == twist).all():
-            measured = np.append(before, measured[1:])  # the first row only goes on with the last twist
+            measured = np.concatenate([[before], measured[1:]])  # the first row only goes on with it
         self._reading = float(measured[-1]), odometry.twist[-1]
-        self._interval = min(self._interval, float(np.diff(measured).min(initial=np.inf)))
-        ages = np.append(odometry.t[1:], t) - measured
-        held = np.maximum(ages - max(HOLD, HOLD_INTERVALS * self._interval), 0.0)
-        excess, missing = np.zeros(3), bool(held[-1] > 0.0)
+        if len(measured) > 1:
+            self._interval = min(self._interval, float((measured[1:] - measured[:-1]).min()))
+        ends = np.concatenate([odometry.t[1:], [t]])
+        held = np.maximum(ends - measured - max(HOLD, HOLD_INTERVALS * self._interval), 0.0)
+        excess, missing, durations = np.zeros(3), bool(held[-1] > 0.0), ends - odometry.t
         if missing or held.any():
             excess = held[:, None] * np.array(self.settings.accelerations)
-        integrated = integrate_odometry(odometry, t, np.hypot(self.sigma, excess))
-        durations, stuck = np.diff(np.append(odometry.t, t)), _is_stuck(odometry.twist)
+        integrated = integrate_twists(durations, odometry.twist, np.hypot(self.sigma, excess))
+        stuck = _is_stuck(odometry.twist)
         return MeasuredMotion(integrated, odometry.twist, False, missing, stuck, None, durations, excess)
 
     def _at_rest(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:

@@ -84,10 +84,11 @@ class NoiseLearner:
         if not self.of_sensor or measured is None or measured.along is None:
             return detections
         covariances = measured.covariances(points, inflated=False) if self.of_detections else None
-        return replace(
-            detections,
-            points_vehicle=measured.corrected(points, twist, shown=True),
-            covariances=detections.covariances if covariances is None else covariances,
+        return Detections(
+            detections.t,
+            measured.corrected(points, twist, shown=True),
+            detections.covariances if covariances is None else covariances,
+            detections.labels,
         )
 
     def for_map(self, detections: Detections) -> Detections:
@@ -98,7 +99,7 @@ class NoiseLearner:
         covariances = measured.covariances(points, inflated=True) if self.of_detections else None
         if covariances is None:
             covariances = measured.inflated(points, detections.covariances)
-        return replace(detections, covariances=covariances)
+        return Detections(detections.t, points, covariances, detections.labels)
 
     def for_lap(
         self, motions: Sequence[MeasuredMotion], detections: Sequence[Detections]
@@ -109,7 +110,18 @@ class NoiseLearner:
         """
         if self.of_odometry and self.measured is not None:
             motions = [motion.with_sigma(self.twist_sigma) for motion in motions]
-        return list(motions), [self.for_map(cycle) for cycle in detections]
+        counts = [len(cycle.labels) for cycle in detections]
+        stated = Detections(
+            0.0,
+            np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in detections)]),
+            np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in detections)]),
+            np.zeros(sum(counts), np.intp),
+        )
+        used = np.split(self.for_map(stated).covariances, np.cumsum(counts)[:-1])
+        return list(motions), [
+            Detections(cycle.t, cycle.points_vehicle, covariances, cycle.labels)
+            for cycle, covariances in zip(detections, used, strict=True)
+        ]
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
         """Return settings with measured priors of the calibrations where one of the old ones is contradicted.

@@ -87,8 +87,9 @@ class Follower:
         detections, pose = cycle.detections, cycle.pose
         self._follow_bias(detections.t, pose)
         keep = self._last > detections.t - MAX_AGE
-        for name in COLUMNS:
-            setattr(self, name, getattr(self, name)[keep])
+        if not keep.all():
+            for name in COLUMNS:
+                setattr(self, name, getattr(self, name)[keep])
         ranges = np.hypot(*detections.points_vehicle.T)
         order = np.argsort(ranges, kind="stable")
         order = order[ranges[order] < MAX_RANGE]
@@ -96,7 +97,7 @@ class Follower:
         points = to_map(self._known.corrected(measured, cycle.twist), pose[None])
         rows, cones = self._assign(points, detections.labels[order], ranges[order], pose, detections.t)
         stamps = np.full(len(rows), detections.t)
-        shared = (np.tile(one, (len(rows), 1)) for one in (cycle.twist, pose, self._by_bias))
+        shared = (one[None].repeat(len(rows), axis=0) for one in (cycle.twist, pose, self._by_bias))
         return Sightings(cones, stamps, measured[rows], *shared)
 
     def _follow_bias(self, t: float, pose: Array) -> None:
@@ -114,7 +115,8 @@ class Follower:
             round_gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
             return round_gate, round_gate
         along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
-        return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
+        along, across = (np.minimum(np.maximum(one, GATE_LEAST), GATE_MOST) for one in (along, across))
+        return along, across
 
     def _assign(
         self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float
@@ -127,13 +129,14 @@ class Follower:
             points, labels, ranges, pose[:2], along, across, *known, FOLLOWING
         )
         new = np.flatnonzero(place >= count)
-        own, first = np.unique(place[new], return_index=True)
-        first = new[first]
-        numbers = self._count + np.arange(len(own))
-        added = points[first], labels[first], ranges[first], np.full(len(first), t), numbers
-        for name, values in zip(COLUMNS, added, strict=True):
-            setattr(self, name, np.concatenate([getattr(self, name), values]))
-        self._count += len(own)
+        if len(new):
+            own, first = np.unique(place[new], return_index=True)
+            first = new[first]
+            numbers = self._count + np.arange(len(own))
+            added = points[first], labels[first], ranges[first], np.full(len(first), t), numbers
+            for name, values in zip(COLUMNS, added, strict=True):
+                setattr(self, name, np.concatenate([getattr(self, name), values]))
+            self._count += len(own)
         rows = np.concatenate([np.flatnonzero((place >= 0) & (place < count)), new])
         self._last[place[rows]] = t
         return rows, self._cones[place[rows]]

@@ -16,7 +16,7 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.linear import linear_factor
 
-from .variables import POINT, Layout, Variables, names, sizes
+from .variables import POINT, Layout, Variables, names, sizes, spread
 
 GraphPart = (
     gtsam.GaussianFactor | gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet | gtsam.GaussianBayesTree
@@ -286,13 +286,26 @@ def merge_variables(
 def substitute_points(
     graph: gtsam.GaussianFactorGraph, old: IntArray, new: IntArray, change: Array, offset: Array, sigma: float
 ) -> gtsam.GaussianFactorGraph:
-    """Return the graph where points `new` (k,) replace points `old` (n,), as one factor and an elimination.
+    """Return the graph, as one factor, where points `new` (k,) replace points `old` (n,).
 
     The unknowns satisfy `d_old = (E x I) d_new + offset + N(0, sigma^2)`, with E the matrix `change` (n, k)
     and `offset` (2 n,). The information about the old points is carried over, reduced by a shift of sigma
-    (m).
+    (m): LAPACK eliminates them from the sum of both.
     """
-    E = np.kron(change, np.eye(POINT))
-    A = np.concatenate([np.eye(len(E)), -E], axis=1) / sigma
-    substitution = jacobian_factor(np.append(old, new), A, offset / sigma)
-    return eliminate(graph_of(graph, substitution), old)[1]
+    held, E, weight = Layout(keys_of(graph)), np.kron(change, np.eye(POINT)), sigma**-2
+    information, vector = normal_equations(graph, held)
+    keys = np.concatenate([old, np.setdiff1d(held.keys, old), new])
+    widths, (count, added) = sizes(keys), E.shape
+    known = held.positions(keys) >= 0
+    at, own = spread((widths.cumsum() - widths)[known], widths[known]), held.entries(keys[known])
+    H, g = np.zeros((widths.sum(), widths.sum())), np.zeros(widths.sum())
+    H[np.ix_(at, at)], g[at] = information[np.ix_(own, own)], vector[own]
+    H[:count, :count] += weight * np.eye(count)
+    H[:count, -added:], H[-added:, -added:] = -weight * E, np.kron(weight * change.T @ change, np.eye(POINT))
+    g[:count] += weight * offset
+    g[-added:] -= weight * offset @ E
+    root = cholesky(np.asfortranarray(H[:count, :count]))
+    half = half_solve(root, np.asfortranarray(np.column_stack([H[:count, count:], g[:count]])))
+    carried, pull = half[:, :-1], half[:, -1]
+    rows = square_root_form(H[count:, count:] - carried.T @ carried, g[count:] - pull @ carried)
+    return graph_of(as_hessian_factor(graph_of(jacobian_factor(keys[len(old) :], *rows))))

@@ -58,11 +58,13 @@ class RelativeFactor:
         """
         keys = np.append(self.keys.keys, self.frame)
         entries = variables.layout.entries(keys)
-        values, columns = variables.values[entries], (self.keys.turning, self.keys.headings)
-        jacobian, residual = _relative_rows(self.root, self.right, self.local, values, *columns)
-        now = variables.change(entries)
-        fixed = np.repeat(keys == ORIGIN_KEY, np.append(self.keys.widths, POSE))
-        return jacobian_factor(keys[keys != ORIGIN_KEY], jacobian[:, ~fixed], jacobian @ now - residual)
+        now, columns = (variables.values[entries], variables.change(entries)), self.keys
+        block = _relative_block(self.root, self.right, self.local, *now, columns.turning, columns.headings)
+        widths, moves = np.append(self.keys.widths, POSE), keys != ORIGIN_KEY
+        if not moves.all():
+            block = np.asfortranarray(block[:, np.append(np.repeat(moves, widths), True)])
+        matrix = gtsam.VerticalBlockMatrix([*widths[moves].tolist(), 1], block, False)
+        return gtsam.GaussianConditional(keys[moves].tolist(), 1, matrix)
 
     def without(self, keys: IntArray) -> RelativeFactor:
         """Return the factor without information about some keys."""
@@ -100,13 +102,19 @@ def relative_factor(
 
 
 @compiled
-def _relative_rows(
-    root: Array, right: Array, local: Array, values: Array, turning: IntArray, headings: IntArray
-) -> tuple[Array, Array]:
-    """Return the derivatives (r, q + 3) and residuals (r,) of a relative factor.
+def _relative_block(
+    root: Array,
+    right: Array,
+    local: Array,
+    values: Array,
+    change: Array,
+    turning: IntArray,
+    headings: IntArray,
+) -> Array:
+    """Return `[J | J d - r]` (r, q + 4), by columns, with derivatives J and residuals r of a relative factor.
 
-    The values (q + 3,) are those of its variables and then of the frame. The columns of points and poses and
-    those of headings are as in a `Layout`.
+    The values (q + 3,) and the unknowns d, which are `change` (q + 3,) now, are those of its variables and
+    then of the frame. The columns of points and poses and those of headings are as in a `Layout`.
     """
     frame, c, s = values[-POSE:], np.cos(values[-1]), np.sin(values[-1])
     by_all, there = np.zeros((len(local), len(values))), values[:-POSE].copy()
@@ -119,7 +127,8 @@ def _relative_rows(
     by_all[x, -3], by_all[x, -2], by_all[x, -1] = -c, -s, there[y]
     by_all[y, -3], by_all[y, -2], by_all[y, -1] = s, -c, -there[x]
     by_all[headings, -1] = -1.0
-    return root @ by_all, root @ (there - local) - right
+    jacobian, residual = root @ by_all, root @ (there - local) - right
+    return np.asfortranarray(np.column_stack([jacobian, jacobian @ change - residual]))
 
 
 # --- coordinates in the frame of a pose ------------------------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any
+from typing import Final, cast
 
 import gtsam
 import numpy as np
@@ -19,10 +19,11 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, odometry_residuals
+from pathspace_graph.factors.linear import keys_of_factor
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, whitened_odometry
 from pathspace_graph.factors.se2 import compose, rotation
 
-from .gaussian import FactoredSystem, half_solve, keys_of
+from .gaussian import FactoredSystem, factors_of, half_solve
 from .variables import (
     CALIBRATION_KEY,
     CALIBRATION_LETTER,
@@ -37,6 +38,9 @@ from .variables import (
     sizes,
     spread,
 )
+
+Parts = tuple[IntArray, Array, Array, IntArray]
+Placed = tuple[IntArray, IntArray, IntArray, Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +63,18 @@ class Rows:
     def __len__(self) -> int:
         return len(self.residual)
 
+    @property
+    def parts(self) -> Parts:
+        """Return keys, derivatives, residuals and owners."""
+        return self.keys, self.jacobian, self.residual, self.owner
+
     def where(self, chosen: BoolArray | IntArray | slice) -> Rows:
         return Rows(self.keys[chosen], self.jacobian[chosen], self.residual[chosen], self.owner[chosen])
+
+    @property
+    def placed(self) -> Placed:
+        """Return the keys of rows, the key and the entry of each derivative, derivatives and residuals."""
+        return self.keys, *self.pattern, self.jacobian, self.residual
 
     @property
     def pattern(self) -> tuple[IntArray, IntArray]:
@@ -141,30 +155,45 @@ def _moved_residual(
 
 def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.GaussianConditional]:
     """Return a factor `1/2 |J d + r|^2` by owner, from rows whose unknowns are d, on the keys of its rows."""
-    parts: dict[int, list[tuple[Rows, IntArray]]] = {}
+    parts: dict[int, list[Rows]] = {}
     for unordered in groups:
         rows = unordered.where(unordered.owner.argsort(kind="stable"))
-        places, (owners, first) = layout.places(rows.keys), np.unique(rows.owner, return_index=True)
+        owners, first = np.unique(rows.owner, return_index=True)
         for owner, begin, end in zip(owners.tolist(), first, np.append(first, len(rows))[1:], strict=True):
-            parts.setdefault(owner, []).append((rows.where(slice(begin, end)), places[begin:end]))
+            parts.setdefault(owner, []).append(rows.where(slice(begin, end)))
     return {owner: _factor(parts[owner], layout) for owner in sorted(parts)}
 
 
-def _factor(parts: Sequence[tuple[Rows, IntArray]], layout: Layout) -> gtsam.GaussianConditional:
-    """Return the factor of rows, each with the places (m, k) of its keys in a layout."""
-    held = np.unique(np.concatenate([places.ravel() for _, places in parts]))
-    ends = layout.widths[held].cumsum()
-    starts = ends - layout.widths[held]
-    height = sum(len(rows) for rows, _ in parts)
-    block, begin = np.zeros((height, int(ends[-1]) + 1), order="F"), 0
-    for rows, places in parts:
-        end, (key, entry) = begin + len(rows), rows.pattern
-        columns = starts[held.searchsorted(places)][:, key] + entry
-        block[np.arange(begin, end)[:, None], columns] = rows.jacobian
-        block[begin:end, -1] = -rows.residual
-        begin = end
+def _factor(parts: Sequence[Rows], layout: Layout) -> gtsam.GaussianConditional:
+    """Return the factor of rows on the variables of a layout."""
+    try:
+        held, block = _block_of(layout.keys, layout.widths, [rows.placed for rows in parts])
+    except ValueError:
+        for rows in parts:
+            layout.places(rows.keys)  # it says which variable is not known
+        raise
     matrix = gtsam.VerticalBlockMatrix([*layout.widths[held].tolist(), 1], block, False)
     return gtsam.GaussianConditional(layout.keys[held].tolist(), 1, matrix)
+
+
+@compiled
+def _block_of(keys: IntArray, widths: IntArray, groups: list[Placed]) -> tuple[IntArray, Array]:
+    """Return the places (h,) of the variables that rows hold, and `[J -r]` (m, n + 1) on them, by columns.
+
+    The variables have ascending keys (k,) and widths (k,). ValueError where rows hold others.
+    """
+    sought = np.concatenate([np.zeros(0, np.intp), *(rows[0].ravel() for rows in groups)])
+    held = np.flatnonzero(among(keys, np.sort(sought)))
+    ends = widths[held].cumsum()
+    height, begin = sum(len(rows[0]) for rows in groups), 0
+    block = np.zeros((height, int(ends[-1]) + 1 if len(held) else 1), order="F")
+    for keys_of_rows, key, entry, jacobian, residual in groups:
+        end = begin + len(residual)
+        columns = _known_columns(keys[held], ends - widths[held], keys_of_rows, key, entry)
+        block[np.arange(begin, end)[:, None], columns] = jacobian
+        block[begin:end, -1] = -residual
+        begin = end
+    return held, block
 
 
 def stacked_factor(groups: Sequence[Rows], variables: Variables) -> list[gtsam.GaussianConditional]:
@@ -187,34 +216,37 @@ class KeptRows:
 
     def holding(self, keys: IntArray) -> IntArray:
         """Return the owners of rows that hold any of some ascending keys (k,)."""
-        of_groups = (rows.owner[_rows_holding(rows.keys, keys)] for rows in self.groups)
+        of_groups = (_owners_holding(rows.keys, rows.owner, keys) for rows in self.groups)
         return np.concatenate([np.zeros(0, np.intp), *of_groups])
 
     def replace(self, owners: IntArray, groups: Sequence[Rows], variables: Variables) -> None:
         """Replace all rows of some owners by rows that are linearized at the variables' values."""
-        self.drop(owners)
-        for rows in at_reference(groups, variables):
-            widths = rows.widths
-            same = next((i for i, kept in enumerate(self.groups) if kept.widths == widths), None)
-            if same is None:
+        kept, new = {rows.widths: rows for rows in self.groups}, dict[tuple[int, ...], Rows]()
+        for rows in groups:
+            if len(rows):
+                same = rows.widths in new
+                new[rows.widths] = stacked_rows([new[rows.widths], rows]) if same else rows
+        gone, change, layout = np.sort(owners), variables.values - variables.reference, variables.layout
+        self.groups = []
+        for widths in {**new, **kept}:
+            fresh = new[widths] if widths in new else kept[widths].where(slice(0))
+            old = kept[widths] if widths in kept else fresh.where(slice(0))
+            placed = layout.keys, layout.starts, *_pattern(widths), change
+            rows = Rows(*_replaced(old.parts, gone, fresh.parts, *placed))
+            if len(rows):
+                rows.__dict__["widths"] = widths
                 self.groups.append(rows)
-            else:
-                self.groups[same] = stacked_rows([self.groups[same], rows])
 
     def drop(self, owners: IntArray) -> list[Rows]:
         """Drop the rows of some owners, and return them."""
-        ascending, both = np.sort(owners), []
-        for rows in self.groups if len(owners) else ():
-            parts = _parted(rows.keys, rows.jacobian, rows.residual, rows.owner, ascending)
-            both.append((Rows(*parts[:4]), Rows(*parts[4:])))
+        both = [_parted(rows.parts, np.sort(owners)) for rows in (self.groups if len(owners) else ())]
         if both:
-            self.groups = [kept for kept, _ in both if len(kept)]
-        return [dropped for _, dropped in both if len(dropped)]
+            self.groups = [Rows(*kept) for kept, _ in both if len(kept[0])]
+        return [Rows(*dropped) for _, dropped in both if len(dropped[0])]
 
     def pop(self, owner: int, layout: Layout) -> gtsam.GaussianConditional:
         """Remove the rows of an owner and return them as a factor."""
-        own = self.drop(np.array([owner]))
-        return _factor([(rows, layout.places(rows.keys)) for rows in own], layout)
+        return _factor(self.drop(np.array([owner])), layout)
 
 
 def among(keys: IntArray, ascending: IntArray) -> BoolArray:
@@ -225,18 +257,38 @@ def among(keys: IntArray, ascending: IntArray) -> BoolArray:
 
 
 @compiled
-def _rows_holding(keys: IntArray, ascending: IntArray) -> BoolArray:
-    """Return which rows (m,) hold any of some ascending keys, given the keys (m, k) of each."""
-    return np.asarray(among(keys, ascending).any(axis=1))
+def _owners_holding(keys: IntArray, owner: IntArray, ascending: IntArray) -> IntArray:
+    """Return the owners of rows that hold any of some ascending keys, given the keys (m, k) of each."""
+    return np.asarray(owner[among(keys, ascending).any(axis=1)])
 
 
 @compiled
-def _parted(
-    keys: IntArray, jacobian: Array, residual: Array, owner: IntArray, gone: IntArray
-) -> tuple[Any, ...]:
-    """Return the columns of rows without those of some ascending owners, and then those of the latter."""
-    own, columns = among(owner, gone), (keys, jacobian, residual, owner)
-    return *(column[~own] for column in columns), *(column[own] for column in columns)
+def _parted(rows: Parts, gone: IntArray) -> tuple[Parts, Parts]:
+    """Return the columns of rows without those of some ascending owners, and those of the latter."""
+    own = among(rows[3], gone)
+    stay, leave = (tuple(column[chosen] for column in rows) for chosen in (~own, own))
+    return cast(Parts, stay), cast(Parts, leave)
+
+
+@compiled
+def _replaced(
+    rows: Parts,
+    gone: IntArray,
+    fresh: Parts,
+    keys: IntArray,
+    starts: IntArray,
+    key: IntArray,
+    entry: IntArray,
+    change: Array,
+) -> Parts:
+    """Return the columns of rows without those of some ascending owners, and then those of fresh rows.
+
+    The fresh ones are linearized where the unknowns d are `change` (n,), in the columns of `_known_columns`.
+    """
+    sought, jacobian, residual, owner = fresh
+    moved = _moved_residual(keys, starts, sought, key, entry, jacobian, residual, change)
+    pairs = zip(_parted(rows, gone)[0], (sought, jacobian, moved, owner), strict=True)
+    return cast(Parts, tuple(np.concatenate(pair) for pair in pairs))
 
 
 def stacked_rows(groups: Sequence[Rows]) -> Rows:
@@ -258,13 +310,10 @@ def newton_system(
     Both are on the variables of a layout. SingularSystemError where nothing holds one of them, and ValueError
     where something holds another one.
     """
-    hessian, gradient = np.zeros((layout.size, layout.size), order="F"), np.zeros(layout.size)
-    if graph.size():
-        own = Layout(keys_of(graph))
-        entries = spread(layout.starts[layout.places(own.keys)], own.widths)
-        add_prior(hessian, gradient, *graph.hessian(own.ordering), entries, change)
-    for rows in groups:
-        add_rows(hessian, gradient, *rows.places(layout), rows.jacobian, rows.residual, change)
+    factors = [(keys_of_factor(factor), factor.augmentedInformation()) for factor in factors_of(graph)]
+    hessian, gradient = _summed(
+        layout.keys, layout.starts, layout.widths, factors, [rows.placed for rows in groups], change
+    )
     missing = layout.keys[hessian.diagonal()[layout.starts] == 0.0]
     if len(missing):
         raise SingularSystemError(f"expected a factor on every variable, found none on {names(missing)}")
@@ -272,40 +321,37 @@ def newton_system(
 
 
 @compiled
-def add_prior(
-    hessian: Array, gradient: Array, information: Array, vector: Array, entries: IntArray, change: Array
-) -> None:
-    """Add L (m, m) to the lower triangle of a Hessian (n, n), and `g - L d` to a negative gradient (n,).
-
-    They are on ascending entries (m,), and the unknowns d are `change` (n,) now.
-    """
-    hessian[np.ix_(entries, entries)] += information
-    gradient[entries] += vector - information @ change[entries]
-
-
-@compiled
-def add_rows(
-    hessian: Array,
-    gradient: Array,
+def _summed(
     keys: IntArray,
     starts: IntArray,
-    sought: IntArray,
-    key: IntArray,
-    entry: IntArray,
-    jacobian: Array,
-    residual: Array,
+    widths: IntArray,
+    factors: list[tuple[IntArray, Array]],
+    groups: list[Placed],
     change: Array,
-) -> None:
-    """Add `J'J` to the lower triangle of a Hessian (n, n), and `-J'(J d + r)` to a negative gradient (n,).
+) -> tuple[Array, Array]:
+    """Return the lower triangle of H (n, n), by columns, and the negative gradient (n,), at `change` (n,).
 
-    Derivatives J (m, k) are by the unknowns d in the columns that `_known_columns` finds, which are `change`
-    (n,) now.
+    They are sums over factors with `[[L, g], [g', f]]` on some of the variables, and over rows `J d + r`. The
+    variables have ascending keys (k,), and their first columns and widths (k,).
     """
-    columns = _known_columns(keys, starts, sought, key, entry)
-    A = np.zeros((len(jacobian), len(gradient)))
-    A[np.arange(len(jacobian))[:, None], columns] = jacobian
-    hessian += A.T @ A
-    gradient -= (A @ change + residual) @ A
+    hessian, gradient = np.zeros((len(change), len(change)), order="F"), np.zeros(len(change))
+    for own, matrix in factors:
+        places = _known_columns(keys, np.arange(len(keys)), own[:, None], *_pattern((1,)))[:, 0]
+        entries = spread(starts[places], widths[places])
+        hessian[np.ix_(entries, entries)] += matrix[:-1, :-1]
+        gradient[entries] += matrix[:-1, -1] - matrix[:-1, :-1] @ change[entries]
+    for sought, key, entry, jacobian, residual in groups:
+        columns = _known_columns(keys, starts, sought, key, entry)
+        A = np.zeros((len(jacobian), len(gradient)))
+        A[np.arange(len(jacobian))[:, None], columns] = jacobian
+        hessian += A.T @ A
+        gradient -= (A @ change + residual) @ A
+    return hessian, gradient
+
+
+_FIRST_KEYS: Final = np.array([CALIBRATION_KEY, pose_key(0), pose_key(1)])
+_ON_POSE: Final = np.array([0, 1, 1])
+"""The keys of a row of odometry at the first cycle, and which of them count the cycles."""
 
 
 class OdometryChain:
@@ -344,12 +390,8 @@ class OdometryChain:
         The poses x (P, 3) are in the map frame, and b (2,) is the calibration. The derivatives (m, 3, 8) are
         by [calibration | pose | next pose].
         """
-        whiteners, by_calibration = self.whiteners[slots], self.by_calibration[slots]
-        start, end = poses[:-1][slots], poses[1:][slots]
-        residual, by_start, by_end = odometry_residuals(start, end, self.deltas[slots])
-        residual = residual + by_calibration @ calibration
-        jacobian = whiteners @ np.concatenate([by_calibration, by_start, by_end], axis=2)
-        return (whiteners @ residual[:, :, None])[:, :, 0], jacobian
+        measured = self.deltas[slots], self.whiteners[slots], self.by_calibration[slots]
+        return whitened_odometry(poses[:-1][slots], poses[1:][slots], *measured, calibration)
 
     def rows(self, variables: Variables, cycles: IntArray) -> list[Rows]:
         """Return the rows from the poses of some cycles (m,) to the next poses; each cycle owns its rows.
@@ -368,9 +410,9 @@ class OdometryChain:
 def odometry_rows(cycles: IntArray, terms: tuple[Array, Array], owner: IntArray) -> Rows:
     """Return the result of `OdometryChain.terms` for cycles (m,) as rows with these owners (m,)."""
     residual, jacobian = terms
-    keys = np.stack([np.full(len(cycles), CALIBRATION_KEY), pose_keys(cycles), pose_keys(cycles + 1)], axis=1)
+    keys = _FIRST_KEYS + np.repeat(cycles, POSE)[:, None] * _ON_POSE
     flat = jacobian.reshape(residual.size, CALIBRATION_SIZE + 2 * POSE)
-    return Rows(np.repeat(keys, POSE, axis=0), flat, residual.ravel(), np.repeat(owner, POSE))
+    return Rows(keys, flat, residual.ravel(), np.repeat(owner, POSE))
 
 
 def odometry_factor(cycle: int, interval: IntegratedOdometry) -> gtsam.CustomFactor:

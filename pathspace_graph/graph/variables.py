@@ -62,6 +62,7 @@ def letter_keys(letter: str) -> tuple[int, int]:
 
 FIRST_POSE: Final = letter_keys(POSE_LETTER)[0]
 """Poses have the last keys: every key from this one on belongs to a pose."""
+_SIZES: Final = (POINT, SENSOR_SIZE, POSE)
 ORIGIN_KEY: Final = int(gtsam.symbol("y", 0))
 """Key of the origin of the map frame, which is a pose at (0, 0, 0) by definition."""
 _FIRST_LANDMARK: Final = letter_keys(LANDMARK_LETTER)[0]
@@ -105,8 +106,21 @@ def are_poses(keys: IntArray) -> BoolArray:
 
 def sizes(keys: IntArray) -> IntArray:
     """Return the number of entries of each key's variable, which its letter determines."""
-    wider = (POSE - POINT) * are_poses(keys) + (SENSOR_SIZE - POINT) * (keys == SENSOR_KEY)
-    return np.asarray(POINT + wider)
+    return _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES)[0]
+
+
+@compiled
+def _laid_out(
+    keys: IntArray, sensor_key: int, first_pose: int, sizes: tuple[int, int, int]
+) -> tuple[IntArray, IntArray, int]:
+    """Return the widths (k,) and the first columns (k,) of variables, and their number of columns.
+
+    The sizes are those of a point, of the sensor's calibration, and of a pose.
+    """
+    point, sensor, pose = sizes
+    widths = np.where(keys >= first_pose, pose, np.where(keys == sensor_key, sensor, point))
+    ends = widths.cumsum()
+    return widths, ends - widths, int(widths.sum())
 
 
 def name(key: int) -> str:
@@ -133,12 +147,9 @@ class Layout:
 
     def __init__(self, keys: IntArray) -> None:
         self.keys = keys
-        self.widths: IntArray = sizes(keys)
-        """Each key has this number of columns (K,)."""
-        ends = self.widths.cumsum()
-        self.starts: IntArray = ends - self.widths
-        """Each key begins at this column (K,)."""
-        self.size = int(ends[-1]) if len(keys) else 0
+        self.widths, self.starts, self.size = _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES)
+        """Each key has this number of columns (K,), and begins at this one (K,)."""
+        self._begins: list[int] | None = None
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
@@ -184,12 +195,11 @@ class Layout:
 
     def block(self, letter: str) -> slice:
         """Return the columns of all keys of a letter."""
-        return self._blocks[letter]
-
-    @cached_property
-    def _blocks(self) -> dict[str, slice]:
-        begins = np.append(self.starts, self.size)[self.keys.searchsorted(_LETTER_ENDS)].tolist()
-        return {letter: slice(*begins[k : k + 2]) for letter, k in _LETTER_PLACES.items()}
+        k = _LETTER_PLACES[letter]
+        if self._begins is None:
+            places = np.concatenate([self.starts, [self.size]])
+            self._begins = places[self.keys.searchsorted(_LETTER_ENDS)].tolist()
+        return slice(self._begins[k], self._begins[k + 1])
 
     def begin(self, key: int) -> int:
         """Return the first column of a key, or where it would be if the layout held the key."""
@@ -275,10 +285,11 @@ class Variables:
         self.linearized = _inserted(self.linearized, at, values)
 
     def remove(self, keys: IntArray) -> None:
-        kept_entries = np.ones(self.layout.size, bool)
-        kept_entries[self.layout.entries(keys)] = False
+        if len(keys) == 0:
+            return
         kept_keys = np.ones(len(self.layout.keys), bool)
-        kept_keys[self.layout.positions(keys)] = False
+        kept_keys[self.layout.places(keys)] = False
+        kept_entries = kept_keys.repeat(self.layout.widths)
         self.layout = Layout(self.layout.keys[kept_keys])
         self.values, self.reference = self.values[kept_entries], self.reference[kept_entries]
         self.linearized = self.linearized[kept_entries]

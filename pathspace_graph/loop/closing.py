@@ -8,6 +8,7 @@ control points, `optimize_loop` solves the whole loop, and `simplify` makes the 
 from typing import Final
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.batch.lap import LapMarginal
@@ -52,13 +53,17 @@ def simplify(smoother: CurveSmoother) -> None:
 def substitute(smoother: CurveSmoother, periodic: dict[int, PeriodicCurve]) -> None:
     """Change the variables, `C_old = E C_new`, in the graph, the detections and the poses' parameters."""
     state, detections = smoother.map.state, smoother.map.detections
-    sigma = smoother.map.settings.spline.sigma_simplify
+    closed = {label: state.boundaries[label].closed(new.knots) for label, new in periodic.items()}
+    smoother.substitute(
+        np.concatenate([state.keys(label) for label in periodic]),
+        np.concatenate([control_keys(label, boundary.numbers) for label, boundary in closed.items()]),
+        np.concatenate([new.points for new in periodic.values()]),
+        block_diag(*(new.old_from_new for new in periodic.values())),
+        smoother.map.settings.spline.sigma_simplify,
+    )
     for label, new in periodic.items():
-        old_keys, rows = state.keys(label), detections.used_on(label)
-        boundary = state.boundaries[label].closed(new.knots)
-        new_keys = control_keys(label, boundary.numbers)
-        smoother.substitute(old_keys, new_keys, new.points, new.old_from_new, sigma)
-        state.close(label, boundary)
+        rows = detections.used_on(label)
+        state.close(label, closed[label])
         detections.take(rows, label, new.overlap.new_parameter(detections.u[rows]))
         state.locate(label, new.overlap.new_parameter(state.pose_u[label]))
 

@@ -9,6 +9,7 @@ agree. Once one is clearly better than all others, and twice in a row, the windo
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -29,6 +30,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])
+NO_CONES: Final = np.zeros(0)
 """Unit vectors that choose the position of a pose."""
 FOUND: Final = "the vehicle was lost, and is found again"
 """Beginning of the notice of a cycle in which the window starts anew at the place that was found."""
@@ -91,6 +93,11 @@ class Loop:
     mapped: Mapping[int, BoolArray]
     """Whether each of these lies between cones that were detected (see `is_mapped`)."""
 
+    @cached_property
+    def with_gaps(self) -> list[int]:
+        """Return the boundaries whose curves have gaps."""
+        return [label for label, mapped in self.mapped.items() if not mapped.all()]
+
     def at(self, stations: Array) -> Array:
         """Return the points of the middle at stations of any shape, as complex numbers x + i y."""
         x, y = (np.interp(stations, self.stations, axis, period=self.length) for axis in self.middle.T)
@@ -121,14 +128,26 @@ def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) 
     The others lie in a gap, which is longer than `gap` times the median distance of neighbours, and farther
     than the margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
     """
+    return _is_between(u, *_neighbours(cones, length, gap), length, margin)
+
+
+def _neighbours(cones: Array, length: float, gap: float) -> tuple[Array, Array, BoolArray]:
+    """Return places (n,) of cones (k,) on a closed curve, steps (n,) to the next, and which are no gap."""
     if len(cones) < 2:
-        return np.ones(len(u), bool)
+        return np.zeros(1), np.full(1, length), np.ones(1, bool)
     places = np.unique(np.mod(cones, length))
     steps = np.diff(places, append=places[0] + length)
+    return places, steps, np.asarray(steps <= gap * np.median(steps))
+
+
+def _is_between(
+    u: Array, places: Array, steps: Array, known: BoolArray, length: float, margin: float
+) -> BoolArray:
+    """Return `is_mapped` of parameters (m,), given the `_neighbours` of a curve."""
     before = np.searchsorted(places, np.mod(u, length)) - 1
     past = np.mod(u - places[before], length)
     near_end = np.minimum(past, steps[before] - past) < margin
-    return np.asarray(near_end | (steps <= gap * np.median(steps))[before])
+    return np.asarray(near_end | known[before])
 
 
 def lay_out_loop(state: State, is_mapped_on: Callable[[int, Array], BoolArray] | None = None) -> Loop:
@@ -158,6 +177,7 @@ class KnownLoop:
     def __init__(self, smoother: CurveSmoother) -> None:
         self._smoother = smoother
         self._laid_out: tuple[list[Boundary], Loop] | None = None
+        self._cones: dict[int, tuple[Array, tuple[Array, Array, BoolArray]]] = {}
 
     def get(self) -> Loop:
         """Return the loop as it was when it was laid out, which changes no variable."""
@@ -178,13 +198,15 @@ class KnownLoop:
 
     def with_gaps(self) -> list[int]:
         """Return the boundaries whose curves have gaps."""
-        return [label for label, mapped in self.get().mapped.items() if not mapped.all()]
+        return self.get().with_gaps
 
     def is_mapped(self, label: int, u: Array) -> BoolArray:
         """Return which parameters (m,) of a boundary lie between cones that were detected."""
         track, settings = self._smoother.map, self._smoother.map.settings
-        cones, length = track.cones.get(label, np.zeros(0)), track.state.boundaries[label].length
-        return is_mapped(u, cones, length, GAP, settings.growth.merge_radius)
+        cones, length = track.cones.get(label, NO_CONES), track.state.boundaries[label].length
+        if self._cones.get(label, (None,))[0] is not cones:
+            self._cones[label] = cones, _neighbours(cones, length, GAP)
+        return _is_between(u, *self._cones[label][1], length, settings.growth.merge_radius)
 
 
 def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_again: BoolArray) -> Evidence:

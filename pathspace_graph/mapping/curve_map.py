@@ -1,17 +1,25 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
 from collections.abc import Iterator
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.factors.bspline import Spans
+from pathspace_graph.factors.footpoint import (
+    SEARCH_ITERATIONS,
+    TOLERANCES,
+    FootPoints,
+    refine_joint_foot_points,
+)
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.residuals import ProjectionRows, detection_rows, pair_residuals, project
-from pathspace_graph.factors.sensor import SensorRows
-from pathspace_graph.graph.rows import Rows, stacked_rows
-from pathspace_graph.graph.variables import CONTROL_LETTERS, SENSOR_KEY, control_keys, pose_keys
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.sensor import SensorRows, corrected
+from pathspace_graph.graph.rows import Parts, Rows, among, stacked_rows
+from pathspace_graph.graph.variables import CONTROL_LETTERS, FIRST_POSE, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Gauge
 
@@ -57,28 +65,21 @@ class CurveMap:
         state, detections = self.state, self.detections
         if not state.boundaries or len(cycles) == 0:
             return []
-        rows = np.flatnonzero(detections.used & detections.in_cycles(cycles))
-        curves, cycle = state.curves, detections.cycle[rows]
-        curve = curves.number(detections.boundary[rows])
-        points = detections.points_map(rows, self.variables)
-        foot = curves.refine(state.map_points, points, curve, detections.u[rows])
-        self._refined, self.reached_inactive = (rows, foot.u), curves.reaches_inactive(curve, foot)
-        residual, sigma, jacobian = detection_rows(
-            points,
-            detections.covariance[rows],
-            self.variables.poses_at(cycle),
-            foot.normal_unit,
-            foot.distance,
-            foot.basis,
-            detections.measured[rows],
-            detections.twist[rows],
-            self.variables.sensor,
-            self.settings.spline.sigma_model,
+        curves, variables, s = state.curves, self.variables, self.settings.spline
+        rows, u, self.reached_inactive, parts = _curve_rows(
+            curves.spans,
+            (state.map_points, curves.labels, curves.keys, curves.trusted, curves.active_from),
+            detections.associated,
+            cycles,
+            variables.poses,
+            variables.first_cycle,
+            variables.sensor,
+            (s.refine_room, s.refine_iterations, SEARCH_ITERATIONS, s.sigma_model, self.settings.gate.huber),
+            (FIRST_POSE, SENSOR_KEY),
+            TOLERANCES,
         )
-        weight = np.sqrt(huber_weights(residual / sigma, self.settings.gate.huber))
-        weight *= foot.interior / sigma
-        keys = np.concatenate([self.measuring_keys(cycle), curves.keys[foot.columns]], axis=1)
-        return [Rows(keys, jacobian * weight[:, None], residual * weight, cycle)]
+        self._refined = rows, u
+        return [Rows(*parts)]
 
     def measuring_keys(self, cycles: IntArray) -> IntArray:
         """Return the keys (m, k) that the detections of cycles (m,) depend on beside the curves.
@@ -189,6 +190,42 @@ class CurveMap:
         return Rows(
             control_keys(label, self.state.boundaries[label].first + repeated), jacobian, residual, owner
         )
+
+
+@compiled
+def _curve_rows(
+    spans: Spans,
+    curves: tuple[Array, IntArray, IntArray, Array, Array],
+    table: tuple[Any, ...],
+    cycles: IntArray,
+    poses: Array,
+    first_cycle: int,
+    sensor: Array,
+    limits: tuple[float, int, int, float, float],
+    names: tuple[int, int],
+    tolerances: tuple[float, ...],
+) -> tuple[IntArray, Array, bool, Parts]:
+    """Return the parts of `CurveMap.rows`, after the detections by row and their refined parameters (m,).
+
+    The third result is whether one has slid to where a curve is inactive. Curves have control points (n, 2),
+    labels (k,), keys (n,), and parameters (k,) up to which and from which on they may be used. The table has
+    the columns of `DetectionTable.associated`.
+    """
+    control_points, labels, control_keys, trusted, active_from = curves
+    room, iterations, _, sigma_model, huber = limits
+    rows = np.flatnonzero(table[2] & among(table[0], cycles))
+    cycle, boundary, _, u, measured, twist, covariance = (column[rows] for column in table)
+    curve, own = labels.searchsorted(boundary), poses[cycle - first_cycle]
+    points = to_map(corrected(measured, twist, sensor), own)
+    stretch = u, u - room, np.minimum(u + room, trusted[curve])
+    foot = refine_joint_foot_points(spans, control_points, points, curve, *stretch, iterations)
+    known = points, covariance, own, foot.normal_unit, foot.distance, foot.basis
+    residual, sigma, jacobian = detection_rows(*known, measured, twist, sensor, sigma_model)
+    weight = np.sqrt(huber_weights(residual / sigma, huber)) * (foot.interior / sigma)
+    measuring = np.array(names) + np.outer(cycle, [1, 0])
+    keys = np.concatenate([measuring[:, : 2 if len(sensor) else 1], control_keys[foot.columns]], axis=1)
+    reached = not spans.periodic and bool((foot.u <= active_from[curve]).any())
+    return rows, foot.u, reached, (keys, jacobian * weight[:, None], residual * weight, cycle)
 
 
 def _by_axis(coefficients: Array) -> Array:

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
 from typing import Self
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.factors.sensor import SensorRows, corrected, sensor_rows
 from pathspace_graph.graph.variables import Variables
@@ -67,15 +69,17 @@ class DetectionColumns:
 
         The vehicle moved with this twist (3,), in m/s, m/s and rad/s; by default it stood still.
         """
-        start = int(self.cycle.searchsorted(cycle, side="right"))
-        new = type(self).of([detections], cycle, None if twist is None else twist[None])
+        start, columns = int(self.cycle.searchsorted(cycle, side="right")), vars(self)
+        new = vars(type(self).of([detections], cycle, None if twist is None else twist[None]))
         for column in self._columns():
-            known, added = getattr(self, column), getattr(new, column)
-            setattr(self, column, np.concatenate([known[:start], added, known[start:]]))
-        return slice(start, start + len(new))
+            known = columns[column]
+            columns[column] = np.concatenate([known[:start], new[column], known[start:]])
+        return slice(start, start + len(detections.labels))
 
-    def _columns(self) -> list[str]:
-        return [column.name for column in fields(self) if column.name != "sensor"]
+    @classmethod
+    @cache
+    def _columns(cls) -> list[str]:
+        return [column.name for column in fields(cls) if column.name != "sensor"]
 
     def corrected(self, rows: IntArray | slice, sensor: Array) -> Array:
         """Return positions (m, 2), vehicle frame, corrected by the sensor's calibration: (5,) or empty."""
@@ -92,7 +96,10 @@ class DetectionColumns:
 
     def points_map(self, rows: IntArray | slice, variables: Variables) -> Array:
         """Return corrected positions (m, 2) in the map frame, by the poses of their cycles."""
-        return to_map(self.corrected(rows, variables.sensor), variables.poses_at(self.cycle[rows]))
+        if isinstance(rows, slice):
+            rows = np.arange(len(self))[rows]
+        poses = variables.poses, variables.first_cycle
+        return _placed(rows, self.cycle, self.measured, self.twist, *poses, variables.sensor)
 
     def covariances_map(self, rows: IntArray | slice, variables: Variables) -> Array:
         """Return the covariances (m, 2, 2) in m^2 in the map frame, by the poses of their cycles."""
@@ -111,7 +118,7 @@ class DetectionColumns:
         """Remove the detections of all cycles before `cycle`."""
         first = int(self.cycle.searchsorted(cycle))
         for column in self._columns():
-            setattr(self, column, getattr(self, column)[first:])
+            vars(self)[column] = vars(self)[column][first:]
 
     def in_cycles(self, cycles: IntArray) -> BoolArray:
         """Return (m,) whether each detection was made in one of the ascending cycles (k,)."""
@@ -154,6 +161,19 @@ class DetectionTable(DetectionColumns):
         """Store the refreshed foot points' parameters (m,); the associations do not change."""
         self.u[rows] = u
 
+    @property
+    def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array]:
+        """Return the columns that say what is in use, where, and as what it was measured."""
+        return (
+            self.cycle,
+            self.boundary,
+            self.used,
+            self.u,
+            self.measured,
+            self.twist,
+            self.covariance,
+        )
+
     def used_on(self, label: int) -> IntArray:
         """Return the rows in use on the boundary `label`."""
         return np.flatnonzero(self.used & (self.boundary == label))
@@ -162,13 +182,38 @@ class DetectionTable(DetectionColumns):
         """Return the rows out of use that have the colour of the boundary `label`."""
         return np.flatnonzero(~self.used & (self.label == label))
 
-    def open_to(self, label: int, since: int) -> IntArray:
-        """Return the rows, from `since` on, that the boundary `label` is tested for.
+    def open_to(self, labels: IntArray, since: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the rows (m,) that each of some boundaries (k,) is tested for, from its `since` (k,) on.
 
         These are the rows out of use, and those of unknown colour that the other boundary uses: if both
-        boundaries accept one, it is ambiguous.
+        boundaries accept one, it is ambiguous. The second result (m,) is the index of the boundary.
         """
-        label_since, used = self.label[since:], self.used[since:]
-        unknown = label_since == UNKNOWN
-        is_open = np.where(used, unknown & (self.boundary[since:] != label), unknown | (label_since == label))
-        return since + np.flatnonzero(is_open)
+        return _open_rows(labels, since, self.label, self.boundary, self.used, UNKNOWN)
+
+
+@compiled
+def _placed(
+    rows: IntArray,
+    cycles: IntArray,
+    measured: Array,
+    twists: Array,
+    poses: Array,
+    first_cycle: int,
+    sensor: Array,
+) -> Array:
+    """Return `DetectionColumns.points_map` of some rows, by the poses (P, 3) from `first_cycle` on."""
+    points = corrected(measured[rows], twists[rows], sensor)
+    return to_map(points, poses[cycles[rows] - first_cycle])
+
+
+@compiled
+def _open_rows(
+    labels: IntArray, since: IntArray, label: IntArray, boundary: IntArray, used: BoolArray, unknown: int
+) -> tuple[IntArray, IntArray]:
+    """Return `DetectionTable.open_to` for a table with these columns."""
+    colourless, rows = label == unknown, []
+    for own, first in zip(labels, since, strict=True):
+        is_open = np.where(used, colourless & (boundary != own), colourless | (label == own))
+        rows.append(first + np.flatnonzero(is_open[first:]))
+    curve = np.repeat(np.arange(len(rows)), [len(of_label) for of_label in rows])
+    return np.concatenate([np.zeros(0, np.intp), *rows]), curve

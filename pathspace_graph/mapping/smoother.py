@@ -1,11 +1,14 @@
 """The fixed-lag engine on both boundaries' curves: association, and the active part of the map."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.factors.bspline import Spans
+from pathspace_graph.factors.footpoint import TOLERANCES, FootPoints, joint_foot_points
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.residuals import sigma_across
 from pathspace_graph.graph.inactive import Follower
 from pathspace_graph.graph.rows import Rows
@@ -77,10 +80,9 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         """Put those of the late detections, which are the rows `new`, into use that lie on a curve."""
         if self.last_step is None:
             return
-        of_label = [self.map.detections.open_to(b, new.start) for b in self.map.state.curves.labels.tolist()]
-        of_label = [rows[rows < new.stop] for rows in of_label]
-        curve = np.repeat(np.arange(len(of_label)), [len(rows) for rows in of_label])
-        self._associate(np.concatenate(of_label), curve)
+        labels = self.map.state.curves.labels
+        rows, curve = self.map.detections.open_to(labels, np.full(len(labels), new.start))
+        self._associate(rows[rows < new.stop], curve[rows < new.stop])
 
     def reassociate(self) -> None:
         """Associate all detections of the window anew, after the curves were replaced.
@@ -114,28 +116,27 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         Return the distance of each from its curve, in standard deviations (m,).
         """
         detections, state, gate = self.map.detections, self.map.state, self.map.settings.gate
-        poses = self.variables.poses_at(detections.cycle[rows])
-        covariances, sigma_model = detections.covariance[rows], self.map.settings.spline.sigma_model
-        sigma = sigma_across(foot.normal_unit, covariances, poses, sigma_model)
-        variance, unknown = sigma**2 + gate.sigma_floor**2, detections.label[rows] == UNKNOWN
-        near, square = foot.interior & (np.abs(foot.distance) < gate.rough), foot.distance**2
-        accepted = near & (square < np.where(unknown, gate.chi_unknown, gate.chi) ** 2 * variance)
-        doubtful = np.flatnonzero(near & ~accepted & ~unknown)
-        if len(doubtful):  # the joint uncertainty is costly, and only these need it
+        sigma_model = self.map.settings.spline.sigma_model
+        limits = (sigma_model, gate.sigma_floor, gate.rough, gate.chi, gate.chi_unknown, UNKNOWN)
+        columns = detections.cycle, detections.label, detections.covariance
+        poses, at = (self.variables.poses, self.first_cycle), (foot.normal_unit, foot.distance, foot.interior)
+        variance, accepted, doubtful = _gated(rows, *columns, *poses, at, limits)
+        if doubtful.any():  # the joint uncertainty is costly, and only these need it
             variance[doubtful] += self.joint_variance(rows[doubtful], points[doubtful], foot.where(doubtful))
-            accepted[doubtful] = square[doubtful] < gate.chi**2 * variance[doubtful]
+            accepted[doubtful] = foot.distance[doubtful] ** 2 < gate.chi**2 * variance[doubtful]
         taken = rows[accepted]
         ambiguous = detections.used[taken] | (np.bincount(taken)[taken] > 1)  # two curves accept it
         detections.take(taken, state.curves.labels[curve[accepted]], foot.u[accepted])
-        detections.release(taken[ambiguous])
+        if ambiguous.any():
+            detections.release(taken[ambiguous])
         return np.asarray(foot.distance / np.sqrt(variance))
 
     def _untested(self, retest: frozenset[int]) -> tuple[IntArray, IntArray]:
         """Return the detections (m,) to test, and the index (m,) of the curve that each is tested for."""
-        detections, labels = self.map.detections, self.map.state.curves.labels.tolist()
+        detections, labels = self.map.detections, self.map.state.curves.labels
         newest = int(detections.cycle.searchsorted(self.next_cycle - 1))
-        rows = [detections.open_to(label, 0 if label in retest else newest) for label in labels]
-        return np.concatenate(rows), np.repeat(np.arange(len(rows)), [len(of_label) for of_label in rows])
+        since = np.array([0 if label in retest else newest for label in labels.tolist()], np.intp)
+        return detections.open_to(labels, since)
 
     def joint_variance(self, rows: IntArray, points: Array, foot: FootPoints) -> Array:
         """Return `g_i' Sigma g_i` (m,) in m^2: the variance of each residual of detections (m,).
@@ -160,24 +161,25 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         The newest pose's foot point on every curve is found in the same search and noted in the state.
         """
         state, gate = self.map.state, self.map.settings.gate
-        curves, pose = state.curves, state.poses[-1]
-        pose_u = np.array([state.pose_u[label] for label in state.boundaries])
-        pose_u = np.append(pose_u, pose_u[:, -1:], axis=1)  # the newest pose is near the one before
-        (low, high), all_curves = self._view(rows, curve, pose_u), np.arange(len(pose_u))
-        behind, ahead = self._search_room()
-        foot = curves.find(
+        curves, s = state.curves, self.map.settings.spline
+        foot, beside = _in_view(
+            curves.spans,
             state.map_points,
-            np.concatenate([points, np.broadcast_to(pose[:2], (len(pose_u), 2))]),
-            np.append(curve, all_curves),
-            np.append(low, pose_u[:, -1] - behind),
-            np.append(high, pose_u[:, -1] + ahead),
+            curves.trusted,
+            points,
+            curve,
+            self.map.detections.cycle[rows] - self.first_cycle,
+            [state.pose_u[label] for label in state.boundaries],
+            state.poses[-1],
+            (gate.view_behind, gate.view_ahead, *self._search_room()),
+            s.search_step,
+            s.search_iterations,
+            TOLERANCES,
         )
-        beside = foot.where(slice(len(rows), None))
-        along = beside.tangent_unit @ np.array([np.cos(pose[2]), np.sin(pose[2])])
-        lost = (along < 0.0) | (np.abs(beside.distance) > gate.station_lateral)
-        for label, u, is_lost in zip(state.boundaries, beside.u.tolist(), lost.tolist(), strict=True):
-            state.locate_newest(label, self._relocated(label) if is_lost else u)
-        return foot.where(slice(len(rows)))
+        for label, (u, along, distance) in zip(state.boundaries, beside, strict=True):
+            lost = along < 0.0 or abs(distance) > gate.station_lateral
+            state.locate_newest(label, self._relocated(label) if lost else u)
+        return FootPoints(*foot)
 
     def _search_room(self) -> tuple[float, float]:
         """Return how far behind and ahead (m) of its last parameter the vehicle's foot point is searched."""
@@ -239,13 +241,73 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         high = float(pose_u.max()) + gate.view_ahead + gate.station_ahead + slide + room
         if boundary.periodic and high - low >= boundary.length:
             return boundary.everything
-        first, last = boundary.tables.locate(np.array([low, high]))[0]
+        first, last = boundary.tables.span_of(low), boundary.tables.span_of(high)
         if not boundary.periodic:
             return np.arange(first, boundary.size)
         last += boundary.degree + (boundary.size if last < first else 0)
         if last - first >= boundary.size - 1:
             return boundary.everything
         return np.arange(first, last + 1) % boundary.size
+
+
+@compiled
+def _in_view(
+    spans: Spans,
+    control_points: Array,
+    trusted: Array,
+    points: Array,
+    curve: IntArray,
+    slot: IntArray,
+    pose_u: list[Array],
+    pose: Array,
+    rooms: tuple[float, float, float, float],
+    step: float,
+    iterations: int,
+    tolerances: tuple[float, ...],
+) -> tuple[tuple[Any, ...], list[tuple[float, float, float]]]:
+    """Return the foot points of detections at points (m, 2), each on its curve (m,) beside its pose (m,).
+
+    The poses have parameters (P,) on each of the curves. The second result has, for each curve, the parameter
+    of the newest pose (3,), the cosine of its angle with the curve, and its distance; it is near the pose
+    before it. The rooms are those behind and ahead of a detection's pose, and of the newest one.
+    """
+    known = np.array(pose_u)
+    known = np.concatenate([known, known[:, -1:]], axis=1)
+    numbers = np.append(curve, np.arange(len(known)))
+    seen_from = np.append(known[curve, slot], known[:, -1])
+    behind, ahead = (np.repeat(room, [len(points), len(known)]) for room in (rooms[::2], rooms[1::2]))
+    stretch = seen_from - behind, np.minimum(seen_from + ahead, trusted[numbers])
+    both = np.concatenate([points, np.tile(pose[:2], (len(known), 1))])
+    foot = joint_foot_points(spans, control_points, both, numbers, *stretch, step, iterations)
+    beside = foot.where(slice(len(points), None))
+    along = beside.tangent_unit @ np.array([np.cos(pose[2]), np.sin(pose[2])])
+    newest = zip(beside.u.tolist(), along.tolist(), beside.distance.tolist(), strict=True)
+    of_rows = foot.where(slice(len(points)))
+    return tuple(vars(of_rows).values()), list(newest)
+
+
+@compiled
+def _gated(
+    rows: IntArray,
+    cycle: IntArray,
+    label: IntArray,
+    covariances: Array,
+    poses: Array,
+    first_cycle: int,
+    foot: tuple[Array, Array, BoolArray],
+    limits: tuple[float, float, float, float, float, int],
+) -> tuple[Array, BoolArray, BoolArray]:
+    """Return the variance (m,) of each detection by row, whether its curve accepts it, or else may do so.
+
+    The foot points have normals (m, 2), distances (m,) and whether they are interior (m,). The limits are
+    the sigma of the model, the least sigma, the largest distance, both gates in sigmas, and `UNKNOWN`.
+    """
+    (normals, distance, interior), own = foot, poses[cycle[rows] - first_cycle]
+    sigma_model, floor, rough, chi, chi_unknown, unknown = limits
+    variance = sigma_across(normals, covariances[rows], own, sigma_model) ** 2 + floor**2
+    near, colourless = interior & (np.abs(distance) < rough), label[rows] == unknown
+    accepted = near & (distance**2 < np.where(colourless, chi_unknown, chi) ** 2 * variance)
+    return variance, accepted, near & ~accepted & ~colourless
 
 
 def _holds(active: IntArray, needed: IntArray, size: int) -> bool:

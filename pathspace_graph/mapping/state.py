@@ -8,7 +8,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials, Spans, lay_out
-from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points
 from pathspace_graph.graph.variables import CONTROL_LETTERS, Variables, control_keys
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
@@ -58,34 +58,18 @@ class Curves:
             keys=np.concatenate([control_keys(label, b.numbers) for label, b in boundaries.items()]),
         )
 
-    def number(self, labels: IntArray) -> IntArray:
-        """Return the index (m,) of the curve that has each label (m,)."""
-        return self.labels.searchsorted(labels)
-
-    def believed(self, curve: IntArray, high: Array) -> Array:
-        """Return upper limits (m,) of stretches, clipped so that they exclude extrapolated ends."""
-        trusted = np.array([boundary.trusted for boundary in self.boundaries])
-        return np.asarray(np.minimum(high, trusted[curve]))
+    @property
+    def trusted(self) -> Array:
+        """Return the parameter (k,) of each curve up to which foot points are allowed."""
+        return np.array([boundary.trusted for boundary in self.boundaries])
 
     def find(
         self, control_points: Array, points: Array, curve: IntArray, low: Array, high: Array
     ) -> FootPoints:
         """Search the foot point of each point (m, 2) on its own curve (m,) and stretch [low, high]."""
-        s, high = self.boundaries[0].settings, self.believed(curve, high)
+        s, high = self.boundaries[0].settings, np.minimum(high, self.trusted[curve])
         search = (s.search_step, s.search_iterations)
         return joint_foot_points(self.spans, control_points, points, curve, low, high, *search)
-
-    def refine(self, control_points: Array, points: Array, curve: IntArray, u: Array) -> FootPoints:
-        """Refine the foot point of each point (m, 2) on its own curve (m,), starting at u (m,)."""
-        s = self.boundaries[0].settings
-        low, high = u - s.refine_room, self.believed(curve, u + s.refine_room)
-        return refine_joint_foot_points(
-            self.spans, control_points, points, curve, u, low, high, s.refine_iterations
-        )
-
-    def reaches_inactive(self, curve: IntArray, foot: FootPoints) -> bool:
-        """Return whether any foot point, each on its own curve (m,), is on an inactive part."""
-        return not self.spans.periodic and bool((foot.u <= self.active_from[curve]).any())
 
 
 class State:
@@ -221,8 +205,8 @@ class State:
         """Add the newest pose's parameter; on a closed curve it goes on from lap to lap."""
         boundary, known = self.boundaries[label], self.pose_u[label]
         if boundary.periodic:
-            u += boundary.length * np.round((known[-1] - u) / boundary.length)
-        self.pose_u[label] = np.append(known, u)
+            u += boundary.length * round((float(known[-1]) - u) / boundary.length)
+        self.pose_u[label] = np.concatenate([known, [u]])
 
     def drop_oldest_pose_u(self) -> None:
         """Remove the parameters of the oldest pose, which has left the window."""

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, move_points, rotated, to_map
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.io.log import Detections
@@ -49,40 +50,12 @@ class TentativeTracks:
         self._keep(self.last_t > t - self.settings.forget_after)
         if len(points) == 0:
             return
-        information = np.linalg.inv(covariances)
-        nearest, near = self._nearest(points, covariances)
-        for row in np.flatnonzero(near):
-            i, weight = nearest[row], information[row]
-            self.information[i] += weight
-            self.points[i] += np.linalg.solve(self.information[i], weight @ (points[row] - self.points[i]))
-            self.counts[i] += 1
-            self.last_t[i] = max(self.last_t[i], t)  # a late detection makes no track older
-        new = ~near
-        self.points = np.concatenate([self.points, points[new]])
-        self.information = np.concatenate([self.information, information[new]])
-        self.counts = np.concatenate([self.counts, np.ones(int(new.sum()), np.intp)])
-        self.last_t = np.concatenate([self.last_t, np.full(int(new.sum()), t)])
+        gate = (self.settings.merge_radius, MERGE_MOST, MERGE_CHI)
+        tracks = _merged(
+            (self.points, self.information, self.counts, self.last_t), points, covariances, t, gate
+        )
+        self.points, self.information, self.counts, self.last_t = tracks
         self._keep(newest_of(self.last_t, MAX_TRACKS))
-
-    def _nearest(self, points: Array, covariances: Array) -> tuple[IntArray, BoolArray]:
-        """Return the track of each detection (m, 2), by index, and whether it has one."""
-        radius = self.settings.merge_radius
-        nearest, near = nearest_within(points, self.points, radius)
-        rest = np.flatnonzero(~near)
-        if len(self.points) == 0 or len(rest) == 0:
-            return nearest, near
-        offset = points[rest, None] - self.points
-        i, j = np.nonzero((offset**2).sum(axis=2) < (MERGE_MOST * radius) ** 2)
-        if len(i) == 0:
-            return nearest, near
-        joint = covariances[rest[i]] + np.linalg.inv(self.information[j])
-        off = offset[i, j]
-        square = np.full(offset.shape[:2], np.inf)
-        square[i, j] = (off * np.linalg.solve(joint, off[:, :, None])[:, :, 0]).sum(axis=1)
-        best = square.argmin(axis=1)
-        smeared = square[np.arange(len(rest)), best] < MERGE_CHI**2
-        nearest[rest[smeared]], near[rest[smeared]] = best[smeared], True
-        return nearest, near
 
     def confirmed(self) -> IntArray:
         """Return the indices of the tracks with enough detections."""
@@ -123,6 +96,44 @@ class TentativeTracks:
         if not keep.all():
             self.points, self.information = self.points[keep], self.information[keep]
             self.counts, self.last_t = self.counts[keep], self.last_t[keep]
+
+
+Tracks = tuple[Array, Array, IntArray, Array]
+
+
+@compiled
+def _merged(
+    known: Tracks, points: Array, covariances: Array, t: float, gate: tuple[float, float, float]
+) -> Tracks:
+    """Return the columns of tracks with detections added as `TentativeTracks.add` does.
+
+    The gate is a radius (m), its multiple within which smeared detections are tested, and their sigmas.
+    """
+    radius, most, chi = gate
+    places, inform, counts, last_t = known[0].copy(), known[1].copy(), known[2].copy(), known[3].copy()
+    information = np.linalg.inv(covariances)
+    nearest, near = nearest_within(points, places, radius)
+    offset = points[:, None] - places
+    i, j = np.nonzero(~near[:, None] & ((offset**2).sum(axis=2) < (most * radius) ** 2))
+    if len(i):
+        square, off = np.full(offset.shape[:2], np.inf), offset[i, j]
+        joint = covariances[i] + np.linalg.inv(inform[j])
+        square[i, j] = (off * np.linalg.solve(joint, off[:, :, None])[:, :, 0]).sum(axis=1)
+        smeared = square.min(axis=1) < chi**2
+        nearest[smeared], near[smeared] = square.argmin(axis=1)[smeared], True
+    for row in np.flatnonzero(near):
+        track, weight = nearest[row], information[row]
+        inform[track] += weight
+        places[track] += np.linalg.solve(inform[track], weight @ (points[row] - places[track]))
+        counts[track] += 1
+        last_t[track] = max(last_t[track], t)  # a late detection makes no track older
+    new = int((~near).sum())
+    return (
+        np.concatenate([places, points[~near]]),
+        np.concatenate([inform, information[~near]]),
+        np.concatenate([counts, np.ones(new, np.intp)]),
+        np.concatenate([last_t, np.full(new, t)]),
+    )
 
 
 def add_by_label(

@@ -1,5 +1,6 @@
 """Growth of the open curves through confirmed tentative tracks ahead of their ends (paper: Expansion)."""
 
+from statistics import median
 from typing import Final
 
 import numpy as np
@@ -243,10 +244,9 @@ class Growth:
         station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position)
         side = SIDES[label] * float(lateral[0])
         if len(boundary.observed) >= NEWEST:
-            _, beside = path_ahead.since(path_ahead.driven - RECALL).locate(
-                np.array(boundary.observed[-NEWEST:])
-            )
-            side = float(np.median(np.append(SIDES[label] * beside, side)))
+            newest = np.array(boundary.observed[-NEWEST:])
+            _, beside = path_ahead.since(path_ahead.driven - RECALL).locate(newest)
+            side = median([*(SIDES[label] * beside).tolist(), side])
         return End(position[0], float(station[0]), side)
 
     # --- bounds ------------------------------------------------------------------------------------------

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Final, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, Self
 
 import numpy as np
-from scipy.interpolate import BSpline as ScipyBSpline
+import scipy  # which imports its modules when they are used
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
@@ -18,6 +18,9 @@ from pathspace_graph.factors.bspline import (
 )
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline as ScipyBSpline
 
 _PERIODIC_TOLERANCE: Final = 1e-9  # of repeated values, over (1 + the largest)
 _GRID_PER_SPAN: Final = 8  # grid points on each span of a foot-point search over the whole curve
@@ -296,10 +299,12 @@ class BSpline:
         variance = np.einsum("ka,kab,kb->k", normal, self.covariance_at(u, joint_covariance), normal)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
-    def to_scipy(self) -> ScipyBSpline:
+    def to_scipy(self) -> "ScipyBSpline":
         """Return the same curve as scipy's class, which gives NaN outside of an open domain."""
         extrapolate: Literal["periodic", False] = "periodic" if self.periodic else False
-        return ScipyBSpline(self.knots, self.control_points, self.degree, extrapolate=extrapolate)
+        return scipy.interpolate.BSpline(
+            self.knots, self.control_points, self.degree, extrapolate=extrapolate
+        )
 
     def _refuse_periodic(self, what: str) -> None:
         if self.periodic:

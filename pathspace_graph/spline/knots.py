@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy.linalg
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.blas import dger
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.settings.batch import BreakSettings, FitSettings
 from pathspace_graph.spline.bspline import BSpline
@@ -94,25 +94,40 @@ def refit(
     u = _refit_samples(old, new)
     inside = (u >= within[0]) & (u <= within[1])
     w = u if u_map is None else u_map(u)
-    B_old, B_new = old.basis_matrix(u), new.basis_matrix(w)
+    local_old, local_new = old.local_basis(u), new.local_basis(w)
     within_new = w[inside]
     if new.periodic:
         begin, end = new.domain
         within_new = begin + np.mod(within_new - begin, end - begin)
     sparse = np.histogram(within_new, new.breaks)[0] <= new.degree  # fewer samples than control points
     bridge = _BRIDGE * _bending_rows(new)[np.repeat(sparse, _BENDING_PER_SPAN)]
-    stacked = np.concatenate([B_new[inside], bridge])
-    target = np.concatenate([B_old[inside], np.zeros((len(bridge), old.size))])
-    return Refit(new_from_old=_least_squares(stacked, target), old_from_new=_least_squares(B_old, B_new))
+    (values, columns), (size, old_size) = local_new, (new.size, old.size)
+    counted = values * inside[:, None], columns
+    new_from_old = _normal_solution(
+        _product(counted, local_new, (size, size)) + bridge.T @ bridge,
+        _product(counted, local_old, (size, old_size)),
+    )
+    old_from_new = _normal_solution(
+        _product(local_old, local_old, (old_size, old_size)),
+        _product(local_old, local_new, (old_size, size)),
+    )
+    return Refit(new_from_old, old_from_new)
 
 
-def _least_squares(matrix: Array, right: Array) -> Array:
-    """Return argmin |M X - R| by normal equations, which a sampled B-spline basis keeps well conditioned."""
+def _product(a: tuple[Array, IntArray], b: tuple[Array, IntArray], shape: tuple[int, int]) -> Array:
+    """Return A' B of the basis matrices (k, m) and (k, n) whose rows have local values and their columns."""
+    at = a[1][:, :, None] * shape[1] + b[1][:, None, :]
+    weights = a[0][:, :, None] * b[0][:, None, :]
+    return np.asarray(np.bincount(at.ravel(), weights.ravel(), shape[0] * shape[1]).reshape(shape), float)
+
+
+def _normal_solution(normal: Array, right: Array) -> Array:
+    """Return N^+ R of normal equations, which a sampled B-spline basis keeps well conditioned."""
     try:
-        factor = scipy.linalg.cho_factor(matrix.T @ matrix, check_finite=False)
+        factor = cho_factor(normal, check_finite=False)
     except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.lstsq(matrix, right)[0])
-    return np.asarray(scipy.linalg.cho_solve(factor, matrix.T @ right, check_finite=False))
+        return np.asarray(np.linalg.lstsq(normal, right)[0])
+    return np.asarray(cho_solve(factor, right, check_finite=False))
 
 
 def _refit_samples(old: BSpline, new: BSpline) -> Array:
@@ -255,19 +270,21 @@ def thin(
     jumps = np.diff(highest, axis=0)  # of the highest derivative at each inner break, by control point
     factor = cho_factor(B.T @ B + fit.smoothness * bending.T @ bending)
     watched, n, remaining = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
-    spread, values = watched @ cho_solve(factor, jumps.T), watched @ cho_solve(factor, B.T @ points)
+    spread = np.asfortranarray(watched @ cho_solve(factor, jumps.T))
+    values = watched @ cho_solve(factor, B.T @ points)
     leverage = np.einsum("kn,nk->k", B, cho_solve(factor, B.T))
     for size in range(B.shape[1], max(min(least, B.shape[1]), B.shape[1] - n) - 1, -1):
         kept = breaks[np.concatenate([[0], 1 + remaining, [-1]])]
         yield Thinned(kept, size, points - values[n:], leverage)
         if len(remaining):
-            cost = (values[remaining] ** 2).sum(axis=1) / spread.diagonal()[remaining]
+            jump = values[remaining]
+            cost = (jump[:, 0] ** 2 + jump[:, 1] ** 2) / spread[remaining, remaining]
             removed = int((cost + EVEN * (kept[2:] - kept[:-2]) ** 2).argmin())
             k, column = remaining[removed], spread[:, remaining[removed]].copy()
-            leverage = leverage - column[n:] ** 2 / column[k]
-            values = values - np.outer(column / column[k], values[k])
-            spread -= np.outer(column / column[k], spread[k])
-            remaining = np.delete(remaining, removed)
+            leverage, share = leverage - column[n:] ** 2 / column[k], column / column[k]
+            values = values - share[:, None] * values[k]
+            spread = dger(-1.0, share, spread[k], a=spread, overwrite_a=1)
+            remaining = np.concatenate([remaining[:removed], remaining[removed + 1 :]])
 
 
 def _breaks(u: Array, high: float) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
-from pathspace_graph.factors.footpoint import joint_foot_points, refine_joint_foot_points
+from pathspace_graph.factors.footpoint import TOLERANCES, joint_foot_points, refine_joint_foot_points
 from pathspace_graph.factors.kernels import _KERNELS, COMPILED, IN_NUMPY, NUMPY_ONLY
 
 for _module in (
@@ -22,6 +22,8 @@ for _module in (
     "graph.relative",
     "graph.rows",
     "mapping.path",
+    "mapping.smoother",
+    "mapping.tentative",
 ):
     import_module(f"pathspace_graph.{_module}")  # each registers its functions
 
@@ -47,8 +49,22 @@ def information(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def rows_of_a_system(rng: np.random.Generator) -> tuple[Any, ...]:
-    hessian = np.asfortranarray(np.zeros((30, 30)))
-    return hessian, rng.normal(size=30), *rows_with_keys(rng), rng.normal(size=30)
+    """Two groups of rows, and a factor with its keys in any order."""
+    keys, starts, *rows, residual = rows_with_keys(rng)
+    held = rng.permutation(keys)[:4]
+    factor = held, np.asfortranarray(information(rng, 13))
+    return keys, starts, np.full(10, 3), [factor], [(*rows, residual)] * 2, rng.normal(size=30)
+
+
+def block_of_rows(rng: np.random.Generator) -> tuple[Any, ...]:
+    keys, _, *rows, residual = rows_with_keys(rng)
+    return keys, np.full(10, 3), [(*rows, residual)] * 2
+
+
+def replaced_rows(rng: np.random.Generator) -> tuple[Any, ...]:
+    keys, starts, sought, *pattern, jacobian, residual = rows_with_keys(rng)
+    kept, fresh = ((sought, jacobian, residual, rng.integers(0, 9, COUNT)) for _ in range(2))
+    return kept, np.array([2, 3, 7]), fresh, keys, starts, *pattern, rng.normal(size=30)
 
 
 def rows_with_keys(rng: np.random.Generator) -> tuple[Any, ...]:
@@ -67,16 +83,9 @@ def rows_with_keys(rng: np.random.Generator) -> tuple[Any, ...]:
     )
 
 
-def prior_of_a_system(rng: np.random.Generator) -> tuple[Any, ...]:
-    hessian, entries = np.asfortranarray(np.zeros((30, 30))), np.sort(rng.choice(30, 12, replace=False))
-    information = rng.normal(size=(12, 12))
-    rest = rng.normal(size=12), entries, rng.normal(size=30)
-    return hessian, rng.normal(size=30), np.asfortranarray(information @ information.T), *rest
-
-
 def kept_rows(rng: np.random.Generator) -> tuple[Any, ...]:
     keys, owner = rng.integers(0, 50, (COUNT, 4)), rng.integers(0, 9, COUNT)
-    return keys, rng.normal(size=(COUNT, 7)), rng.normal(size=COUNT), owner, np.array([2, 3, 7])
+    return (keys, rng.normal(size=(COUNT, 7)), rng.normal(size=COUNT), owner), np.array([2, 3, 7])
 
 
 def some_columns(rng: np.random.Generator) -> tuple[Any, ...]:
@@ -98,18 +107,89 @@ def scan(rng: np.random.Generator) -> tuple[Any, ...]:
     return recent, rng.uniform(-8.0, 8.0, (COUNT, 2)), rng.uniform(0.01, 0.1, COUNT), 0.1 * poses(rng, 1)[0]
 
 
+def table(rng: np.random.Generator) -> tuple[Any, ...]:
+    """Rows of a table of detections, its cycles and points, and the poses from cycle 5 on."""
+    rows, cycles = np.arange(COUNT)[::2], 5 + np.sort(rng.integers(0, 3, COUNT))
+    return rows, cycles, 9.0 * rng.normal(size=(COUNT, 2)), poses(rng), poses(rng, 3), 5
+
+
+def gate(rng: np.random.Generator) -> tuple[Any, ...]:
+    rows, cycles, _, _, own, first = table(rng)
+    count = len(rows)
+    foot = rng.normal(size=(count, 2)), rng.normal(size=count), rng.choice([True, False], count)
+    limits = (0.1, 0.05, 2.0, 1.0, 0.5, 2)
+    return rows, cycles, rng.integers(0, 3, COUNT), covariances(rng), own, first, foot, limits
+
+
+def tracks(rng: np.random.Generator) -> tuple[Any, ...]:
+    """Detections near tracks, beside them in their smeared noise, and far from any."""
+    known = 2 * COUNT
+    inform = np.linalg.inv(np.tile(0.05 * np.eye(2), (known, 1, 1)))
+    columns = 4.0 * rng.normal(size=(known, 2)), inform, rng.integers(1, 9, known), rng.uniform(size=known)
+    smeared = 0.2 * covariances(rng) + 0.01 * np.eye(2)
+    return columns, 5.0 * rng.normal(size=(COUNT, 2)), smeared, 0.7, (0.5, 2.0, 2.5)
+
+
+def seen_curves(rng: np.random.Generator, periodic: bool) -> tuple[Any, ...]:
+    """Curves, and detections in use on them, of two cycles of three."""
+    spans, control_points = curves(rng, periodic, 3)
+    keys = rng.permutation(1000)[: len(control_points)]
+    own = control_points, np.array([0, 1]), keys, np.array([9.0, 30.0]), np.array([3.0, -np.inf])
+    cycles, boundary = 5 + np.sort(rng.integers(0, 3, COUNT)), rng.integers(0, 2, COUNT)
+    measured, twists = 9.0 * rng.normal(size=(COUNT, 2)), poses(rng)
+    where = rng.choice([True, True, False], COUNT), rng.uniform(0.0, 20.0, COUNT)
+    seen = (cycles, boundary, *where, measured, twists, covariances(rng) + 0.01 * np.eye(2))
+    limits = (4.0, 2, 50, 0.1, 1.5)
+    poses_seen = 0.1 * poses(rng, 3), 5, 0.01 * rng.normal(size=5)
+    return spans, own, seen, np.array([5, 7]), *poses_seen, limits, (100, 50), TOLERANCES
+
+
+def views(rng: np.random.Generator, periodic: bool) -> tuple[Any, ...]:
+    spans, control_points = curves(rng, periodic, 3)
+    beside = [rng.uniform(0.0, 20.0, 4) for _ in range(2)]
+    where = 9.0 * rng.normal(size=(COUNT, 2)), rng.integers(0, 2, COUNT), rng.integers(0, 5, COUNT)
+    rooms = (5.0, 15.0, 2.0, 4.0)
+    known = np.array([9.0, np.inf])
+    return spans, control_points, known, *where, beside, poses(rng, 1)[0], rooms, 0.7, 50, TOLERANCES
+
+
 CASES: dict[str, Arguments] = {
-    "add_rows": rows_of_a_system,
-    "add_prior": prior_of_a_system,
+    "summed": rows_of_a_system,
+    "block_of": block_of_rows,
+    "replaced": replaced_rows,
     "moved_residual": lambda rng: (*rows_with_keys(rng), rng.normal(size=30)),
     "parted": kept_rows,
-    "rows_holding": lambda rng: (rng.integers(0, 50, (COUNT, 4)), np.array([2, 3, 7, 20])),
+    "owners_holding": lambda rng: (
+        rng.integers(0, 50, (COUNT, 4)),
+        rng.integers(0, 9, COUNT),
+        np.array([2, 3, 7, 20]),
+    ),
+    "laid_out": lambda rng: (np.sort(rng.integers(0, 50, COUNT)), 5, 40, (2, 5, 3)),
     "columns_of": some_columns,
     "spread": lambda rng: (rng.integers(0, 99, COUNT), rng.integers(0, 4, COUNT)),
     "by_sensor": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng)),
     "shifted": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng), rng.normal(size=5)),
     "to_map": lambda rng: (rng.normal(size=(COUNT, 2)), poses(rng)),
     "detection_rows": lambda rng: detections(rng, 5),
+    "placed": lambda rng: (*table(rng), 0.1 * rng.normal(size=5)),
+    "open_rows": lambda rng: (
+        np.array([0, 1]),
+        np.array([0, min(COUNT, 4)]),
+        *rng.integers(0, 3, (2, COUNT)),
+        rng.choice([True, False], COUNT),
+        2,
+    ),
+    "gated": gate,
+    "merged": tracks,
+    "curve_rows": lambda rng: seen_curves(rng, False),
+    "in_view": lambda rng: views(rng, False),
+    "whitened_odometry": lambda rng: (
+        *(poses(rng) for _ in range(3)),
+        rng.normal(size=(COUNT, 3, 3)),
+        rng.normal(size=(COUNT, 3, 2)),
+        rng.normal(size=2),
+        1e-3,
+    ),
     "along_and_across": lambda rng: (poses(rng)[:, :2], poses(rng, 40)[:, :2], np.sort(rng.normal(size=40))),
     "odometry_residuals": lambda rng: (poses(rng), poses(rng), poses(rng), 1e-3),
     "integrated": lambda rng: (rng.uniform(0.0, 0.1, COUNT), poses(rng), rng.uniform(0.1, 0.2, (COUNT, 3))),
@@ -133,10 +213,10 @@ CASES: dict[str, Arguments] = {
         poses(rng, 1)[0],
         information(rng, 3),
     ),
-    "relative_rows": lambda rng: (
+    "relative_block": lambda rng: (
         rng.normal(size=(COUNT, 9)),
         rng.normal(size=COUNT),
-        *(rng.normal(size=size) for size in (9, 12)),
+        *(rng.normal(size=size) for size in (9, 12, 12)),
         np.array([2, 4, 6]),
         np.array([8]),
     ),
@@ -165,12 +245,17 @@ SEARCHES = {"searched", "refined"}
 
 
 def results(function: Callable[..., Any], arguments: tuple[Any, ...]) -> list[Any]:
-    """What a function returns, or the arrays that it has changed."""
-    own = tuple(one.copy(order="K") if isinstance(one, np.ndarray) else one for one in arguments)
-    found = function(*own)
-    if found is None:
-        return [np.tril(own[0]), own[1]]
-    return list(found) if isinstance(found, tuple) else [found]
+    """What a function returns, where of a Hessian only the lower triangle is told."""
+    found = function(*arguments)
+    if function.__name__.endswith("summed"):
+        return [np.tril(found[0]), found[1]]
+    return [*flat(found)]
+
+
+def flat(found: Any) -> Iterator[Any]:
+    """The arrays and numbers in nested tuples and lists."""
+    for one in found if isinstance(found, tuple | list) else (found,):
+        yield from flat(one) if isinstance(one, tuple | list) else (one,)
 
 
 def assert_equal(found: list[Any], expected: list[Any]) -> None:
@@ -213,6 +298,9 @@ def test_every_compiled_function_is_tested() -> None:
         ("to_map", lambda rng: (rng.normal(size=(1, 2)), poses(rng))),
         ("to_map", lambda rng: (np.zeros((0, 2)), poses(rng, 1))),
         ("detection_rows", lambda rng: detections(rng, 0)),
+        ("placed", lambda rng: (*table(rng), np.zeros(0))),
+        ("curve_rows", lambda rng: seen_curves(rng, True)),
+        ("in_view", lambda rng: views(rng, True)),
         ("odometry_residuals", lambda rng: (poses(rng), poses(rng), 1e-5 * poses(rng), 1e-3)),
         ("matched", lambda rng: (np.zeros((0, 2)), *scan(rng)[1:], [1.0], (3.0, 0.7, 2.5, 0.05, 3, 1e-6))),
         ("integrated", lambda rng: (np.full(3, 0.1), np.zeros((3, 3)), np.full((3, 3), 0.1))),
@@ -279,8 +367,6 @@ def test_foot_points(seed: int, periodic: bool, degree: int, monkeypatch: pytest
 def test_shapes_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="shapes that fit"):
         _KERNELS.to_map(np.zeros((3, 2)), np.zeros((2, 3)))
-    with pytest.raises(TypeError):  # the Hessian is changed in place, so a copy of it would be lost
-        _KERNELS.add_rows(np.zeros((2, 3)), *[np.zeros(2)] * 9)
 
 
 def test_the_environment_keeps_the_compiled_versions_out() -> None:

@@ -88,9 +88,10 @@ def test_which_rows_a_boundary_may_have() -> None:
     assert table.pending(LEFT).tolist() == [0, 4, 5]
     table.take(np.array([2, 4]), np.array([RIGHT, LEFT]), np.zeros(2))
     assert table.pending(LEFT).tolist() == [0, 5]
-    assert table.open_to(LEFT, 0).tolist() == [0, 2, 5]
-    assert table.open_to(RIGHT, 0).tolist() == [1, 3]
-    assert table.open_to(LEFT, 1).tolist() == [2, 5]
+    rows, curve = table.open_to(np.array([LEFT, RIGHT]), np.zeros(2, np.intp))
+    assert rows[curve == 0].tolist() == [0, 2, 5]
+    assert rows[curve == 1].tolist() == [1, 3]
+    assert table.open_to(np.array([LEFT]), np.array([1]))[0].tolist() == [2, 5]
 
 
 def test_landmarks_that_are_merged_give_their_detections() -> None:

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.footpoint import refine_joint_foot_points
 from pathspace_graph.graph.variables import CALIBRATION_KEY, control_keys, pose_keys
+from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.mapper import SplineSettings
+from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
 
 from ..scenes.maps import boundary_through
 
@@ -84,7 +87,9 @@ def test_foot_points_on_both_curves_are_those_on_each_alone(state: State) -> Non
     curve, u = rng.integers(0, 2, 20), rng.uniform(3.0, 35.0, 20)
     points = np.column_stack([u, rng.normal(size=20)])
     found = state.curves.find(state.map_points, points, curve, u - 3.0, u + 3.0)
-    refined = state.curves.refine(state.map_points, points, curve, u)
+    room = SplineSettings().refine_room
+    stretch = u, u - room, np.minimum(u + room, state.curves.trusted[curve])
+    refined = refine_joint_foot_points(state.curves.spans, state.map_points, points, curve, *stretch)
     for index, label in enumerate((LEFT, RIGHT)):
         own, boundary = curve == index, state.boundaries[label]
         control = state.control_points(label)
@@ -102,17 +107,18 @@ def test_a_foot_point_before_the_active_stretch_is_noticed(state: State) -> None
     first = 5
     state.active_stretch = {LEFT: np.arange(first, state.boundaries[LEFT].size)}
     begins = state.boundaries[LEFT].knots[first + SplineSettings().degree]
-    u, curve = np.array([begins + 1.0, 1.0]), np.array([0, 1])
-    foot = state.curves.refine(state.map_points, np.column_stack([u, [2.0, -2.0]]), curve, u)
-    assert not state.curves.reaches_inactive(curve, foot)
-    u = np.array([begins - 1.0, 1.0])
-    foot = state.curves.refine(state.map_points, np.column_stack([u, [2.0, -2.0]]), curve, u)
-    assert state.curves.reaches_inactive(curve, foot)
+    for left, reaches in ((begins + 1.0, False), (begins - 1.0, True)):
+        track, u, labels = CurveMap(MapperSettings(), state), np.array([left, 1.0]), np.array([LEFT, RIGHT])
+        points, covariances = np.column_stack([u, [2.0, -2.0]]), np.tile(0.01 * np.eye(2), (2, 1, 1))
+        track.detections.append(Detections(0.0, points, covariances, labels), 0)
+        track.detections.take(np.arange(2), labels, u)
+        track.rows(np.zeros(1, np.intp))
+        assert track.reached_inactive == reaches
 
 
 def test_the_extrapolated_end_is_no_part_of_a_stretch(state: State) -> None:
     trusted = state.boundaries[RIGHT].trusted
     assert trusted == 40.0 + SplineSettings().confirmed_margin
-    np.testing.assert_array_equal(
-        state.curves.believed(np.array([1, 1]), np.array([20.0, 99.0])), [20.0, trusted]
-    )
+    points, curve, low = np.array([[20.0, -2.0], [99.0, -2.0]]), np.array([1, 1]), np.zeros(2)
+    foot = state.curves.find(state.map_points, points, curve, low, np.array([20.0, 99.0]))
+    np.testing.assert_allclose(foot.u, [20.0, trusted], atol=1e-9)
