@@ -321,7 +321,7 @@ def _figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]:
     mean, p99 = _mean(times[WARM_UP:]), float(np.quantile(times, 0.99))
     gtsam, rival = best.optimize + best.marginal, _mean(measurement.rival[WARM_UP:])
     isam2, isam2_p99 = _mean(measurement.isam2[WARM_UP:]), float(np.quantile(measurement.isam2, 0.99))
-    laps = _lap_means(cycles, measurement.laps)
+    laps = [_mean([c.seconds for c in cycles if c.lap == k]) for k in range(1, measurement.laps + 1)]
     closing = float(times[measurement.closing]) if measurement.closing is not None else float("nan")
     yield "mean_by_gtsam", mean / gtsam, ""
     yield "mean_by_landmark", mean / rival, ""
@@ -370,10 +370,6 @@ def _ahead_figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]
     for name, own in (("ahead_open", times[~closed][WARM_UP:]), ("ahead_closed", times[closed])):
         if len(own):
             yield name, float(np.median(own)), "ms"
-
-
-def _lap_means(cycles: Sequence[CycleRecord], laps: int) -> list[float]:
-    return [_mean([c.seconds for c in cycles if c.lap == lap]) for lap in range(1, laps + 1)]
 
 
 def _mean(values: Iterable[float]) -> float:

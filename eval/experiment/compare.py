@@ -204,12 +204,13 @@ def paper_table(comparison: Comparison) -> TextTable:
     """Return the paper's Table 1, lap by lap; without truth it has the sizes only."""
     shown = PAPER if comparison.has_truth else (METRICS["size"],)
     logs = ["logs"] if len(comparison.logs) > 1 else []
-    rows = tuple(
-        (row["estimator"], _lap(row), *(str(row[key]) for key in logs), *(_cell(m, row) for m in shown))
-        for row in paper_frame(comparison).to_dict("records")
-    )
+    rows = []
+    for row in paper_frame(comparison).to_dict("records"):
+        lap = (AT_END if row["logs"] else FAILED) if pd.isna(row["lap"]) else str(int(row["lap"]))
+        cells = (*(str(row[key]) for key in logs), *(_cell(metric, row) for metric in shown))
+        rows.append((row["estimator"], lap, *cells))
     header = ("estimator", "lap", *logs, *(metric.heading for metric in shown))
-    return TextTable(_title(comparison, "at the end of each lap"), header, rows, group_starts(rows))
+    return TextTable(_title(comparison, "at the end of each lap"), header, tuple(rows), group_starts(rows))
 
 
 def final_table(comparison: Comparison) -> TextTable:
@@ -287,12 +288,6 @@ def _title(comparison: Comparison, when: str) -> str:
     logs = comparison.logs[0].name if count == 1 else f"mean over {count} logs"
     missing = "" if comparison.has_truth else f" ({NO_TRUTH})"
     return f"{logs}, {when}{missing}"
-
-
-def _lap(row: dict[Any, Any]) -> str:
-    if not pd.isna(row["lap"]):
-        return str(int(row["lap"]))
-    return AT_END if row["logs"] else FAILED
 
 
 def _cell(metric: Metric, row: dict[Any, Any]) -> str:

@@ -161,7 +161,10 @@ def _map_values(
     if truth is None or not has_cones(truth):
         return values
     values |= _cone_values(track, truth) | _curve_values(track, truth, ghost_settings)
-    values |= _consistency_values(track, truth) | _turn_values(track, truth) | _centre_values(track, truth)
+    values |= _consistency_values(track, truth) | _centre_values(track, truth)
+    turn = turn_from_truth(track, truth)
+    turns = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
+    values |= {key: value for key, value in turns.items() if not np.isnan(value)}
     if marginals:
         by_marginals = _consistency_values(with_marginals(track), truth)
         keys = ("nees", "inside", "normalized_error")
@@ -197,12 +200,6 @@ def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
     values = {"nees": nees.ratio, "nees_low": low, "nees_high": high}
     values |= {} if np.isnan(nees.ratio) else {"nees_inside": nees.honest}
     return values | {"inside": at_cones.share_inside(), "normalized_error": at_cones.mean_squared()}
-
-
-def _turn_values(track: Map, truth: Truth) -> dict[str, float]:
-    turn = turn_from_truth(track, truth)
-    values = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
-    return {key: value for key, value in values.items() if not np.isnan(value)}
 
 
 def _centre_values(track: Map, truth: Truth) -> dict[str, float]:

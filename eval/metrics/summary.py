@@ -37,6 +37,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
 
     Hints about the log are in it as well.
     """
+    seconds = np.array([record.seconds for record in result.cycles])
     summary: dict[str, Any] = {
         "estimator": result.estimator,
         "settings": result.settings,
@@ -48,7 +49,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "size": result.map.size,
         "not_mapped": not_mapped(result.map, log),
         "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
-        "seconds": _timing(result),
+        "seconds": _timing(seconds) if len(seconds) else None,
         "gate": {name: sum(getattr(record, name) for record in result.cycles) for name in GATE},
     }
     if result.batches is not None:
@@ -63,7 +64,8 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
     if events:
         summary["events"] = events
     if any(record.health for record in result.cycles):
-        summary["health"] = _health(result)
+        number = counts([health_of(record) for record in result.cycles])
+        summary["health"] = {**number, "stretches": [asdict(of) for of in stretches_of(result)]}
     if result.noise is not None:
         summary["noise"] = _noise(result.noise, log)
         notes = noise_lines(result.noise)
@@ -114,12 +116,6 @@ def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
         values |= dict(zip(SENSOR, measured.sensor.tolist(), strict=True))
         values |= dict(zip(sigmas, measured.sensor_sigma.tolist(), strict=True))
     return sources | {"measured": values}
-
-
-def _health(result: RunResult) -> dict[str, Any]:
-    """Return the number of cycles of each condition, and the stretches (s) that were not good."""
-    not_good = [asdict(stretch) for stretch in stretches_of(result)]
-    return {**counts([health_of(record) for record in result.cycles]), "stretches": not_good}
 
 
 def stretches_of(result: RunResult) -> list[Stretch]:
@@ -178,10 +174,7 @@ def has_cones(truth: Truth) -> bool:
     return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
 
 
-def _timing(result: RunResult) -> dict[str, float] | None:
-    if not result.cycles:
-        return None
-    seconds = np.array([record.seconds for record in result.cycles])
+def _timing(seconds: Array) -> dict[str, float]:
     mean, p99, most = np.mean(seconds), np.quantile(seconds, 0.99), np.max(seconds)
     return {"mean": float(mean), "p99": float(p99), "max": float(most)}
 

@@ -184,8 +184,9 @@ class Report:
         if self.quick and self.pages is not None:
             raise SettingsError("--pages: expected none with --quick, whose figures mean little")
         known = read_figures(self.pages / FIGURES) if self.pages and (self.pages / FIGURES).exists() else {}
+        command = "pathspace-graph report" + (" --tracks TRACKS" if self.tracks else "")
         about = {
-            "command": "pathspace-graph report" + (" --tracks TRACKS" if self.tracks else ""),
+            "command": command + (" --real LOGS" if self.real else ""),
             "commit": commit_of(self.pages),
             "date": date.today().isoformat(),
         }
