@@ -183,7 +183,6 @@ class InactiveChain(InactiveMap):
         """Links, in the order in which they left."""
         self.poses: dict[int, Array] = {}
         """Poses (3,) of the origin and of anchors that are no variables, as of `refresh`."""
-        self._refreshed: Array | None = None  # all values as of then
 
     def __len__(self) -> int:
         return len(self.links)
@@ -234,12 +233,10 @@ class InactiveChain(InactiveMap):
         keys = np.concatenate([np.zeros(0, np.intp), *leaving])
         self.keys = np.sort(keys[~are_poses(keys)])
         self.anchors = np.array([link.factor.frame for link in self.links[-1:]], np.intp)
-        self._active, self._refreshed = None, None
+        self._active = None
 
     def refresh(self, variables: Variables) -> None:
         """Update the inactive variables, from the newest link to the oldest, given the active ones."""
-        if self._refreshed is not None and np.array_equal(self._refreshed, variables.values):
-            return
         self.poses = {}
         for link in reversed(self.links):
             values = link.solve(variables, self._pose(link.factor.frame, variables))
@@ -248,7 +245,6 @@ class InactiveChain(InactiveMap):
             variables.values[variables.layout.entries(link.leaving.keys[points])] = values[:count]
             poses = values[count:].reshape(-1, POSE)
             self.poses |= dict(zip(link.leaving.keys[~points].tolist(), poses, strict=True))
-        self._refreshed = variables.values.copy()
 
     def _pose(self, key: int, variables: Variables) -> Array:
         return self.poses[key] if key in self.poses else variables.of(np.array([key]))
@@ -285,7 +281,6 @@ class InactiveChain(InactiveMap):
         motion = inverse(self.origin)
         self.poses = {key: compose(motion, pose) for key, pose in self.poses.items()}
         variables.values = from_frame(variables.values, motion, variables.layout)
-        self._refreshed = variables.values.copy()
         for follower in followers:
             follower.move(motion)
         return graph_of(near.factor(variables))
