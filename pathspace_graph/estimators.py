@@ -67,9 +67,14 @@ def _check(name: str, known: Mapping[str, Any], kind: str) -> None:
         raise SettingsError(f"--estimator: expected a known {kind} estimator ({names}), found '{name}'")
 
 
-check_online: Final = partial(_check, known=ONLINE, kind="online")
-check_batch: Final = partial(_check, known=BATCH, kind="batch")
-"""Raise a SettingsError that names the known estimators, unless the name is one of them."""
+def check_online(name: str) -> None:
+    """Raise a SettingsError that names the known estimators, unless the name is one of them."""
+    _check(name, ONLINE, "online")
+
+
+def check_batch(name: str) -> None:
+    """Raise a SettingsError that names the known estimators, unless the name is one of them."""
+    _check(name, BATCH, "batch")
 
 
 def for_map(name: str, kind: MapKind) -> str:

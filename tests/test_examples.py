@@ -41,8 +41,8 @@ def test_gnss_holds_the_vehicle_where_cones_let_it_drift() -> None:
 @pytest.mark.slow
 def test_a_boundary_passes_through_the_surveyed_point() -> None:
     without, with_survey = example("surveyed_point").main()
-    assert with_survey < 0.15
-    assert with_survey < 0.1 * without
+    assert with_survey < 0.2
+    assert with_survey < 0.15 * without
 
 
 def test_the_graph_can_be_looked_at(tmp_path: Path) -> None:

@@ -94,12 +94,14 @@ class DetectionColumns:
         """Return all positions (m, 2), vehicle frame, corrected by the calibration that was set last."""
         return self.corrected(slice(None), self.sensor)
 
-    def points_map(self, rows: IntArray | slice, variables: Variables) -> Array:
+    def points_map(self, rows: IntArray | BoolArray | slice, variables: Variables) -> Array:
         """Return corrected positions (m, 2) in the map frame, by the poses of their cycles."""
-        if isinstance(rows, slice):
+        if isinstance(rows, slice) or rows.dtype == np.bool_:
             rows = np.arange(len(self))[rows]
         poses = variables.poses, variables.first_cycle
-        return _placed(rows, self.cycle, self.measured, self.twist, *poses, variables.sensor)
+        return _placed(
+            rows.astype(np.intp, copy=False), self.cycle, self.measured, self.twist, *poses, variables.sensor
+        )
 
     def covariances_map(self, rows: IntArray | slice, variables: Variables) -> Array:
         """Return the covariances (m, 2, 2) in m^2 in the map frame, by the poses of their cycles."""

@@ -244,8 +244,7 @@ class Growth:
         station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position)
         side = SIDES[label] * float(lateral[0])
         if len(boundary.observed) >= NEWEST:
-            newest = np.array(boundary.observed[-NEWEST:])
-            _, beside = path_ahead.since(path_ahead.driven - RECALL).locate(newest)
+            _, beside = path_ahead.locate(np.array(boundary.observed[-NEWEST:]))
             side = median([*(SIDES[label] * beside).tolist(), side])
         return End(position[0], float(station[0]), side)
 

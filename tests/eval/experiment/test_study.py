@@ -192,6 +192,7 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
     on_disk = {file.stem for file in (ROOT / "eval" / "studies").glob("*.toml")}
     assert set(shipped_studies()) == on_disk
     assert on_disk == {
+        "acceleration",
         "batch",
         "camera",
         "centerline",
@@ -232,9 +233,13 @@ def test_every_shipped_track_can_be_driven_whole_and_in_part(file: Path) -> None
 @pytest.mark.parametrize("name", shipped_studies())
 def test_every_shipped_study_is_sound_and_listed(name: str) -> None:
     read = read_study(find_study(Path(name)))
-    assert len(read.tracks) * len(read.seeds) >= {"hard": 8, "faults": 4, "endurance": 4, "sizes": 4}.get(
-        name, 20
-    )
+    assert len(read.tracks) * len(read.seeds) >= {
+        "acceleration": 10,
+        "hard": 8,
+        "faults": 4,
+        "endurance": 4,
+        "sizes": 4,
+    }.get(name, 20)
     assert len(read.points) > 1 or len(read.estimators) > 1 or read.columns
     assert f"`{name}`" in (ROOT / "docs" / "studies.md").read_text()
 

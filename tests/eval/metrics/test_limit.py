@@ -24,7 +24,6 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.settings import calibration
 from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
@@ -134,7 +133,7 @@ def standing_log(detections: Array, covariances: Array) -> Log:
 
 
 def test_a_landmark_seen_standing_is_the_information_weighted_mean(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(calibration, "SIGMAS_START", (1e-6, 1e-6, 1e-6))
+    monkeypatch.setattr(OdometrySettings, "sigmas_start", (1e-6, 1e-6, 1e-6))
     rng = np.random.default_rng(0)
     roots = rng.normal(0.0, 2e-3, (8, 2, 2)) + 1e-3 * np.eye(2)
     covariances = roots @ np.swapaxes(roots, 1, 2)
