@@ -325,8 +325,9 @@ class FixedLagSmoother(Generic[M_co]):
                 self.submaps.hang(anchor, self.variables.of(self.chain.anchors))
 
     def carry(self) -> None:
-        """Move an open map so that the drive began at the origin, after its inactive part is updated."""
+        """Update the inactive variables, and move an open map so that the drive began at the origin."""
         if self.chain is None or len(self.chain) == 0:
+            self.refresh()
             return
         self._finish_submap()
         self.prior = self.chain.carry(self.prior, self.variables, self.followers)
@@ -361,7 +362,6 @@ class FixedLagSmoother(Generic[M_co]):
             return
         self.carry()
         self._finish_submap()
-        self.refresh()
         if chain is not None:
             self._place_keyframes(chain)
         if not with_prior:

@@ -12,7 +12,7 @@ from pathspace_graph.settings.online import ClosingSettings
 
 from .curve_map import CurveMap
 from .path import DrivenPath
-from .state import State
+from .state import Curves, State
 
 HEADING: Final = 0.8
 """Largest angle between the heading and that of the beginning where the loop may close (rad)."""
@@ -158,23 +158,37 @@ def register(
     """
     recent, state = _recent(track, times), track.state
     prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
-    stretches = {
-        label: (0.0, min(BEGINNING, BEGINNING_SHARE * boundary.confirmed_end))
-        for label, boundary in state.boundaries.items()
-    }
-    centre = state.poses[-1, :2].copy()
-    vector = np.zeros(3)
+    stretches, centre, vector = _beginning(state), state.poses[-1, :2].copy(), np.zeros(3)
     lost = is_lost(covariance, settings)
     if lost:
         starts = [v for v in _motions(state.poses[-1], beginning) if v @ prior @ v < START_CHI2]
+        curves = state.whole_curves
         inliers = [
-            _match(state, settings, recent, Motion(centre, v), stretches, REACH).inlier.sum()
+            _match(state, curves, settings, recent, Motion(centre, v), stretches, REACH).inlier.sum()
             for v in [vector, *starts]
         ]
         vector = [vector, *starts][int(np.argmax(inliers))]
     found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
     agree = agrees(found.matches, list(state.boundaries), settings)
     return found if agree and is_certain(found.matches, found.covariance, settings, lost) else None
+
+
+def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
+    """Return whether the newest detections reach the beginning of the curves from where they are believed.
+
+    Where they do not, `register` can only agree if the vehicle is lost.
+    """
+    recent, state = _recent(track, times), track.state
+    unmoved = Motion(state.poses[-1, :2], np.zeros(3))
+    found = _match(state, state.whole_curves, settings, recent, unmoved, _beginning(state), REACH)
+    return bool(found.hessian.any())
+
+
+def _beginning(state: State) -> dict[int, tuple[float, float]]:
+    return {
+        label: (0.0, min(BEGINNING, BEGINNING_SHARE * boundary.confirmed_end))
+        for label, boundary in state.boundaries.items()
+    }
 
 
 def refine(
@@ -189,10 +203,11 @@ def refine(
 
     The prior of the motion has the mean (3,) and the information (3, 3).
     """
-    (mean, information), vector = prior, start.vector
+    (mean, information), vector, curves = prior, start.vector, state.whole_curves
     for iteration in range(ITERATIONS):
         reach = max(settings.inlier_distance, REACH * SHRINK**iteration)
-        matches = _match(state, settings, seen, Motion(start.centre, vector), stretches, reach)
+        motion = Motion(start.centre, vector)
+        matches = _match(state, curves, settings, seen, motion, stretches, reach)
         negative_gradient = matches.negative_gradient - information @ (vector - mean)
         vector = vector + np.linalg.solve(matches.hessian + information, negative_gradient)
     covariance = np.asarray(np.linalg.inv(matches.hessian + information), np.float64)
@@ -228,6 +243,7 @@ def _recent(track: CurveMap, times: Sequence[float]) -> Sightings:
 
 def _match(
     state: State,
+    curves: Curves,
     settings: ClosingSettings,
     seen: Sightings,
     motion: Motion,
@@ -235,27 +251,22 @@ def _match(
     reach: float,
 ) -> Matches:
     """Match moved detections with a stretch of each curve, and linearize those within `reach` (m)."""
-    moved = motion.apply(seen.points)
-    hessian, negative_gradient = np.zeros((3, 3)), np.zeros(3)
-    matched, u, inlier = [np.zeros(0, np.intp)], [np.zeros(0)], [np.zeros(0, bool)]
-    for label, boundary in state.boundaries.items():
-        of_label = np.flatnonzero(seen.labels == label)
-        low, high = (np.full(len(of_label), end) for end in stretches[label])
-        foot = boundary.find(state.control_points(label), moved[of_label], low, high)
-        used = foot.interior & (np.abs(foot.distance) < reach)
-        n, arm = foot.normal_unit[used], moved[of_label[used]] - motion.centre - motion.vector[:2]
-        sigma = np.sqrt(
-            np.einsum("mi,mij,mj->m", n, seen.covariances[of_label[used]], n) + settings.sigma_reading**2
-        )
-        jacobian = by_motion(n, arm) / sigma[:, None]
-        hessian += jacobian.T @ jacobian
-        negative_gradient -= jacobian.T @ (foot.distance[used] / sigma)
-        matched.append(of_label[foot.interior])
-        u.append(foot.u[foot.interior])
-        inlier.append(np.abs(foot.distance[foot.interior]) < settings.inlier_distance)
-    inside, parameters, inliers = np.concatenate(matched), np.concatenate(u), np.concatenate(inlier)
-    rows, labels = seen.rows[inside], seen.labels[inside]
-    return Matches(rows, labels, parameters, inliers, seen.explained[inside], hessian, negative_gradient)
+    moved, curve = motion.apply(seen.points), curves.labels.searchsorted(seen.labels)
+    low, high = np.array([stretches[label] for label in curves.labels.tolist()])[curve].T
+    foot = curves.find(state.map_points, moved, curve, low, high)
+    inside, used = foot.interior, foot.interior & (np.abs(foot.distance) < reach)
+    n, arm = foot.normal_unit[used], moved[used] - motion.centre - motion.vector[:2]
+    variance = np.einsum("mi,mij,mj->m", n, seen.covariances[used], n) + settings.sigma_reading**2
+    jacobian = by_motion(n, arm) / np.sqrt(variance)[:, None]
+    return Matches(
+        seen.rows[inside],
+        seen.labels[inside],
+        foot.u[inside],
+        np.abs(foot.distance[inside]) < settings.inlier_distance,
+        seen.explained[inside],
+        jacobian.T @ jacobian,
+        -jacobian.T @ (foot.distance[used] / np.sqrt(variance)),
+    )
 
 
 def by_motion(normals: Array, arms: Array) -> Array:

@@ -152,6 +152,13 @@ class State:
             known = self._curves = Curves.of(self.boundaries, active)
         return known
 
+    @property
+    def whole_curves(self) -> Curves:
+        """Return the boundaries side by side, with their inactive control points."""
+        if self.whole:
+            return self.curves
+        return Curves.of(self.boundaries, {label: b.everything for label, b in self.boundaries.items()})
+
     def add_boundary(self, label: int, boundary: Boundary, control_points: Array) -> None:
         """Add a boundary with control points (m, 2)."""
         self.boundaries = dict(sorted({**self.boundaries, label: boundary}.items()))

@@ -23,7 +23,7 @@ from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, s
 from pathspace_graph.loop.track_loop import LoopRefusedError, TrackLoop
 from pathspace_graph.mapping.motion import known_noise, predict
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import passes_start, register
+from pathspace_graph.mapping.registration import is_lost, is_within_reach, passes_start, register
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import CycleResult, Stopwatch
@@ -36,6 +36,9 @@ from .growth import Growth
 
 ROAD: Final = 10.0
 """Length of both boundaries beside a lost vehicle from which on they are a road (m)."""
+
+PLACED: Final = 20.0
+"""Path (m) for which a vehicle stays certain enough of its place that only detections can close the loop."""
 
 
 def careful(process: partial[CycleResult]) -> partial[CycleResult]:
@@ -77,6 +80,7 @@ class FixedLagMapper(MapperEstimate):
         """The road beside a lost vehicle, mapped anew in the frame of the pose in which the search began."""
         self._unused: Odometry | None = None  # twists of a cycle that was left out
         self._grown: frozenset[int] = frozenset()
+        self._placed_until = 0.0  # path driven (m) up to which the vehicle is not lost (`is_lost`)
 
     def update(
         self,
@@ -285,14 +289,15 @@ class FixedLagMapper(MapperEstimate):
     def _close(self) -> bool:
         if not self.boundaries or not self.loop.may_close():
             return False
-        self.smoother.carry()
-        self.smoother.refresh()
-        track, covariance, settings = (
-            self.smoother.map,
-            self.smoother.newest_covariance(),
-            self.settings.closing,
-        )
-        found = register(track, self.smoother.times, covariance, self.path.beginning, settings)
+        smoother, settings = self.smoother, self.settings.closing
+        smoother.carry()
+        track, times = smoother.map, smoother.times
+        if self.path.length < self._placed_until and not is_within_reach(track, times, settings):
+            return False  # the covariance would be costly
+        covariance = smoother.newest_covariance()
+        if not is_lost(covariance, settings):
+            self._placed_until = self.path.length + PLACED
+        found = register(track, times, covariance, self.path.beginning, settings)
         if found is None or not passes_start(track.state, self.path, found.motion):
             return False
         apply_correspondences(self.smoother, found)

@@ -22,6 +22,7 @@ from pathspace_graph.mapping.registration import (
     _match,
     agrees,
     is_certain,
+    is_within_reach,
     near_start,
     register,
 )
@@ -270,6 +271,15 @@ def test_a_window_is_registered_among_clutter_that_no_curve_explains(explained: 
         np.testing.assert_allclose(found.motion.apply(scene.poses[:, :2]), scene.truth[:, :2], atol=0.2)
 
 
+@pytest.mark.parametrize(("sideways", "reached"), [(0.0, True), (2.0, True), (30.0, False)])
+def test_nothing_is_registered_out_of_reach_of_the_beginning(sideways: float, reached: bool) -> None:
+    """A registration moves nothing where no detection reaches a curve, since its prior has a mean of zero."""
+    scene = window()
+    scene.drift(motion(sideways, 0.0, 0.0, scene.truth[-1, :2]))
+    assert is_within_reach(scene.track, scene.times, ClosingSettings()) is reached
+    assert reached or scene.register() is None
+
+
 def test_a_far_uncertain_detection_weighs_less() -> None:
     """Its information across the curve is that of its own sigma and the registration's together."""
     scene = window()
@@ -293,7 +303,8 @@ def _seen_points(scene: Window) -> Array:
 def _match_at(scene: Window, seen: Sightings) -> Array:
     """Returns the information about a motion from sightings where they are."""
     stretches = dict.fromkeys(SIDES, (0.0, 60.0))
-    found = _match(scene.track.state, ClosingSettings(), seen, motion(0.0, 0.0, 0.0), stretches, 1.0)
+    state, unmoved = scene.track.state, motion(0.0, 0.0, 0.0)
+    found = _match(state, state.whole_curves, ClosingSettings(), seen, unmoved, stretches, 1.0)
     return found.hessian
 
 
