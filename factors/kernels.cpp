@@ -20,6 +20,7 @@ using Shape = std::vector<Index>;
 namespace {
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
+constexpr Index kOwn = -2;  // a detection that is the first one of a new cone
 
 double clipped(double v, double low, double high) { return std::min(std::max(v, low), high); }
 
@@ -1436,82 +1437,109 @@ py::tuple usable(const Array& points, const Array& covariances, const py::tuple&
 
 // --- sightings --------------------------------------------------------------------------------------------
 
-// Points, and the gates along and across the rays to them from a place.
-struct Gates {
-  Gates(const Array& points, const Array& along, const Array& across, const double* place)
-      : points(points.data()), along(along.data()), across(across.data()), place(place) {}
-
-  double square(Index i, const double* other) const {
-    const double* p = points + 2 * i;
-    double rx = p[0] - place[0], ry = p[1] - place[1];
-    const double range = std::max(std::hypot(rx, ry), std::numeric_limits<double>::min());
-    rx /= range, ry /= range;
-    const double dx = other[0] - p[0], dy = other[1] - p[1];
-    const double a = (dx * rx + dy * ry) / along[i], c = (dy * rx - dx * ry) / across[i];
-    return a * a + c * c;
+// Cones that are followed, column by column.
+struct Cones {
+  explicit Cones(const py::tuple& columns) {
+    const auto places = columns[0].cast<Array>(), ranges = columns[2].cast<Array>(), stamps = columns[3].cast<Array>();
+    const auto labels = columns[1].cast<Ints>(), numbers = columns[4].cast<Ints>();
+    const Index n = labels.size();
+    expect(places.size() == 2 * n && ranges.size() == n && stamps.size() == n && numbers.size() == n);
+    for (Index j = 0; j < n; ++j)
+      all.push_back({{places.data()[2 * j], places.data()[2 * j + 1]}, labels.data()[j], ranges.data()[j],
+                     stamps.data()[j], numbers.data()[j]});
   }
 
-  const double *points, *along, *across, *place;
+  py::tuple columns() const {
+    const Index n = static_cast<Index>(all.size());
+    Array places(Shape{n, 2}), ranges(n), stamps(n);
+    Ints labels(n), numbers(n);
+    for (Index j = 0; j < n; ++j) {
+      std::copy_n(all[j].at, 2, places.mutable_data() + 2 * j);
+      labels.mutable_data()[j] = all[j].label, ranges.mutable_data()[j] = all[j].nearest;
+      stamps.mutable_data()[j] = all[j].last, numbers.mutable_data()[j] = all[j].number;
+    }
+    return py::make_tuple(places, labels, ranges, stamps, numbers);
+  }
+
+  struct Cone {
+    double at[2];
+    Index label;
+    double nearest, last;
+    Index number;
+  };
+  std::vector<Cone> all;
 };
 
-py::tuple assigned(const Array& points, const Ints& labels, const Array& ranges, const Array& place,
-                   const Array& along, const Array& across, const Array& known, const Ints& known_labels,
-                   const Array& nearest, const py::tuple& weights) {
-  const Index m = points.shape(0), n = known.shape(0);
-  expect(points.size() == 2 * m && labels.size() == m && ranges.size() == m && place.size() == 2);
-  expect(along.size() == m && across.size() == m);
-  expect(known.size() == 2 * n && known_labels.size() == n && nearest.size() == n);
-  const double nearer = weights[0].cast<double>(), farther = weights[1].cast<double>();
-  const Gates gates(points, along, across, place.data());
-  Ints cones(m);
-  Array moved(Shape{n, 2}, known.data()), least(Shape{n}, nearest.data());
-  std::vector<Index> counts(n, 0), lone;
-  std::vector<double> sums(2 * n, 0.0), closest(n, kInfinity);
-  Index* cone = cones.mutable_data();
-  for (Index i = 0; i < m; ++i) {
-    double best = 1.0;
-    cone[i] = -1;
-    for (Index j = 0; j < n; ++j) {
-      if (known_labels.data()[j] != labels.data()[i]) continue;
-      const double square = gates.square(i, known.data() + 2 * j);
-      if (square < best) best = square, cone[i] = j;
-    }
-    if (cone[i] >= 0) ++counts[cone[i]];
-  }
-  for (Index i = 0; i < m; ++i) {
-    if (cone[i] < 0) continue;
-    const Index j = cone[i];
-    for (int c = 0; c < 2; ++c) sums[2 * j + c] += points.data()[2 * i + c] / static_cast<double>(counts[j]);
-    closest[j] = std::min(closest[j], ranges.data()[i]);
-  }
-  for (Index j = 0; j < n; ++j) {
-    if (counts[j] == 0) continue;
-    const double weight = closest[j] <= nearest.data()[j] ? nearer : farther;
-    for (int c = 0; c < 2; ++c) {
-      double& at = moved.mutable_data()[2 * j + c];
-      at += weight * (sums[2 * j + c] - at);
-    }
-    least.mutable_data()[j] = std::min(nearest.data()[j], closest[j]);
-  }
-  // Each of the others is a cone of its own, unless it lies beside an earlier one that is.
-  for (Index i = 0; i < m; ++i)
-    if (cone[i] < 0) lone.push_back(i);
-  std::vector<Index> first(lone.size());
-  Index count = n;
-  for (std::size_t a = 0; a < lone.size(); ++a) {
-    first[a] = static_cast<Index>(a);
-    for (std::size_t b = 0; b < a; ++b)
-      if (labels.data()[lone[a]] == labels.data()[lone[b]] &&
-          gates.square(lone[a], points.data() + 2 * lone[b]) < 1.0) {
-        first[a] = static_cast<Index>(b);
-        break;
+py::tuple followed(const Ints& begins, const Array& stamps, const Array& places, const Array& points, const Ints& labels,
+                   const Array& ranges, const Array& along, const Array& across, const py::tuple& known, Index count,
+                   const py::tuple& limits) {
+  const Index m = points.shape(0), cycles = stamps.size();
+  expect(begins.size() == cycles + 1 && places.size() == 2 * cycles && points.size() == 2 * m);
+  expect(labels.size() == m && ranges.size() == m && along.size() == m && across.size() == m);
+  for (Index k = 0; k < cycles; ++k) expect(begins.data()[k] >= 0 && begins.data()[k] <= begins.data()[k + 1]);
+  expect(begins.data()[cycles] <= m);
+  const double max_age = limits[0].cast<double>(), nearer = limits[1].cast<double>(), farther = limits[2].cast<double>();
+  Cones cones(known);
+  auto& all = cones.all;
+  Ints numbers(m);
+  Index* number = numbers.mutable_data();
+  std::fill_n(number, m, -1);
+  std::vector<Index> lone;
+  std::vector<double> sums, closest;
+  for (Index k = 0; k < cycles; ++k) {
+    const double t = stamps.data()[k], *place = places.data() + 2 * k;
+    // The squared offset of a point from a detection on the detection's ray, in its gates.
+    const auto square = [&](Index i, const double* other) {
+      const double* p = points.data() + 2 * i;
+      double rx = p[0] - place[0], ry = p[1] - place[1];
+      const double range = std::max(std::hypot(rx, ry), std::numeric_limits<double>::min());
+      rx /= range, ry /= range;
+      const double dx = other[0] - p[0], dy = other[1] - p[1];
+      const double a = (dx * rx + dy * ry) / along.data()[i], c = (dy * rx - dx * ry) / across.data()[i];
+      return a * a + c * c;
+    };
+    all.erase(std::remove_if(all.begin(), all.end(), [&](const Cones::Cone& one) { return !(one.last > t - max_age); }),
+              all.end());
+    const Index n = static_cast<Index>(all.size()), first = begins.data()[k], end = begins.data()[k + 1];
+    std::vector<Index> cone(end - first, -1), counts(n, 0);
+    sums.assign(2 * n, 0.0), closest.assign(n, kInfinity), lone.clear();
+    for (Index i = first; i < end; ++i) {
+      double best = 1.0;
+      for (Index j = 0; j < n; ++j) {
+        if (all[j].label != labels.data()[i]) continue;
+        const double off = square(i, all[j].at);
+        if (off < best) best = off, cone[i - first] = j;
       }
+      if (cone[i - first] >= 0) ++counts[cone[i - first]], number[i] = all[cone[i - first]].number;
+      else lone.push_back(i);
+    }
+    for (Index i = first; i < end; ++i) {
+      const Index j = cone[i - first];
+      if (j < 0) continue;
+      for (int c = 0; c < 2; ++c) sums[2 * j + c] += points.data()[2 * i + c] / static_cast<double>(counts[j]);
+      closest[j] = std::min(closest[j], ranges.data()[i]);
+    }
+    for (Index j = 0; j < n; ++j) {
+      if (counts[j] == 0) continue;
+      const double weight = closest[j] <= all[j].nearest ? nearer : farther;
+      for (int c = 0; c < 2; ++c) all[j].at[c] += weight * (sums[2 * j + c] - all[j].at[c]);
+      all[j].nearest = std::min(all[j].nearest, closest[j]), all[j].last = t;
+    }
+    // Each of the others is a cone of its own, unless it lies beside an earlier one: then it is of that one's cone.
+    for (std::size_t a = 0; a < lone.size(); ++a) {
+      const Index i = lone[a];
+      std::size_t b = 0;
+      while (b < a && !(labels.data()[i] == labels.data()[lone[b]] && square(i, points.data() + 2 * lone[b]) < 1.0)) ++b;
+      if (b < a) {
+        if (cone[lone[b] - first] == kOwn) number[i] = number[lone[b]];
+        continue;
+      }
+      const double* p = points.data() + 2 * i;
+      cone[i - first] = kOwn, number[i] = count;
+      all.push_back({{p[0], p[1]}, labels.data()[i], ranges.data()[i], t, count++});
+    }
   }
-  std::vector<Index> number(lone.size(), -1);
-  for (std::size_t a = 0; a < lone.size(); ++a)
-    if (first[a] == static_cast<Index>(a)) number[a] = count++;
-  for (std::size_t a = 0; a < lone.size(); ++a) cone[lone[a]] = number[first[a]];
-  return py::make_tuple(cones, moved, least);
+  return py::make_tuple(numbers, cones.columns(), count);
 }
 
 }  // namespace
@@ -1545,7 +1573,7 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("integrated", &integrated);
   module.def("weighted_means", &weighted_means);
   module.def("matched", &matched);
-  module.def("assigned", &assigned);
+  module.def("followed", &followed);
   module.def("off_prediction", &off_prediction);
   module.def("squared", &squared);
   module.def("learned", &learned);

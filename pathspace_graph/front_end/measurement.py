@@ -323,8 +323,8 @@ class Measurement:
         if self._rounds is not None:
             found = self._rounds.advance()
             return None if found is None else self._passed(found)
-        for cycle in self._cycles[self._followed : self._followed + FOLLOWED]:
-            self._sightings.append(self._follower.add(cycle))
+        cycles = self._cycles[self._followed : self._followed + FOLLOWED]
+        self._sightings.append(self._follower.follow(cycles))
         self._followed += FOLLOWED
         if self._followed < len(self._cycles):
             return None

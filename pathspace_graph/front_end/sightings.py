@@ -1,6 +1,6 @@
 """Sightings of cones, followed by dead reckoning, and the twists of a drive: what noise is measured from."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from math import comb
 from typing import Final
@@ -10,7 +10,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import MeasuredNoise
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import left_of, to_map
 from pathspace_graph.io.log import Detections, Odometry
 
 MAD: Final = 1.4826  # standard deviation of a Gaussian by its median absolute deviation
@@ -25,6 +25,9 @@ FOLLOWING: Final = (0.5, 0.15)  # of a cone to where it is seen, and was seen fr
 GATE_SIGMAS: Final = 3.5
 GATE_LEAST: Final = 0.4
 GATE_MOST: Final = 3.5  # of the gate once noise is known: sigmas along and across the ray; least, most, m
+
+Cones = tuple[Array, IntArray, Array, Array, IntArray]
+"""Place (k, 2) of each cone that is followed, its label (k,), least range, latest stamp and number."""
 
 
 @dataclass(eq=False)
@@ -59,13 +62,9 @@ class SeenCycle:
     twist: Array  # (3,) twist of the vehicle: m/s, m/s, rad/s
 
 
-def follow(cycles: Iterable[SeenCycle], known: MeasuredNoise) -> Sightings:
+def follow(cycles: Sequence[SeenCycle], known: MeasuredNoise) -> Sightings:
     """Return the sightings of cones in the cycles, in order of time, as measured."""
-    follower = Follower(known)
-    return Sightings.stacked([Sightings.none(), *(follower.add(cycle) for cycle in cycles)])
-
-
-COLUMNS: Final = ("_points", "_labels", "_nearest", "_last", "_cones")  # of the cones that are followed
+    return Follower(known).follow(cycles)
 
 
 class Follower:
@@ -73,40 +72,45 @@ class Follower:
 
     def __init__(self, known: MeasuredNoise) -> None:
         self._known = known
-        self._points: Array = np.zeros((0, 2))
-        self._labels: IntArray = np.zeros(0, np.intp)
-        self._nearest: Array = np.zeros(0)  # least range at which each cone was seen (m)
-        self._last: Array = np.zeros(0)
-        self._cones: IntArray = np.zeros(0, np.intp)
+        none = np.zeros(0, np.intp)
+        self._cones: Cones = (np.zeros((0, 2)), none, np.zeros(0), np.zeros(0), none)
         self._count = 0
-        self._by_bias: Array = np.zeros(3)
-        self._pose: Array | None = None
-        self._t = 0.0
+        self._from: tuple[float, Array, Array] | None = None  # stamp, pose and `by_bias` of the latest cycle
 
-    def add(self, cycle: SeenCycle) -> Sightings:
-        detections, pose = cycle.detections, cycle.pose
-        self._follow_bias(detections.t, pose)
-        keep = self._last > detections.t - MAX_AGE
-        if not keep.all():
-            for name in COLUMNS:
-                setattr(self, name, getattr(self, name)[keep])
-        ranges = np.hypot(*detections.points_vehicle.T)
-        order = np.argsort(ranges, kind="stable")
+    def follow(self, cycles: Sequence[SeenCycle]) -> Sightings:
+        """Return the sightings of the next cycles, in order of time, and the nearest first in each."""
+        if not cycles:
+            return Sightings.none()
+        t = np.array([cycle.detections.t for cycle in cycles])
+        poses, twists = (np.array([getattr(cycle, name) for cycle in cycles]) for name in ("pose", "twist"))
+        cycle = np.repeat(np.arange(len(cycles)), [len(one.detections.labels) for one in cycles])
+        measured = np.concatenate([one.detections.points_vehicle for one in cycles])
+        labels = np.concatenate([one.detections.labels for one in cycles])
+        ranges = np.hypot(*measured.T)
+        order = np.lexsort((ranges, cycle))
         order = order[ranges[order] < MAX_RANGE]
-        measured = detections.points_vehicle[order]
-        points = to_map(self._known.corrected(measured, cycle.twist), pose[None])
-        rows, cones = self._assign(points, detections.labels[order], ranges[order], pose, detections.t)
-        stamps = np.full(len(rows), detections.t)
-        shared = (one[None].repeat(len(rows), axis=0) for one in (cycle.twist, pose, self._by_bias))
-        return Sightings(cones, stamps, measured[rows], *shared)
+        cycle, measured, ranges = cycle[order], measured[order], ranges[order]
+        points = to_map(self._known.corrected(measured, twists[cycle]), poses[cycle])
+        begins, gates = cycle.searchsorted(np.arange(len(cycles) + 1)), self._gates(ranges)
+        seen = (points, labels[order], ranges, *gates)
+        cones, self._cones, self._count = _followed(
+            begins, t, poses[:, :2].copy(), *seen, self._cones, self._count, (MAX_AGE, *FOLLOWING)
+        )
+        by_bias, own = self._by_bias(t, poses), cycle[cones >= 0]
+        return Sightings(
+            cones[cones >= 0], t[own], measured[cones >= 0], twists[own], poses[own], by_bias[own]
+        )
 
-    def _follow_bias(self, t: float, pose: Array) -> None:
-        """Carry the derivative of the pose by the yaw rate's bias on: `d theta = -dt`, and what follows."""
-        if self._pose is not None:
-            moved, turned = pose[:2] - self._pose[:2], self._by_bias[2]
-            middle = turned - 0.5 * (t - self._t)
-            self._by_bias = self._by_bias + np.array([-moved[1] * middle, moved[0] * middle, -(t - self._t)])
-        self._pose, self._t = pose.copy(), t
+    def _by_bias(self, t: Array, poses: Array) -> Array:
+        """Return the derivatives (c, 3) of the poses by the bias of the yaw rate."""
+        stamp, pose, by_bias = self._from or (t[0], poses[0], np.zeros(3))
+        moved, dt = np.diff(poses[:, :2], axis=0, prepend=pose[None, :2]), np.diff(t, prepend=stamp)
+        turned = by_bias[2] - (t - stamp)
+        middle = turned + 0.5 * dt
+        derivatives = np.column_stack([np.cumsum(left_of(moved) * middle[:, None], axis=0), turned])
+        derivatives[:, :2] += by_bias[:2]
+        self._from = t[-1], poses[-1], derivatives[-1]
+        return derivatives
 
     def _gates(self, ranges: Array) -> tuple[Array, Array]:
         """Return how far along and across its ray a detection (m,) may be from its cone (m)."""
@@ -118,31 +122,45 @@ class Follower:
         along, across = (np.minimum(np.maximum(one, GATE_LEAST), GATE_MOST) for one in (along, across))
         return along, across
 
-    def _assign(
-        self, points: Array, labels: IntArray, ranges: Array, pose: Array, t: float
-    ) -> tuple[IntArray, IntArray]:
-        """Return which detections (m,), nearest first, are sightings, and of which cones."""
-        count = len(self._cones)
-        known = self._points, self._labels, self._nearest
-        along, across = self._gates(ranges)
-        place, self._points, self._nearest = _assigned(
-            points, labels, ranges, pose[:2], along, across, *known, FOLLOWING
-        )
-        new = np.flatnonzero(place >= count)
-        if len(new):
-            own, first = np.unique(place[new], return_index=True)
-            first = new[first]
-            numbers = self._count + np.arange(len(own))
-            added = points[first], labels[first], ranges[first], np.full(len(first), t), numbers
-            for name, values in zip(COLUMNS, added, strict=True):
-                setattr(self, name, np.concatenate([getattr(self, name), values]))
-            self._count += len(own)
-        rows = np.concatenate([np.flatnonzero((place >= 0) & (place < count)), new])
-        self._last[place[rows]] = t
-        return rows, self._cones[place[rows]]
-
 
 @compiled
+def _followed(
+    begins: IntArray,
+    stamps: Array,
+    places: Array,
+    points: Array,
+    labels: IntArray,
+    ranges: Array,
+    along: Array,
+    across: Array,
+    cones: Cones,
+    count: int,
+    limits: tuple[float, float, float],
+) -> tuple[IntArray, Cones, int]:
+    """Return the number (m,) of the cone of each detection, or -1, the cones then, and their count so far.
+
+    Detections at points (m, 2) have gates along and across their rays (m,), and begin at `begins` (c + 1,) in
+    cycles at times (c,) and places (c, 2). The limits are `MAX_AGE` and `FOLLOWING`.
+    """
+    numbers, (max_age, *weights) = np.full(len(points), -1), limits
+    for k, t in enumerate(stamps.tolist()):
+        known, kinds, nearest, last, own = (column[cones[3] > t - max_age] for column in cones)
+        rows, size = slice(begins[k], begins[k + 1]), len(own)
+        gates = along[rows], across[rows]
+        index, known, nearest = _assigned(
+            points[rows], labels[rows], ranges[rows], places[k], *gates, known, kinds, nearest, weights
+        )
+        new, first = np.unique(index[index >= size], return_index=True)
+        first = np.flatnonzero(index >= size)[first]
+        last[index[(index >= 0) & (index < size)]] = t
+        added = points[rows][first], labels[rows][first], ranges[rows][first], np.full(len(new), t)
+        columns = (known, kinds, nearest, last, own), (*added, count + np.arange(len(new)))
+        known, kinds, nearest, last, own = map(np.concatenate, zip(*columns, strict=True))
+        cones, count = (known, kinds, nearest, last, own), count + len(new)
+        numbers[rows] = np.append(own, -1)[index]
+    return numbers, cones, count
+
+
 def _assigned(
     points: Array,
     labels: IntArray,
@@ -153,7 +171,7 @@ def _assigned(
     known: Array,
     known_labels: IntArray,
     nearest: Array,
-    weights: tuple[float, float],
+    weights: Sequence[float],
 ) -> tuple[IntArray, Array, Array]:
     """Return the cone of each detection at points (m, 2), and places and least ranges of the known cones.
 
