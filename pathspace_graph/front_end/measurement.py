@@ -231,16 +231,18 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
     cone, t = cones.table.cone[left.rows], cones.table.t[left.rows]
     i, j = pairs(cone)
     lag = t[j] - t[i]
-    place = np.digitize(lag, LAGS) - 1
-    of_lag = [place == k for k in range(len(LAGS) - 1)]
     product = whitened[i] * whitened[j] - 0.5 * (own[i] + own[j])
     scale = max(float((whitened**2 - own).mean()), 0.25)
-    enough = [own for own in of_lag if own.sum() >= MIN_ROWS // 2]
-    if not enough:
+    place = np.digitize(lag, LAGS)
+    counts = np.bincount(place, minlength=len(LAGS) + 1)
+    enough = np.flatnonzero(counts[:-1] >= MIN_ROWS // 2)
+    enough = enough[enough > 0]
+    if len(enough) == 0:
         return 0.0, 1.0
-    lags = np.array([lag[own].mean() for own in enough])
-    correlations = np.array([product[own].mean() for own in enough]) / scale
-    weights = np.sqrt([own.sum() for own in enough])
+    lags, correlations = (
+        np.bincount(place, values)[enough] / counts[enough] for values in (lag, product / scale)
+    )
+    weights = np.sqrt(counts[enough])
     best = (np.inf, 0.0, 1.0)
     for time in TIMES:
         model = np.exp(-lags / time)

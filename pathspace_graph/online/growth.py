@@ -291,21 +291,21 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
     cycle before, and the second result (m, 2) as they are now.
     """
     first = int(np.searchsorted(boundary.cone_parameters, boundary.confirmed_end - RECALL))
-    now = np.column_stack(
-        path_ahead.since(path_ahead.driven - RECALL).locate(
-            np.array(boundary.observed[first:]).reshape(-1, 2)
-        )
-    )
-    before = known[first : len(boundary.observed)]
-    again = now[: len(before)]
-    passed = before[:, 0] <= path_ahead.driven
-    stays = passed & (np.abs(again[:, 1]) > np.abs(before[:, 1]) - NEARER)
-    again[stays] = before[stays]
+    beside = np.full(
+        (len(boundary.observed), 2), np.nan
+    )  # nothing is known of others
+    beside[: len(known)] = known[: len(beside)]
+    newest = np.array(boundary.observed[first:]).reshape(-1, 2)
+    now = np.column_stack(path_ahead.since(path_ahead.driven - RECALL).locate(newest))
+    before, passed = beside[first:], beside[first:, 0] <= path_ahead.driven
+    stays = passed & (np.abs(now[:, 1]) > np.abs(before[:, 1]) - NEARER)
+    now[stays] = before[stays]
+    beside[first:] = now
     at = np.where(now[:, 0] <= path_ahead.driven, now[:, 0], np.inf)
     later = np.minimum.accumulate(at[::-1])[::-1]
     wrong = np.flatnonzero(at[1:-1] > later[2:] + STATION_MARGIN)
-    kept = first + 1 + int(wrong[0]) if len(wrong) else len(boundary.observed)
-    return kept, np.concatenate([known[:first], now])[:kept]
+    kept = first + 1 + int(wrong[0]) if len(wrong) else len(beside)
+    return kept, beside[:kept]
 
 
 def _newest(path_ahead: PathAhead, end: End) -> PathAhead:

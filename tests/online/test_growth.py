@@ -237,6 +237,17 @@ def test_cones_of_a_second_round_are_not_taken_for_those_of_the_first() -> None:
     np.testing.assert_allclose(beside[:20, 0], step * np.arange(20), atol=0.5)
 
 
+def test_a_curve_that_grows_far_in_one_cycle_remembers_each_cone_as_itself() -> None:
+    """The newest 25 m begin at cones that were never located: what is known is of the first two."""
+    boundary, _ = boundary_through(np.column_stack([np.arange(0.0, 61.0, 4.0), np.full(16, 2.0)]))
+    known = np.array([[0.0, 2.0], [4.0, 2.0]])
+    kept, beside = check_order(boundary, along_x(13.0, begin=0.0), known)
+    assert kept == 16
+    np.testing.assert_array_equal(beside[:2], known)
+    assert np.isnan(beside[2:9]).all()
+    np.testing.assert_allclose(beside[9:, 0], np.arange(36.0, 61.0, 4.0), atol=1e-9)
+
+
 def test_a_curve_that_is_taken_back_goes_through_its_cones_in_the_right_order(alone: FixedLagMapper) -> None:
     """The curve was led past (12, 2) first and then back to (8, 2)."""
     track(alone, (0.0, 2.0), (4.0, 2.0))
