@@ -253,7 +253,7 @@ def extrapolation_factor(step: Array, before: Array) -> float:
 
     Aitken's process for vectors, with r by least squares, and 1 where |r| isn't between `SHARES`. Robust
     weights, held sigmas and foot points on a bend let Gauss-Newton converge only linearly: it creeps (r > 0),
-    or goes to and fro (r < 0), where a shorter step ends it.
+    or oscillates (r < 0), where a shorter step ends it.
     """
     square = float(before @ before)
     share = float(step @ before) / square if square > 0.0 else 0.0

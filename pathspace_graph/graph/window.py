@@ -206,6 +206,8 @@ class WindowFactors(Generic[M_co]):
         return layout.keys[np.logical_or.reduceat(moved, layout.starts)]
 
     def _stale(self, cycles: IntArray, moved: IntArray) -> IntArray:
+        if np.array_equal(moved[-len(cycles) :], self.variables.keys[-len(cycles) :]):
+            return cycles  # every pose has moved
         stale = ~among(cycles, np.sort(self.measured.owners)) | (cycles == self._lengthened)
         stale |= among(cycles, np.sort(np.append(self.map.changed(), self.measured.holding(moved))))
         return np.asarray(cycles[stale])
@@ -214,13 +216,14 @@ class WindowFactors(Generic[M_co]):
         if self.map.structure is not self._structure:
             self.gauge, self.linear_gauge, self._structure = KeptRows(), KeptRows(), self.map.structure
             self.linear_gauge.replace(NO_OWNERS, self.map.linear_gauge(False), self.variables)
-        stale = np.unique(self.gauge.holding(moved))
-        if self.gauge.groups and len(stale) == 0:
+        if (self.exact and len(moved)) or not self.gauge.groups:
+            self.gauge = KeptRows()
+            self.gauge.replace(NO_OWNERS, self.map.gauge(False), self.variables)
             return
-        weak = self.map.gauge(False)
-        if self.gauge.groups:
-            weak = [rows.where(among(rows.owner, stale)) for rows in weak]
-        self.gauge.replace(stale, weak, self.variables)
+        stale = np.unique(self.gauge.holding(moved))
+        if len(stale):
+            weak = [rows.where(among(rows.owner, stale)) for rows in self.map.gauge(False)]
+            self.gauge.replace(stale, weak, self.variables)
 
 
 @dataclass(frozen=True, eq=False)
