@@ -119,11 +119,10 @@ def _nearest(widths: list[float], gaps: list[float]) -> float:
 
 # --- the front door of estimators ------------------------------------------------------------------------
 
-ANSWERS: Final = (
+ANSWERS: Final = (  # methods of an online estimator that return what has lengths
     *("map", "outline", "ahead", "readings", "vehicle_state", "noise_used"),
     *("window_poses", "smoothed"),
 )
-"""Methods of an online estimator that return what has lengths."""
 
 
 class FrontDoor:

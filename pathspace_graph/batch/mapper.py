@@ -53,18 +53,13 @@ from .simplification import Scatter, map_block, own_settings, scatter_of_cones, 
 from .start import CurveMapper, find_recurrence, start_odometry, start_online
 from .system import BatchSystem, Biweight, CurveGauge, Evaluation
 
-ROOM: Final = 4.0
-"""Distance from its foot points in which a factor searches them (m along the curve)."""
+ROOM: Final = 4.0  # distance from its foot points in which a factor searches them (m along the curve)
 HALVINGS: Final = 6
 """Most halvings of the room while another foot point in it is nearer, as in a bend about a detection."""
-SAME: Final = 1e-3
-"""Distance below which two foot points are the same (m along the curve)."""
-STRETCH: Final = 25.0
-"""Length of the stretches of the drive by which a map is judged (m)."""
-FEW: Final = 20
-"""Number of detections below which a stretch says nothing."""
-USUALLY: Final = 80.0
-"""Percentile of the stretches' shares of explained detections that is usual for a log."""
+SAME: Final = 1e-3  # distance below which two foot points are the same (m along the curve)
+STRETCH: Final = 25.0  # length of the stretches of the drive by which a map is judged (m)
+FEW: Final = 20  # number of detections below which a stretch says nothing
+USUALLY: Final = 80.0  # percentile of the stretches' shares of explained detections that is usual for a log
 POOR: Final = 0.6
 """Share of the usual one below which a stretch is poorly mapped; those of a good map are above 0.9."""
 MOST_POOR: Final = 1.0 / 3.0
@@ -201,8 +196,7 @@ def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) ->
     return room
 
 
-NAME: Final = "spline"
-"""Name of the estimator on the command line."""
+NAME: Final = "spline"  # name of the estimator on the command line
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -193,14 +193,10 @@ class Scatter:
 
     LENGTHS: ClassVar = {"seen": 1, "unseen": 1, "places": 1, "lengths": 1}
 
-    seen: float
-    """Root mean square distance of the detected cones from the curves (m)."""
-    unseen: float
-    """Root mean square distance of the same cones from curves that are fitted without them (m)."""
-    places: dict[int, Array]
-    """Parameters (k,) of the detected cones of each boundary (m)."""
-    lengths: dict[int, float]
-    """Length of each closed curve in units of its parameter, else infinity."""
+    seen: float  # root mean square distance of the detected cones from the curves (m)
+    unseen: float  # root mean square distance of the same cones from curves that are fitted without them (m)
+    places: dict[int, Array]  # parameters (k,) of the detected cones of each boundary (m)
+    lengths: dict[int, float]  # length of each closed curve in units of its parameter, else infinity
 
     def sigma(self, label: int, u: Array) -> Array:
         """Return the standard deviation (m,) of the scatter at parameters u (m,) of a boundary, in m."""

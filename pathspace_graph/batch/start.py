@@ -36,10 +36,8 @@ from .simplification import boundary_of, exact_settings, fit_through
 
 ComplexArray = NDArray[np.complex128]
 
-PROFILE_STEP: Final = 0.5
-"""Step at which the path driven is sampled (m)."""
-SMOOTHING: Final = 3.0
-"""Length over which the curvature is averaged (m)."""
+PROFILE_STEP: Final = 0.5  # step at which the path driven is sampled (m)
+SMOOTHING: Final = 3.0  # length over which the curvature is averaged (m)
 CORRELATION_SHARE: Final = 0.8
 """Least correlation of a lap's lag as a share of the largest one; a lap is about the shortest such lag."""
 RECURS: Final = 0.7
@@ -47,16 +45,12 @@ RECURS: Final = 0.7
 it is 0.56 at most after one of them."""
 MIN_OVERLAP: Final = 20.0
 """Least length of the path after a lap (m): over less, straights agree with straights."""
-REFERENCE_STEP: Final = 8.0
-"""Distance of the reference poses that every lap passes (m)."""
+REFERENCE_STEP: Final = 8.0  # distance of the reference poses that every lap passes (m)
 LAP_SIGMAS: Final = np.array([1.5, 1.5, 0.15])
 """Standard deviations of a lap's pose about the reference pose that it passes (m, m, rad)."""
-ALIGN_STEPS: Final = 8
-"""Most Gauss-Newton steps that bring the laps together."""
-ALIGN_TOLERANCE: Final = 1e-6
-"""Largest move of a step at which they are together (m, rad)."""
-MAX_LATERAL: Final = 15.0
-"""Distance from the driven path within which a boundary has detections (m)."""
+ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the laps together
+ALIGN_TOLERANCE: Final = 1e-6  # largest move of a step at which they are together (m, rad)
+MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
 
 
 # --- from an online run ----------------------------------------------------------------------------------
@@ -116,14 +110,10 @@ def unwrap(poses: Array) -> Array:
 class Recurrence:
     """Length of the path driven, and after which length it recurs."""
 
-    driven: Array
-    """Path lengths (P,) from the first pose to each pose (m)."""
-    lap: float
-    """Path length of a lap (m), infinite where the path doesn't recur."""
-    turn: float
-    """Change of the heading in a lap, by the odometry (rad)."""
-    correlation: float
-    """How well the curvature agrees with itself a lap later, 1 where it is the same."""
+    driven: Array  # path lengths (P,) from the first pose to each pose (m)
+    lap: float  # path length of a lap (m), infinite where the path doesn't recur
+    turn: float  # change of the heading in a lap, by the odometry (rad)
+    correlation: float  # how well the curvature agrees with itself a lap later, 1 where it is the same
 
     @property
     def recurs(self) -> bool:
@@ -166,12 +156,9 @@ def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
 class Profile:
     """The path driven, sampled at steps of PROFILE_STEP along it."""
 
-    position: Array
-    """Positions (n, 2) in m, in the frame of the poses."""
-    heading: Array
-    """Headings (n,) in rad, not wrapped."""
-    curvature: Array
-    """Averaged curvatures (n,) in 1/m."""
+    position: Array  # positions (n, 2) in m, in the frame of the poses
+    heading: Array  # headings (n,) in rad, not wrapped
+    curvature: Array  # averaged curvatures (n,) in 1/m
 
     def correlations(self, lags: IntArray, settings: ClosingSettings) -> Array:
         """Return how well the curvature agrees with itself each of the lags (l,) later, in samples.
@@ -267,12 +254,9 @@ def align_laps(chain: LogOdometry, recurrence: Recurrence) -> tuple[Array, Array
 class LapCorrespondences:
     """Residuals `(x_k - reference_k - (0, 0, turns_k)) / sigmas` of poses k that pass a reference pose."""
 
-    cycles: IntArray
-    """Perception cycles (k,) of the poses."""
-    reference: IntArray
-    """Numbers (k,) of the reference poses that they pass."""
-    turns: Array
-    """Change of the heading (k,) in the whole laps before each pose (rad)."""
+    cycles: IntArray  # perception cycles (k,) of the poses
+    reference: IntArray  # numbers (k,) of the reference poses that they pass
+    turns: Array  # change of the heading (k,) in the whole laps before each pose (rad)
 
     def references_at(self, poses: Array) -> Array:
         """Return the reference poses (c, 3): the first of the poses (P, 3) that passes each of them."""

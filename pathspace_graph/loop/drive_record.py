@@ -61,8 +61,7 @@ def _moved(poses: Array, frames: Array, to: Array) -> Array:
 
 # --- the record ------------------------------------------------------------------------------------------
 
-WORKER_IDLE: Final = 600
-"""Time with nothing to do after which the process that solves laps ends (s)."""
+WORKER_IDLE: Final = 600  # time with nothing to do after which the process that solves laps ends (s)
 WATCH_SECONDS: Final = 1.0
 """Interval (s) at which a worker checks whether the process that started it is still there."""
 LATE: Final = "the batch of the lap was late"
@@ -77,12 +76,10 @@ class DriveRecord:
     def __init__(self, settings: MapperSettings, noise: NoiseLearner) -> None:
         self.settings = settings
         self._noise = noise
-        self.unsolvable: str | None = None
-        """Why the drive cannot be solved as a batch; None if it can be."""
+        self.unsolvable: str | None = None  # why the drive cannot be solved as a batch; None if it can be
         self.poses: list[Array] = []
         """Pose (3,) of each cycle, map frame, as it was estimated then or by the newest batch."""
-        self.stamps: list[float] = []
-        """Stamp of each cycle (s)."""
+        self.stamps: list[float] = []  # stamp of each cycle (s)
         self._motions: list[MeasuredMotion] = []
         self._detections: list[Detections] = []
         self._orange: list[Detections] = []
@@ -212,14 +209,11 @@ class LapBatch:
     """A lap that is being solved in a process of its own, while the mapper goes on."""
 
     def __init__(self, lap: OpenLap, t: float, due: int, last: int) -> None:
-        self.t = t
-        """Stamp of the cycle in which the lap was sent (s)."""
+        self.t = t  # stamp of the cycle in which the lap was sent (s)
         self.due = due
         """Cycle in which the marginal replaces the prior, or the first later one in which it is there."""
-        self.last = last
-        """Latest cycle in which it does so."""
-        self.first_kept = lap.first_kept
-        """Cycle from which on the window holds the poses until then."""
+        self.last = last  # latest cycle in which it does so
+        self.first_kept = lap.first_kept  # cycle from which on the window holds the poses until then
         self._lap = lap
         self._future: Future[LapMarginal | None] | None = None
         self.send()

@@ -29,67 +29,45 @@ from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-_POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])
+_POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors that choose a pose's position
 NO_CONES: Final = np.zeros(0)
-"""Unit vectors that choose the position of a pose."""
 FOUND: Final = "the vehicle was lost, and is found again"
 """Beginning of the notice of a cycle in which the window starts anew at the place that was found."""
 BESIDE: Final = 1.0
 """Distance from the closed curve of its colour within which an unused detection is explained (m)."""
-GAP: Final = 3.0
-"""Least distance of neighbouring cones with a gap between them, over the median."""
-INTERVAL: Final = 0.5
-"""Least time between two attempts (s)."""
-MEMORY: Final = 60.0
-"""Length of the newest path whose detections are compared with the map (m)."""
-MOST_DETECTIONS: Final = 200
-"""Largest number of detections, evenly chosen, that are compared with the map."""
-MIN_DETECTIONS: Final = 40
-"""Least number of detections that are compared with the map."""
-STEP: Final = 2.0
-"""Distance of the places along the loop (m)."""
-LEAD: Final = 4.0
-"""Distance ahead of the point on the middle of the track that the vehicle heads for (m)."""
-MISFIT: Final = 3.0
-"""Rms distance of the path driven from the middle within which a place is compared (m)."""
-REACH: Final = 3.0
-"""Distance from its curve that any farther detection counts as (m)."""
-STARTS: Final = 12
-"""Largest number of places that are refined."""
-APART: Final = 4.0
-"""Distance below which two places are one (m)."""
+GAP: Final = 3.0  # least distance of neighbouring cones with a gap between them, over the median
+INTERVAL: Final = 0.5  # least time between two attempts (s)
+MEMORY: Final = 60.0  # length of the newest path whose detections are compared with the map (m)
+MOST_DETECTIONS: Final = 200  # largest number of detections, evenly chosen, that are compared with the map
+MIN_DETECTIONS: Final = 40  # least number of detections that are compared with the map
+STEP: Final = 2.0  # distance of the places along the loop (m)
+LEAD: Final = 4.0  # distance ahead of the point on the middle of the track that the vehicle heads for (m)
+MISFIT: Final = 3.0  # rms distance of the path driven from the middle within which a place is compared (m)
+REACH: Final = 3.0  # distance from its curve that any farther detection counts as (m)
+STARTS: Final = 12  # largest number of places that are refined
+APART: Final = 4.0  # distance below which two places are one (m)
 SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)
 """Standard deviations of the pose about a place, before it is refined (m, m, rad)."""
 SIGMA_FIT: Final = 0.3
 """A detection at a distance d from a curve of its colour scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)."""
-MIN_SCORE: Final = 0.6
-"""Least score of the place that is accepted; the true one has about 0.85."""
-MARGIN: Final = 0.1
-"""Least lead of its score over that of every other place."""
-SIGMA_MAX: Final = 0.5
-"""Largest standard deviation of the position there in its worst direction (m)."""
-CONFIRMATIONS: Final = 2
-"""Attempts, one after the other, that must find the same place."""
+MIN_SCORE: Final = 0.6  # least score of the place that is accepted; the true one has about 0.85
+MARGIN: Final = 0.1  # least lead of its score over that of every other place
+SIGMA_MAX: Final = 0.5  # largest standard deviation of the position there in its worst direction (m)
+CONFIRMATIONS: Final = 2  # attempts, one after the other, that must find the same place
 WIDENING: Final = 3.0
 """Factor of the registration's sigmas in the prior of the found pose: its detections are used again."""
-STEPS: Final = 2
-"""Gauss-Newton steps at the place that was found."""
+STEPS: Final = 2  # Gauss-Newton steps at the place that was found
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
     """A closed map as the search needs it."""
 
-    middle: Array
-    """(n, 2) Points on the middle of the track in driving order, in m, map frame."""
-    stations: Array
-    """(n,) Length along the middle up to each of them (m)."""
-    length: float
-    """Length of the middle (m)."""
-    beside: Mapping[int, Array]
-    """(n,) Parameters beside the points of the middle on each boundary (m)."""
-    curves: Mapping[int, KDTree]
-    """Densely sampled points of each boundary."""
+    middle: Array  # (n, 2) points on the middle of the track in driving order, in m, map frame
+    stations: Array  # (n,) length along the middle up to each of them (m)
+    length: float  # length of the middle (m)
+    beside: Mapping[int, Array]  # (n,) parameters beside the points of the middle on each boundary (m)
+    curves: Mapping[int, KDTree]  # densely sampled points of each boundary
     mapped: Mapping[int, BoolArray]
     """Whether each of these lies between cones that were detected (see `is_mapped`)."""
 
@@ -270,11 +248,9 @@ class Search:
 
     def __init__(self, smoother: CurveSmoother) -> None:
         self.settings: MapperSettings = smoother.map.settings
-        self.loop: Loop
-        """The map as it was in the last attempt."""
+        self.loop: Loop  # the map as it was in the last attempt
         self._smoother = smoother
-        self.first_cycle = smoother.next_cycle
-        """Cycle from which on detections are remembered."""
+        self.first_cycle = smoother.next_cycle  # cycle from which on detections are remembered
         self._poses: list[Array] = []
         self._seen: list[Detections] = []
         self._tried = smoother.times[-1]

@@ -35,25 +35,18 @@ MENDED: Final = "the map was mended"
 SIGHTINGS: Final = 6
 """Detections after which a cone contradicts the map: one that the vehicle passes is detected about twenty
 times, and a place in clutter hardly more than once."""
-MEMORY: Final = 30.0
-"""Time after its last detection at which a contradiction is forgotten (s)."""
-CONES: Final = 3
-"""Least number of contradictions in a row that is mended."""
-BESIDE: Final = 0.5
-"""Distance from a curve within which a cone does not contradict it (m)."""
+MEMORY: Final = 30.0  # time after its last detection at which a contradiction is forgotten (s)
+CONES: Final = 3  # least number of contradictions in a row that is mended
+BESIDE: Final = 0.5  # distance from a curve within which a cone does not contradict it (m)
 CERTAIN: Final = 1.0
 """Standard deviation along its worst direction below which a detection may contradict the map (m): those of a
 far cone, smeared along their ray, are tracks beside a curve that the cone is on."""
 ROW: Final = 11.0
 """Largest distance of neighbours in a row (m): two regular gaps, since a cone may never be detected."""
-SETTLE: Final = 1.5
-"""Time without detections of its cones after which the vehicle has passed a stretch (s)."""
-MOST: Final = 20
-"""Number of contradictions passed after which enough of a stretch is seen, whatever the time."""
-INTERVAL: Final = 0.5
-"""Time after which contradictions are looked for again (s)."""
-ATTEMPTS: Final = 8
-"""Largest number of attempts to mend a map."""
+SETTLE: Final = 1.5  # time without detections of its cones after which the vehicle has passed a stretch (s)
+MOST: Final = 20  # number of contradictions passed after which enough of a stretch is seen, whatever the time
+INTERVAL: Final = 0.5  # time after which contradictions are looked for again (s)
+ATTEMPTS: Final = 8  # largest number of attempts to mend a map
 EXPLAINED: Final = 0.5
 """Least share of the contradictions that a mended map explains; otherwise the old one stays for a lap."""
 
@@ -63,8 +56,7 @@ class Stretch:
     """Cones of a boundary's colour that stand in a row beside its curve."""
 
     label: int
-    cones: Array
-    """(k, 2) Positions in m, map frame, in no order."""
+    cones: Array  # (k, 2) positions in m, map frame, in no order
 
 
 class Contradictions:

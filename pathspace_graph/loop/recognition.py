@@ -42,8 +42,7 @@ STARTS: Final = 6
 class RecognizedPlace:
     """Place where the newest stretch of the curves lies on an earlier stretch."""
 
-    motion: Motion
-    """Motion of the newest stretch onto the earlier one."""
+    motion: Motion  # motion of the newest stretch onto the earlier one
     beside: dict[int, float]
     """Parameter of each boundary beside which the newest pose was there (m), a lap or more before."""
 

@@ -32,7 +32,7 @@ WORST_CONDITION: Final = 1e6  # largest condition number at which the mounting i
 LATEST: Final = 10.0  # largest delay or lead of detections that is tried (s)
 LATE_STEP: Final = 0.25  # step of these (s)
 QUARTER: Final = 90.0  # a quarter turn in degrees
-MEANINGS: Final = (
+MEANINGS: Final = (  # meanings of the odometry that are tried; of equally good ones the first is told
     Meaning(),
     Meaning(content="nothing"),
     Meaning(rate=DEGREE),
@@ -53,7 +53,6 @@ MEANINGS: Final = (
     Meaning(content="pose", rate=DEGREE),
     Meaning(speed=1e-3, rate=1e-3),
 )
-"""Meanings of the odometry that are tried; of equally good ones the first is told."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ UNEXPLAINED: Final = 0.15  # share of the detections that the best motion must e
 LINE_RATIO: Final = 0.1  # ratio of the variations of two coordinates below which detections lie on a line
 TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size in s
 LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # units of positions by their size in m
-SPEEDS: Final = {
+SPEEDS: Final = {  # what a unit of the speeds (m/s) means
     1.0 / 3.6: "are in km/h, not in m/s",
     0.44704: "are in miles per hour, not in m/s",
     0.514444: "are in knots, not in m/s",
@@ -56,13 +56,11 @@ SPEEDS: Final = {
     3.6: "were divided by 3.6 although they were in m/s",
     1e3: "were divided by 1000 although they were in m/s",
 }
-"""What a unit of the speeds (m/s) means."""
-RATES: Final = {
+RATES: Final = {  # what a unit of the yaw rate (rad/s) means
     DEGREE: "is in degrees per second, not in rad/s",
     1.0 / DEGREE: "was turned from degrees to radians although it was in rad/s",
 }
-"""What a unit of the yaw rate (rad/s) means."""
-FRAMES: Final = {
+FRAMES: Final = {  # what a frame in quarter turns means; the one with y to the right has its own hint
     Frame(180.0): "the sensor's frame has x to the rear and y to the right",
     Frame(-90.0): "the sensor's frame has x to the right and y ahead",
     Frame(90.0): "the sensor's frame has x to the left and y to the rear",
@@ -70,7 +68,6 @@ FRAMES: Final = {
     Frame(180.0, True): "the sensor's frame has x to the rear",
     Frame(-90.0, True): "the sensor's frame has x to the right and y to the rear",
 }
-"""What a frame in quarter turns means; the one with y to the right has its own hint."""
 MIRRORED: Final = Frame(0.0, True)  # frame in which y points to the right and x ahead
 
 
