@@ -6,10 +6,8 @@ loop, and the best places are refined by the registration. The farther the vehic
 agree. Once one is clearly better than all others, and twice in a row, the window starts anew there.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -30,7 +28,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors that choose a pose's position
-NO_CONES: Final = np.zeros(0)
 FOUND: Final = "the vehicle was lost, and is found again"
 """Beginning of the notice of a cycle in which the window starts anew at the place that was found."""
 BESIDE: Final = 1.0
@@ -71,11 +68,6 @@ class Loop:
     mapped: Mapping[int, BoolArray]
     """Whether each of these lies between cones that were detected (see `is_mapped`)."""
 
-    @cached_property
-    def with_gaps(self) -> list[int]:
-        """Return the boundaries whose curves have gaps."""
-        return [label for label, mapped in self.mapped.items() if not mapped.all()]
-
     def at(self, stations: Array) -> Array:
         """Return the points of the middle at stations of any shape, as complex numbers x + i y."""
         x, y = (np.interp(stations, self.stations, axis, period=self.length) for axis in self.middle.T)
@@ -106,26 +98,14 @@ def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) 
     The others lie in a gap, which is longer than `gap` times the median distance of neighbours, and farther
     than the margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
     """
-    return _is_between(u, *_neighbours(cones, length, gap), length, margin)
-
-
-def _neighbours(cones: Array, length: float, gap: float) -> tuple[Array, Array, BoolArray]:
-    """Return places (n,) of cones (k,) on a closed curve, steps (n,) to the next, and which are no gap."""
     if len(cones) < 2:
-        return np.zeros(1), np.full(1, length), np.ones(1, bool)
+        return np.ones(len(u), bool)
     places = np.unique(np.mod(cones, length))
     steps = np.diff(places, append=places[0] + length)
-    return places, steps, np.asarray(steps <= gap * np.median(steps))
-
-
-def _is_between(
-    u: Array, places: Array, steps: Array, known: BoolArray, length: float, margin: float
-) -> BoolArray:
-    """Return `is_mapped` of parameters (m,), given the `_neighbours` of a curve."""
     before = np.searchsorted(places, np.mod(u, length)) - 1
     past = np.mod(u - places[before], length)
     near_end = np.minimum(past, steps[before] - past) < margin
-    return np.asarray(near_end | known[before])
+    return np.asarray(near_end | (steps <= gap * np.median(steps))[before])
 
 
 def lay_out_loop(state: State, is_mapped_on: Callable[[int, Array], BoolArray] | None = None) -> Loop:
@@ -155,7 +135,6 @@ class KnownLoop:
     def __init__(self, smoother: CurveSmoother) -> None:
         self._smoother = smoother
         self._laid_out: tuple[list[Boundary], Loop] | None = None
-        self._cones: dict[int, tuple[Array, tuple[Array, Array, BoolArray]]] = {}
 
     def get(self) -> Loop:
         """Return the loop as it was when it was laid out, which changes no variable."""
@@ -176,15 +155,13 @@ class KnownLoop:
 
     def with_gaps(self) -> list[int]:
         """Return the boundaries whose curves have gaps."""
-        return self.get().with_gaps
+        return [label for label, mapped in self.get().mapped.items() if not mapped.all()]
 
     def is_mapped(self, label: int, u: Array) -> BoolArray:
         """Return which parameters (m,) of a boundary lie between cones that were detected."""
         track, settings = self._smoother.map, self._smoother.map.settings
-        cones, length = track.cones.get(label, NO_CONES), track.state.boundaries[label].length
-        if self._cones.get(label, (None,))[0] is not cones:
-            self._cones[label] = cones, _neighbours(cones, length, GAP)
-        return _is_between(u, *self._cones[label][1], length, settings.growth.merge_radius)
+        cones, length = track.cones.get(label, np.zeros(0)), track.state.boundaries[label].length
+        return is_mapped(u, cones, length, GAP, settings.growth.merge_radius)
 
 
 def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_again: BoolArray) -> Evidence:
@@ -239,8 +216,7 @@ def _sigma_of_position(smoother: CurveSmoother) -> float:
     if last is None:
         return np.nan
     half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())
-    (xx, xy), (_, yy) = (half.T @ half).tolist()
-    return math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))
+    return worst_sigma(half.T @ half)
 
 
 class Search:
