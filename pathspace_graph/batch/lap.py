@@ -41,16 +41,13 @@ from .simplification import associate_again, boundary_of, own_settings, scatter_
 from .start import Recurrence, start_odometry
 from .system import BatchSystem, Biweight, Evaluation, curve_gauge
 
-USED_AGAIN: Final = 0.85
-"""Least share of the detections after the first lap on a closed result, over that of the first lap."""
-MISFIT: Final = 1.5
-"""Most distance of detections after the first lap from its curves, in sigmas (root mean square)."""
+USED_AGAIN: Final = 0.85  # least share of the detections used after the first lap, over that of the first lap
+MISFIT: Final = 1.5  # most root mean square distance of detections after the first lap (sigmas)
 GAP: Final = 25.0  # longest stretch of a boundary without detections on it (m)
 OVERLAP: Final = 15.0  # least length that has been driven again (m)
 SIGMA: Final = 0.3
 """Largest standard deviation by which later laps' detections hold their drive beside the curves (m)."""
-WIDER: Final = 2.5
-"""Largest ratio of a boundary point's distance from the road driven to the drive's distance beside it."""
+WIDER: Final = 2.5  # most ratio of a boundary point's distance from the drive to the drive's beside it
 MOSTLY: Final = 95.0  # percentile of the poses' distances: the drive may begin or end off the track
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)
 """A lap that begins at the online map, so that its batch is in time."""
@@ -77,8 +74,7 @@ class OpenLap:
     chain: LogOdometry  # odometry between all cycles
     detections: DetectionTable  # detections of all cycles; their associations are found anew
     first_kept: int  # the poses from this cycle on stay variables of the window
-    start: ClosedMap | Recurrence
-    """Start of the search: a map, or odometry alone, where the path driven recurs after a lap."""
+    start: ClosedMap | Recurrence  # a map, or odometry alone, where the path driven recurs after a lap
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +91,7 @@ class LapMarginal:
     first_kept: int  # cycle before whose pose all measurements are in the marginal, and no later ones
     mean: Array  # (n,) mean of the marginal
     information: Array  # (n, n) its information, the inverse of its covariance
-    scatter: dict[int, Array]
-    """Standard deviation (m,) of each boundary's cones about the curve at each control point (m)."""
+    scatter: dict[int, Array]  # sigma (m,) of each boundary's cones about the curve at each control point (m)
     cones: dict[int, Array]  # parameters (k,) of each boundary's detected cones on its curve (m)
     seconds: float  # wall time (s)
     objection: str = ""  # what speaks against the map; empty where nothing does

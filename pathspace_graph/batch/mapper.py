@@ -54,16 +54,13 @@ from .start import CurveMapper, find_recurrence, start_odometry, start_online
 from .system import BatchSystem, Biweight, CurveGauge, Evaluation
 
 ROOM: Final = 4.0  # distance from its foot points in which a factor searches them (m along the curve)
-HALVINGS: Final = 6
-"""Most halvings of the room while another foot point in it is nearer, as in a bend about a detection."""
+HALVINGS: Final = 6  # most halvings of the room while another foot point in it is nearer, as in a bend
 SAME: Final = 1e-3  # distance below which two foot points are the same (m along the curve)
 STRETCH: Final = 25.0  # length of the stretches of the drive by which a map is judged (m)
 FEW: Final = 20  # number of detections below which a stretch says nothing
 USUALLY: Final = 80.0  # percentile of the stretches' shares of explained detections that is usual for a log
-POOR: Final = 0.6
-"""Share of the usual one below which a stretch is poorly mapped; those of a good map are above 0.9."""
-MOST_POOR: Final = 1.0 / 3.0
-"""Most of the drive that may be so: the way to a track and from it has no boundaries."""
+POOR: Final = 0.6  # share of the usual one below which a stretch is poorly mapped; good maps have 0.9
+MOST_POOR: Final = 1.0 / 3.0  # most of the drive that may be so: ways to a track have no boundaries
 
 
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:

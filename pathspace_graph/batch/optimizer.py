@@ -25,14 +25,11 @@ GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down
 SEARCH: Final = 20  # rounds in which associations are found anew
 SETTLE: Final = 8  # most refinements of the foot points before a step
 POSE_STEPS: Final = 3  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
-ROUGH_TOLERANCE: Final = 8.0
-"""Factor of the tolerances in the first optimization, on knots that follow the start."""
-TOLERANCE_COST: Final = 1e-5
-"""Largest |cost_before - cost_after| over a round at convergence, as a share of the cost."""
+ROUGH_TOLERANCE: Final = 8.0  # factor of the tolerances in the first optimization
+TOLERANCE_COST: Final = 1e-5  # most |cost_before - cost_after| over a round at convergence, over the cost
 TOLERANCE_CURVE: Final = 2e-3
 """Largest move of a point of a curve across it in a round then, as seen from its poses (m)."""
-TOLERANCE_DECREASE: Final = 5e-3
-"""Largest decrease of the cost by an undamped step then; a step of one sigma decreases it by 1/2."""
+TOLERANCE_DECREASE: Final = 5e-3  # most decrease of the cost by an undamped step then; one sigma has 1/2
 CURVE_SAMPLES: Final = 2  # points in each knot interval at which the movement of a curve is measured
 SHARES: Final = (0.3, 0.97)
 """Sizes of a step's share of the one before between which it becomes the sum of all that would follow."""

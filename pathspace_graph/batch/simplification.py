@@ -22,14 +22,11 @@ from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 
 from .association import MIN_CONES, associate, cones_of_curve, first_parameter, locate_poses
 
-MIN_SIZE_SHARE: Final = 0.6
-"""Least share of the largest number of control points that the map's curves are tried with."""
+MIN_SIZE_SHARE: Final = 0.6  # least share of the largest number of control points that is tried
 ALIKE: Final = (3.0, 0.01)
 """Parameters of two curves through the same cones differ by less than `a + b L` (m), with L their length."""
-FOLDS: Final = 4
-"""Groups of the cross-validation, dealt in turn: the neighbours of a cone left out are always there."""
-FOOT_ROOM: Final = 1.5
-"""Distance from its own place in which the foot point of a cone is searched (m along the curve)."""
+FOLDS: Final = 4  # groups of the cross-validation, dealt in turn, so that the neighbours of a cone are there
+FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched (m along the curve)
 
 
 # --- knots -----------------------------------------------------------------------------------------------

@@ -23,8 +23,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import headings
 
-POINTS_A_FACTOR: Final = 8
-"""Neighbouring control points in one factor of their anchors; it changes the speed, not the result."""
+POINTS_A_FACTOR: Final = 8  # neighbouring control points in one factor of their anchors; only for speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +42,7 @@ class CurveGauge:
     sigma: float  # standard deviation of that distance (m)
     smoothness: Array  # D (r, m)
     sigma_smoothness: float  # standard deviation of a second difference (m)
-    sigma_anchor: float
-    """Standard deviation (m) that holds each control point where it is linearized. The anchor has no
-    gradient, so it isn't part of the cost."""
+    sigma_anchor: float  # that holds each control point where it is linearized (m), without any cost
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
         """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives."""

@@ -61,10 +61,8 @@ def _moved(poses: Array, frames: Array, to: Array) -> Array:
 # --- the record ------------------------------------------------------------------------------------------
 
 WORKER_IDLE: Final = 600  # time with nothing to do after which the process that solves laps ends (s)
-WATCH_SECONDS: Final = 1.0
-"""Interval (s) at which a worker checks whether the process that started it is still there."""
-LATE: Final = "the batch of the lap was late"
-"""Why a batch was given up that the process has not solved in time."""
+WATCH_SECONDS: Final = 1.0  # at which a worker checks whether the process that started it is still there
+LATE: Final = "the batch of the lap was late"  # why a batch was given up in the end
 SOLVED: Final = 3.0
 """Distance from its optimum at which a batch counts as solved (joint sigmas): its marginal has the rest."""
 

@@ -30,8 +30,7 @@ from pathspace_graph.spline.boundary import Boundary
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors that choose a pose's position
 FOUND: Final = "the vehicle was lost, and is found again"
 """Beginning of the notice of a cycle in which the window starts anew at the place that was found."""
-BESIDE: Final = 1.0
-"""Distance from the closed curve of its colour within which an unused detection is explained (m)."""
+BESIDE: Final = 1.0  # distance from the closed curve within which an unused detection is explained (m)
 GAP: Final = 3.0  # least distance of neighbouring cones with a gap between them, over the median
 INTERVAL: Final = 0.5  # least time between two attempts (s)
 MEMORY: Final = 60.0  # length of the newest path whose detections are compared with the map (m)
@@ -43,10 +42,8 @@ MISFIT: Final = 3.0  # rms distance of the path driven from the middle within wh
 REACH: Final = 3.0  # distance from its curve that any farther detection counts as (m)
 STARTS: Final = 12  # largest number of places that are refined
 APART: Final = 4.0  # distance below which two places are one (m)
-SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)
-"""Standard deviations of the pose about a place, before it is refined (m, m, rad)."""
-SIGMA_FIT: Final = 0.3
-"""A detection at a distance d from a curve of its colour scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)."""
+SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)  # of the pose about a place, before it is refined (m, m, rad)
+SIGMA_FIT: Final = 0.3  # a detection at a distance d from its curve scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)
 MIN_SCORE: Final = 0.6  # least score of the place that is accepted; the true one has about 0.85
 MARGIN: Final = 0.1  # least lead of its score over that of every other place
 SIGMA_MAX: Final = 0.5  # largest standard deviation of the position there in its worst direction (m)
@@ -65,8 +62,7 @@ class Loop:
     length: float  # length of the middle (m)
     beside: Mapping[int, Array]  # (n,) parameters beside the points of the middle on each boundary (m)
     curves: Mapping[int, KDTree]  # densely sampled points of each boundary
-    mapped: Mapping[int, BoolArray]
-    """Whether each of these lies between cones that were detected (see `is_mapped`)."""
+    mapped: Mapping[int, BoolArray]  # whether each of these lies between detected cones (`is_mapped`)
 
     def at(self, stations: Array) -> Array:
         """Return the points of the middle at stations of any shape, as complex numbers x + i y."""

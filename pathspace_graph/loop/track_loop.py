@@ -29,10 +29,8 @@ from .mending import Mending
 from .recognition import recognize
 from .revisit import Revisits
 
-OWN_PRIOR: Final = "the map goes on from the window's own prior"
-"""Beginning of the notice of a cycle in which the batch of the lap does not replace the prior."""
-LONGEST_WAIT: Final = 1.0
-"""Longest time that a cycle waits for a batch (s), however long ago the cycle before it was."""
+OWN_PRIOR: Final = "the map goes on from the window's own prior"  # begins the notice where no batch came
+LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cycle before it was
 REST: Final = 10.0  # distance for which the loop is left as it is after a failure (m)
 RECOGNITION_INTERVAL: Final = 10.0  # least distance of two attempts to recognize the place (m along the path)
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"

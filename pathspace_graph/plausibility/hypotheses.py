@@ -5,19 +5,19 @@ of them than the log as it is written is the likely truth.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from scipy.special import bdtrc
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import rotation
-from pathspace_graph.io.log import Log
+from pathspace_graph.factors.se2 import rotation, se2_exp
+from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import LEFT, UNKNOWN
 
-from .pairs import DEGREE, SOME_CYCLES, Meaning, Pairs, motions
+from .pairs import SOME_CYCLES, Pairs, motions, turned
 
 TURN_STEP: Final = 15.0  # step of the angles that the frame of the detections is tried at (degrees)
 EQUAL: Final = 0.02  # difference of explained shares below which hypotheses are equally good
@@ -32,51 +32,60 @@ WORST_CONDITION: Final = 1e6  # largest condition number at which the mounting i
 LATEST: Final = 10.0  # largest delay or lead of detections that is tried (s)
 LATE_STEP: Final = 0.25  # step of these (s)
 QUARTER: Final = 90.0  # a quarter turn in degrees
-MEANINGS: Final = (  # meanings of the odometry that are tried; of equally good ones the first is told
-    Meaning(),
-    Meaning(content="nothing"),
-    Meaning(rate=DEGREE),
-    Meaning(rate=1.0 / DEGREE),
-    Meaning(speed=1.0 / 3.6),
-    Meaning(speed=0.44704),
-    Meaning(speed=0.514444),
-    Meaning(speed=1e-2),
-    Meaning(speed=1e-3),
-    Meaning(speed=3.6),
-    Meaning(speed=1e3),
-    Meaning(speed=1.0 / 3.6, rate=DEGREE),
-    Meaning(speed=1e-2, rate=DEGREE),
-    Meaning(speed=1e-3, rate=DEGREE),
-    Meaning(content="twist in the map frame"),
-    Meaning(content="twist in the map frame", rate=DEGREE),
-    Meaning(content="pose"),
-    Meaning(content="pose", rate=DEGREE),
-    Meaning(speed=1e-3, rate=1e-3),
-)
-
-
-@dataclass(frozen=True)
-class Frame:
-    """How the frame of the detections stands in that of the vehicle."""
-
-    turn: float = 0.0  # turn to the left (degrees)
-    mirrored: bool = False  # whether the y axis points to the other side, seen from the x axis
-
-    @property
-    def matrix(self) -> Array:
-        return rotation(self.turn * DEGREE) @ np.diag([1.0, -1.0 if self.mirrored else 1.0])
+DEGREE: Final = float(np.pi / 180.0)  # in radians
+Content = Literal["twist", "twist in the map frame", "pose", "nothing"]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """What the columns of a log mean."""
 
-    frame: Frame = Frame()
-    meaning: Meaning = field(default_factory=Meaning)
+    content: Content = "twist"  # of the odometry; with `nothing` the vehicle does not move at all
+    speed: float = 1.0  # unit of the speeds (m/s)
+    rate: float = 1.0  # unit of the yaw rate (rad/s)
+    turn: float = 0.0  # of the detections' frame in the vehicle's, to the left (degrees)
+    mirrored: bool = False  # whether its y axis points to the other side, seen from its x axis
     late: float = 0.0  # how much too large the stamps of the detections are (s)
+
+    @property
+    def stands(self) -> tuple[float, bool]:
+        """Return how the frame of the detections stands in that of the vehicle."""
+        return self.turn, self.mirrored
+
+    @property
+    def frame(self) -> Array:
+        return rotation(self.turn * DEGREE) @ np.diag([1.0, -1.0 if self.mirrored else 1.0])
+
+    def poses(self, odometry: Odometry) -> Array:
+        """Return the poses (N, 3) at the stamps, in a frame of their own; theta is not wrapped."""
+        measured = odometry.twist * [self.speed, self.speed, self.rate]
+        if self.content == "pose":
+            return np.column_stack([measured[:, :2], np.unwrap(measured[:, 2])])
+        if self.content == "nothing":
+            return np.zeros_like(measured)
+        dt = np.diff(odometry.t)[:, None]
+        heading = np.append(0.0, np.cumsum(measured[:-1, 2:] * dt))
+        if self.content == "twist":
+            steps = turned(se2_exp(measured[:-1] * dt)[:, :2], heading[:-1])
+        else:
+            steps = measured[:-1, :2] * dt
+        return np.column_stack([np.cumsum(np.vstack([np.zeros(2), steps]), axis=0), heading])
 
 
 AS_WRITTEN: Final = Hypothesis()  # the log means what it should
+MEANINGS: Final = (  # of the odometry; of equally good ones the first is told
+    AS_WRITTEN,
+    Hypothesis("nothing"),
+    Hypothesis(rate=DEGREE),
+    Hypothesis(rate=1.0 / DEGREE),
+    *(Hypothesis(speed=speed) for speed in (1.0 / 3.6, 0.44704, 0.514444, 1e-2, 1e-3, 3.6, 1e3)),
+    *(Hypothesis(speed=speed, rate=DEGREE) for speed in (1.0 / 3.6, 1e-2, 1e-3)),
+    Hypothesis("twist in the map frame"),
+    Hypothesis("twist in the map frame", rate=DEGREE),
+    Hypothesis("pose"),
+    Hypothesis("pose", rate=DEGREE),
+    Hypothesis(speed=1e-3, rate=1e-3),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,49 +101,33 @@ class Trial:
         return float(self.explained.mean())
 
 
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Comparison of a hypothesis with the log as it is written, on the pairs that tell them apart."""
-
-    telling: int  # number of these pairs
-    better: int  # number of those that the hypothesis explains better
-    share: float  # share of their detections that it explains
-    share_as_written: float  # share of their detections that the log as it is written explains
-
-    def is_clear(self) -> bool:
-        chance = float(bdtrc(self.better - 1, self.telling, 0.5))
-        far_better = self.share > FAR_BETTER * self.share_as_written
-        return chance < CHANCE and far_better and self.share > LEAST_SHARE
-
-    @property
-    def figures(self) -> dict[str, float]:
-        return {"as_written": self.share_as_written, "share": self.share}
-
-
-def verdict(trial: Trial, reference: Trial) -> Verdict:
+def far_better(trial: Trial, reference: Trial) -> dict[str, float] | None:
+    """Return the shares that both explain where they differ, or None unless the trial is clearly better."""
     gain = trial.explained - reference.explained
     telling: BoolArray = np.abs(gain) > TELLING
     if not telling.any():
-        return Verdict(0, 0, 0.0, 0.0)
-    shares = (float(one.explained[telling].mean()) for one in (trial, reference))
-    return Verdict(int(telling.sum()), int((gain[telling] > 0.0).sum()), *shares)
+        return None
+    share, as_written = (float(one.explained[telling].mean()) for one in (trial, reference))
+    chance = float(bdtrc(int((gain[telling] > 0.0).sum()) - 1, int(telling.sum()), 0.5))
+    clear = chance < CHANCE and share > FAR_BETTER * as_written and share > LEAST_SHARE
+    return {"as_written": as_written, "share": share} if clear else None
 
 
 class Trials:
     def __init__(self, log: Log, pairs: Pairs) -> None:
         self.log, self.pairs = log, pairs
-        self._poses: dict[Meaning, Array] = {}
+        self._poses: dict[Hypothesis, Array] = {}  # by what the odometry means
 
     def motion(self, hypothesis: Hypothesis) -> Array:
         """Return the motion (P, 3) of the vehicle from the earlier to the later cycle of each pair."""
-        odometry, pairs, meaning = self.log.odometry, self.pairs, hypothesis.meaning
+        odometry, pairs, meaning = self.log.odometry, self.pairs, of_odometry(hypothesis)
         if meaning not in self._poses:
             self._poses[meaning] = meaning.poses(odometry)
         begin, end = pairs.begin - hypothesis.late, pairs.end - hypothesis.late
         return motions(odometry.t, self._poses[meaning], begin, end)
 
     def trial(self, hypothesis: Hypothesis) -> Trial:
-        matrix = hypothesis.frame.matrix
+        matrix = hypothesis.frame
         explained = self.pairs.explained(matrix, self.motion(hypothesis))
         return Trial(hypothesis, explained, self.sided(matrix))
 
@@ -152,12 +145,11 @@ class Trials:
     def _others(self) -> Iterator[Hypothesis]:
         """Yield frames in fine steps for a right odometry, and in quarter turns for any other."""
         for meaning in MEANINGS:
-            step = TURN_STEP if meaning == Meaning() else QUARTER
+            step = TURN_STEP if meaning == AS_WRITTEN else QUARTER
             for turn in np.arange(0.0, 360.0, step).tolist():
                 for mirrored in (False, True):
-                    one = Hypothesis(Frame(turn - 360.0 if turn > 180.0 else turn, mirrored), meaning)
-                    is_tried = meaning.content != "nothing" or one.frame == Frame()
-                    if one != AS_WRITTEN and is_tried:
+                    one = replace(meaning, turn=turn - 360.0 if turn > 180.0 else turn, mirrored=mirrored)
+                    if one != AS_WRITTEN and (meaning.content != "nothing" or one == meaning):
                         yield one
 
     def sided(self, matrix: Array) -> float:
@@ -177,6 +169,10 @@ class Trials:
         return points[near], labels[near]
 
 
+def of_odometry(hypothesis: Hypothesis) -> Hypothesis:
+    return replace(hypothesis, turn=0.0, mirrored=False, late=0.0)
+
+
 # --- where the sensor is in the vehicle, and how late it is ----------------------------------------------
 
 MEDIAN_SQUARE: Final = 2.0 * float(np.log(2.0))  # median of |x|^2 of two standard normals
@@ -191,16 +187,6 @@ class Mounting:
     scatter: float  # median distance of detections of one cone (m)
     claimed: float  # the same by their covariances (m)
 
-    @property
-    def yaw(self) -> tuple[float, float]:
-        """Turn to the left and its standard deviation in degrees."""
-        return float(self.values[0]) / DEGREE, float(self.sigmas[0]) / DEGREE
-
-    @property
-    def arm(self) -> tuple[float, float]:
-        """Length of the lever arm, and the larger standard deviation of its components (m)."""
-        return float(np.hypot(*self.values[1:])), float(self.sigmas[1:].max())
-
 
 def mounting_of(trials: Trials, hypothesis: Hypothesis) -> Mounting | None:
     """Return the mounting under which nearby detections lie on each other best; None without any.
@@ -208,7 +194,7 @@ def mounting_of(trials: Trials, hypothesis: Hypothesis) -> Mounting | None:
     A cone at a (vehicle frame, earlier cycle) and b (later) with the motion (R, t) between them leaves
     `a - R b - t + (J t) yaw + (I - R) l`, in first order of the yaw and exactly in the lever arm l.
     """
-    motion, frame = trials.motion(hypothesis), hypothesis.frame.matrix
+    motion, frame = trials.motion(hypothesis), hypothesis.frame
     values, sigmas = np.zeros(3), np.full(3, np.inf)
     for _ in range(MOUNTING_STEPS):
         turned = rotation(values[0]) @ frame

@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, Self
+from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import se2_exp, wrap_angle
-from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.factors.se2 import wrap_angle
+from pathspace_graph.io.log import Detections
 
 MIN_DETECTIONS: Final = 2  # least number of detections of a cycle that is compared
 MOST_DETECTIONS: Final = 14  # most detections of a cycle that are compared, the nearest ones
@@ -130,41 +130,13 @@ def _polar(points: Array) -> tuple[Array, Array]:
     return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
 
 
-# --- the motion of the vehicle, by what the columns of the odometry may mean -----------------------------
-
-Content = Literal["twist", "twist in the map frame", "pose", "nothing"]
-"""What the columns of the odometry hold; with `nothing` the vehicle does not move at all."""
-DEGREE: Final = float(np.pi / 180.0)  # a degree in radians
-
-
-@dataclass(frozen=True)
-class Meaning:
-    """What the columns of the odometry mean."""
-
-    speed: float = 1.0  # unit of the speeds (m/s)
-    rate: float = 1.0  # unit of the yaw rate (rad/s)
-    content: Content = "twist"
-
-    def poses(self, odometry: Odometry) -> Array:
-        """Return the poses (N, 3) at the stamps, in a frame of their own; theta is not wrapped."""
-        measured = odometry.twist * [self.speed, self.speed, self.rate]
-        if self.content == "pose":
-            return np.column_stack([measured[:, :2], np.unwrap(measured[:, 2])])
-        if self.content == "nothing":
-            return np.zeros_like(measured)
-        dt = np.diff(odometry.t)[:, None]
-        heading = np.append(0.0, np.cumsum(measured[:-1, 2:] * dt))
-        if self.content == "twist":
-            steps = _turned(se2_exp(measured[:-1] * dt)[:, :2], heading[:-1])
-        else:
-            steps = measured[:-1, :2] * dt
-        return np.column_stack([np.cumsum(np.vstack([np.zeros(2), steps]), axis=0), heading])
+# --- motions --------------------------------------------------------------------------------------------
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
     """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning."""
     first, last = _at(odometry_t, poses, begin), _at(odometry_t, poses, end)
-    moved = _turned(last[:, :2] - first[:, :2], -first[:, 2])
+    moved = turned(last[:, :2] - first[:, :2], -first[:, 2])
     return np.column_stack([moved, last[:, 2] - first[:, 2]])
 
 
@@ -173,6 +145,6 @@ def _at(odometry_t: Array, poses: Array, stamps: Array) -> Array:
     return np.column_stack([np.interp(stamps, odometry_t, column) for column in poses.T])
 
 
-def _turned(vectors: Array, angles: Array) -> Array:
+def turned(vectors: Array, angles: Array) -> Array:
     c, s = np.cos(angles), np.sin(angles)
     return np.column_stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]])
