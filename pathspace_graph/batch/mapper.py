@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.errors import SettingsError, solving
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.noise import KnownNoise
@@ -263,10 +263,6 @@ class BatchMapper:
         By default `batch.start` decides. `on_round` is called after each round. SettingsError if there is no
         online mapper to begin with, and SolveError where the log leaves no way to an optimum.
         """
-        with threadpool_limits(limits=1), solving("the batch"):
-            return self._solve(log, start or self.settings.batch.start, on_round)
-
-    def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         watch = Stopwatch()
         judged = judge_log(log, self.noise, own_settings(self.settings))
         settings = judged.settings
@@ -274,7 +270,7 @@ class BatchMapper:
         system = BatchSystem(detections, chain, settings, Biweight(LOOSE_GATE))
         optimizer = Optimizer(system, on_round=on_round)
         watch.lap("integrate")
-        if start == "odometry":
+        if (start or self.settings.batch.start) == "odometry":
             online = None
             at, convergence = find_optimum_from_odometry(optimizer)
         else:

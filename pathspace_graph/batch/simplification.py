@@ -14,7 +14,7 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.graph.variables import CONTROL_LETTERS, POINT, Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.batch import BatchSettings, FitSettings
+from pathspace_graph.settings.batch import BatchSettings
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
@@ -72,9 +72,9 @@ def fit_through(
     most = max(smallest, int(share * len(points)))
     if periodic:
         points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
-    fit = FitSettings(degree=settings.spline.degree)
-    chosen = chosen_breaks(points, periodic, fit, max(smallest, int(least_share * most)), most)
-    return fit_spline(points, chosen.size, periodic, fit, chosen.breaks)
+    degree = settings.spline.degree
+    chosen = chosen_breaks(points, periodic, degree, max(smallest, int(least_share * most)), most)
+    return fit_spline(points, chosen.size, periodic, degree, chosen.breaks)
 
 
 def extended(points: Array, beyond: float) -> Array:
