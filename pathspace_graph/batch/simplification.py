@@ -3,7 +3,6 @@
 Simplification: the optimum's curves on few knots, their covariance, and how far cones lie from them.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
@@ -14,7 +13,6 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.graph.variables import CONTROL_LETTERS, POINT, Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.batch import BatchSettings
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
@@ -38,26 +36,18 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
     `dense` places so many knots that the curves meet the cones; else they are as few as the map has.
     """
     state = state.copy()
-    cones = {label: cones_of_curve(state, detections, label, settings) for label in state.boundaries}
-    share = size_share({label: len(found.u) for label, found in cones.items()}, settings.batch)
     for label, boundary in list(state.boundaries.items()):
-        points = cones[label].points
+        points = cones_of_curve(state, detections, label, settings).points
         if len(points) < MIN_CONES:
             continue
         if dense:
             beyond = 0.0 if boundary.periodic else settings.growth.merge_radius
             points, share_of = extended(points, beyond), (settings.batch.dense_share, 1.0)
         else:
-            share_of = share, MIN_SIZE_SHARE
+            share_of = settings.batch.size_share, MIN_SIZE_SHARE
         spline = fit_through(points, boundary.periodic, settings, *share_of)
         state.replace_boundary(label, *boundary_of(spline, settings))
     return state
-
-
-def size_share(cones: Mapping[int, int], batch: BatchSettings) -> float:
-    """Return the control points per cone: the settings' share, or their size over all cones."""
-    total = sum(cones.values())
-    return batch.size_share if batch.size is None or total == 0 else batch.size / total
 
 
 def fit_through(

@@ -19,9 +19,21 @@ from pathspace_graph.settings.online import LimitSettings
 
 from . import hypotheses
 from .hint import Hint, because, told
-from .hypotheses import AS_WRITTEN, DEGREE, LEAST_SHARE, Hypothesis, Mounting, Trial, Trials, far_better
+from .hypotheses import (
+    AS_WRITTEN,
+    DEGREE,
+    GAPS,
+    LEAST_SHARE,
+    Hypothesis,
+    Mounting,
+    Pairs,
+    Trial,
+    Trials,
+    far_better,
+    motions,
+    pairs_of,
+)
 from .noise import noise_hints
-from .pairs import GAPS, Pairs, motions, pairs_of
 
 LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is said
 OVERLAP: Final = 0.5  # share of its detections that another cycle sees, from which they are compared

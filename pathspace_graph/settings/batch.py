@@ -67,8 +67,6 @@ class BatchSettings(Positive):
 
     start: Start = "online"
     """Start of the optimization: the map of an online run over the log, or odometry alone."""
-    size: int | None = None
-    """Number of control points of both boundaries together; by default the number of cones decides."""
     size_share: float = 0.43
     """Most control points as a share of the distinct cones that were detected (the paper has 0.44)."""
     dense_share: float = 1.0

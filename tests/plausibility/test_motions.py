@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.io.log import Odometry
-from pathspace_graph.plausibility.hypotheses import DEGREE, Hypothesis
-from pathspace_graph.plausibility.pairs import motions
+from pathspace_graph.plausibility.hypotheses import DEGREE, Hypothesis, motions
 
 T = 0.1 * np.arange(11)
 
