@@ -25,8 +25,7 @@ class LapCounter:
     """
 
     def __init__(self) -> None:
-        self.lap = 1
-        """Current lap, counted from 1."""
+        self.lap = 1  # current lap, counted from 1
         self._path = 0.0
         self._farthest = 0.0
         self._last: tuple[float, float, float] | None = None

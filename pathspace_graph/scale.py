@@ -13,13 +13,14 @@ from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
 from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .errors import ReadingError, SettingsError, check_type
+from .errors import ReadingError, SettingsError, check_type, solving
 from .labels import LEFT, RIGHT, UNKNOWN
 from .lengths import POSE, scaled, times
 from .run import settings_dict
@@ -119,11 +120,10 @@ def _nearest(widths: list[float], gaps: list[float]) -> float:
 
 # --- the front door of estimators ------------------------------------------------------------------------
 
-ANSWERS: Final = (
+ANSWERS: Final = (  # methods of an online estimator that return what has lengths
     *("map", "outline", "ahead", "readings", "vehicle_state", "noise_used"),
     *("window_poses", "smoothed"),
 )
-"""Methods of an online estimator that return what has lengths."""
 
 
 class FrontDoor:
@@ -243,7 +243,10 @@ def _outwards(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def log_at_scale(estimator: C) -> C:
-    """Let a batch estimator map logs of any size, by the scale of the settings or as the log tells it."""
+    """Let a batch estimator map logs of any size, by the scale of the settings or as the log tells it.
+
+    BLAS has one thread, and whatever numerics raise is a SolveError.
+    """
     begin, solve = estimator.__init__, estimator.solve
 
     @wraps(begin)
@@ -258,8 +261,9 @@ def log_at_scale(estimator: C) -> C:
         scale = settings.scale or scale_of(log)
         inner = object.__new__(type(self))
         begin(inner, replace(settings, scale=1.0), noise_at(noise, scale), *others, **by_name)
-        result = scaled(solve(inner, scaled(log, 1.0 / scale), *options, **named), scale)
-        return replace(result, settings=settings_dict(settings))
+        with threadpool_limits(limits=1), solving("the batch"):
+            result = solve(inner, scaled(log, 1.0 / scale), *options, **named)
+        return replace(scaled(result, scale), settings=settings_dict(settings))
 
     estimator.__init__, estimator.solve = begin_and_keep, solve_at_scale
     return estimator

@@ -11,11 +11,10 @@ from pathspace_graph.eval.metrics.accuracy import closest_points, root_mean_squa
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.io.map import SplineBoundary
-from pathspace_graph.settings.batch import BreakSettings
 from pathspace_graph.sim.curves import ring
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import curvature_weighted_breaks, fit_spline, refit
+from pathspace_graph.spline.knots import BASELINE, curvature_weighted_breaks, fit_spline, refit
 
 from . import style
 from .style import BLUE, DARK, LIGHT, ORANGE, PURPLE, THIN_WIDTH, WIDTH
@@ -176,15 +175,14 @@ def simplification() -> Simplification:
     u = old.parameters_at(length)
     points = old.evaluate(u)
 
-    def simplified(settings: BreakSettings) -> Simplified:
+    def simplified(baseline: float) -> Simplified:
         empty = BSpline.periodic_from(
-            curvature_weighted_breaks(old, _AFTER, settings), np.zeros((_AFTER, 2)), old.degree
+            curvature_weighted_breaks(old, _AFTER, baseline), np.zeros((_AFTER, 2)), old.degree
         )
         curve = empty.with_points(refit(old, empty).new_from_old @ old.distinct_control_points)
         return Simplified(curve, np.linalg.norm(points - closest_points(curve, points).position, axis=1))
 
-    uniform = BreakSettings(baseline=1.0)
-    return Simplification(old, length, old.curvature(u), simplified(BreakSettings()), simplified(uniform))
+    return Simplification(old, length, old.curvature(u), simplified(BASELINE), simplified(1.0))
 
 
 def plot_simplification(data: Simplification) -> Figure:

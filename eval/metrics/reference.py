@@ -6,14 +6,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.baselines.landmark_batch import LandmarkSolution, solve_landmarks
+from pathspace_graph.baselines.landmark_batch import LandmarkSystem, solve_landmarks
+from pathspace_graph.baselines.landmark_map import LandmarkState
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import inverse, left_of, to_map
 from pathspace_graph.io.log import Detections, Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
-from pathspace_graph.settings.batch import FitSettings
 from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.knots import fit_spline
@@ -47,24 +47,24 @@ class Limit:
 def limit(log: Log, track: Map) -> Limit:
     """Return the limit of a simulated log and a map of it; ValueError without truth or associations."""
     truth = _truth(log)
-    return Limit(l=landmark_rmse(solve_oracle_landmarks(log), truth), f=fit_rmse(track, truth))
+    return Limit(l=landmark_rmse(solve_oracle_landmarks(log)[1], truth), f=fit_rmse(track, truth))
 
 
-def solve_oracle_landmarks(log: Log, *, with_covariance: bool = False) -> LandmarkSolution:
+def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:
     """Return the landmark batch with oracle association: each detection knows its true cone.
 
-    It also knows the sensor's constant errors and the true noise, where the log has them. Landmark ids are
-    indices of true cones.
+    It also knows the sensor's constant errors and the true noise, where the log has them. Numbers of
+    landmarks are indices of true cones.
     """
     truth = _truth(log)
     if truth.associations is None:
         raise ValueError("expected a simulated log, whose associations are known, found one without")
     if truth.sensor is None and truth.noise is None:
-        return solve_landmarks(log, truth.associations, with_covariance=with_covariance)
+        return solve_landmarks(log, truth.associations)
     settings = MapperSettings(calibration=CalibrationSettings(sensor=truth.sensor is None))
     told, associations = without_sensor_errors(log, truth.associations)
     told = with_true_noise(told, associations)
-    return solve_landmarks(told, associations, with_covariance=with_covariance, settings=settings)
+    return solve_landmarks(told, associations, settings)
 
 
 def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArray]:
@@ -130,10 +130,10 @@ def _rays(points: Array) -> tuple[Array, Array]:
     return distance, unit[:, :, None] * unit[:, None, :]
 
 
-def landmark_rmse(solution: LandmarkSolution, truth: Truth) -> float:
+def landmark_rmse(solved: LandmarkState, truth: Truth) -> float:
     """Return sqrt(mean |l_j - cone_j|^2) in m over the cones of a boundary that were ever detected."""
-    counted = np.isin(truth.cone_labels[solution.landmark_ids], BOUNDARIES)
-    errors = solution.landmarks - truth.cones[solution.landmark_ids]
+    counted = np.isin(truth.cone_labels[solved.numbers], BOUNDARIES)
+    errors = solved.landmarks - truth.cones[solved.numbers]
     return root_mean_square(np.linalg.norm(errors[counted], axis=1))
 
 
@@ -149,7 +149,7 @@ def fit_rmse(track: Map, truth: Truth) -> float:
         fitted = cones
         if isinstance(boundary, SplineBoundary) and boundary.size < len(cones):
             like = boundary.spline
-            spline = fit_spline(cones, boundary.size, like.periodic, FitSettings(degree=like.degree))
+            spline = fit_spline(cones, boundary.size, like.periodic, like.degree)
             fitted = closest_points(spline, cones).position
         distances.append(np.linalg.norm(cones - fitted, axis=1))
     return root_mean_square(np.concatenate(distances))

@@ -6,7 +6,6 @@ from typing import Final
 
 import gtsam
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from pathspace_graph.batch.association import headings
 from pathspace_graph.batch.mapper import (
@@ -19,7 +18,7 @@ from pathspace_graph.batch.mapper import (
 )
 from pathspace_graph.batch.start import CurveMapper
 from pathspace_graph.batch.system import CurveGauge
-from pathspace_graph.errors import SettingsError, solving
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.gtsam_factors import pose_array, ribbon_factor
 from pathspace_graph.factors.noise import KnownNoise
@@ -249,11 +248,10 @@ class CenterlineBatch:
         names = ("map", "trajectory_t", "trajectory", "cycles", "laps", "converged", "cost", "noise")
         shared = {name: getattr(start, name) for name in names}
         run = BatchRun(estimator=NAME, settings=settings_dict(self.settings), **shared)
-        with threadpool_limits(limits=1), solving("the batch"):
-            try:
-                return self._optimized(start, run)
-            except SettingsError:
-                return run
+        try:
+            return self._optimized(start, run)
+        except SettingsError:
+            return run
 
     def _optimized(self, start: BatchResult, run: BatchRun) -> BatchRun:
         settings, splines, count = self.settings, start.optimum.state.splines, len(start.trajectory)

@@ -32,7 +32,7 @@ from pathspace_graph.spline.knots import refit
 
 from .ckf_curves import CurveState, Expansion
 from .ckf_update import OnCurve, classify, update
-from .landmark_association import ROUGH, Association, Gates, associate, compatible, pair_costs
+from .landmark_association import ROUGH, Gates, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 
 REACH: Final = 9.0  # a curve is extended up to this far ahead of the vehicle (m along the predicted path)
@@ -256,25 +256,25 @@ class LandmarkCkf(_Filter):
         """Tracks by label that are not landmarks yet."""
 
     def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
-        found = self._associate(detections)
+        landmark, is_new = self._associate(detections)
         watch.lap("associate")
-        self._update(detections, found.landmark)
+        self._update(detections, landmark)
         watch.lap("update")
-        self._create(detections, found.new)
+        self._create(detections, is_new)
         watch.lap("create")
-        return int((found.landmark != UNASSOCIATED).sum()), landmark_counts(self.labels), False
+        return int((landmark != UNASSOCIATED).sum()), landmark_counts(self.labels), False
 
-    def _associate(self, detections: Detections) -> Association:
+    def _associate(self, detections: Detections) -> tuple[IntArray, BoolArray]:
         points = to_map(detections.points_vehicle, self.belief.pose[None])
         nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH)[1])
         predicted, covariances = self._predict(nearby)
         cost = pair_costs(detections.points_vehicle, detections.covariances, predicted, covariances)
         cost[~compatible(detections.labels, self.labels[nearby])] = np.inf
-        found = associate(cost, Gates.of(self.settings.landmark))
-        matched = found.landmark != UNASSOCIATED
+        column, is_new = associate(cost, Gates.of(self.settings.landmark))
+        matched = column != UNASSOCIATED
         landmark = np.full(len(detections.labels), UNASSOCIATED, np.intp)
-        landmark[matched] = nearby[found.landmark[matched]]
-        return Association(landmark, found.new)
+        landmark[matched] = nearby[column[matched]]
+        return landmark, is_new
 
     def _predict(self, landmarks: IntArray) -> tuple[Array, Array]:
         k = len(landmarks)

@@ -27,14 +27,6 @@ ROUGH: Final = 5.0  # a landmark farther from every detection of a cycle than th
 HELD_MARGIN: Final = 1e-9  # of a held pair below the match gate, where round-off would decide
 
 
-@dataclass(frozen=True, eq=False)
-class Association:
-    """Landmark of each of the m detections of one perception cycle."""
-
-    landmark: IntArray  # (m,) column of each detection's landmark, or UNASSOCIATED
-    new: BoolArray  # (m,) set where a detection lies beyond the create gate of every compatible landmark
-
-
 @dataclass(frozen=True)
 class Gates:
     """Two gates on squared Mahalanobis distances with two degrees of freedom."""
@@ -49,16 +41,18 @@ class Gates:
         return Gates(chi2_quantile(settings.match, POINT), chi2_quantile(settings.create, POINT))
 
 
-def associate(cost: Array, gates: Gates) -> Association:
+def associate(cost: Array, gates: Gates) -> tuple[IntArray, BoolArray]:
     """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
     cost (m, n) holds squared Mahalanobis distances of detections to landmarks, infinite for other labels.
+    Return the column (m,) of each detection's landmark, or UNASSOCIATED, and which detections (m,) lie beyond
+    the create gate of every compatible landmark.
     """
     landmark = np.full(len(cost), UNASSOCIATED, np.intp)
     rows, columns = scipy.optimize.linear_sum_assignment(np.minimum(cost, gates.match))
     chosen = cost[rows, columns] < gates.match
     landmark[rows[chosen]] = columns[chosen]
-    return Association(landmark, np.asarray((cost > gates.create).all(axis=1)))
+    return landmark, np.asarray((cost > gates.create).all(axis=1))
 
 
 def squared_mahalanobis(innovations: Array, covariances: Array) -> Array:
@@ -105,11 +99,11 @@ def associate_newest(
     predicted = predict(smoother, landmarks, cycle)
     any_label = pair_costs(detections.point[rows], detections.covariance[rows], *predicted)
     same_label = compatible(detections.label[rows], state.labels[landmarks])
-    found = associate(np.where(same_label, any_label, np.inf), gates)
-    matched = found.landmark != UNASSOCIATED
-    detections.take(rows[matched], numbers[found.landmark[matched]])
+    landmark, is_new = associate(np.where(same_label, any_label, np.inf), gates)
+    matched = landmark != UNASSOCIATED
+    detections.take(rows[matched], numbers[landmark[matched]])
     explained = (any_label < gates.match).any(axis=1)
-    detections.landmark[rows[~matched & (~found.new | explained)]] = AMBIGUOUS
+    detections.landmark[rows[~matched & (~is_new | explained)]] = AMBIGUOUS
     if explained.any():
         state.vote(detections.label[rows[explained]], numbers[any_label[explained].argmin(axis=1)])
 

@@ -8,12 +8,9 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from threadpoolctl import threadpool_limits
 
 from pathspace_graph.batch.association import insert_drive
-from pathspace_graph.errors import solving
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, huber_loss
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
@@ -39,7 +36,6 @@ from .landmark_association import Gates, find_duplicates
 from .landmark_fixed_lag import LandmarkFixedLag
 from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
 
-Ints = NDArray[np.int64]
 NAME: Final = "landmark-batch"  # the estimator's name on the command line
 MAX_ROUNDS: Final = 10  # all detections are associated anew at most this number of times
 SETTLED: Final = 1e-3  # largest share of the detections that changed their landmark in the last round
@@ -58,10 +54,6 @@ class LandmarkBatch:
         self.noise = known_noise(odometry_sigma)
 
     def solve(self, log: Log) -> BatchRun:
-        with threadpool_limits(limits=1), solving("the batch"):
-            return self._solve(log)
-
-    def _solve(self, log: Log) -> BatchRun:
         system = LandmarkSystem.of_log(log, self.settings, self.noise)
         system, state = start_online(log, system, self.noise)
         system.optimize(state)
@@ -212,13 +204,11 @@ class Reassociation:
         candidates, j = np.unique(landmarks, return_inverse=True)
         table = np.full((len(detected), len(candidates)), np.inf)
         table[i, j] = cost
-        table[~association.compatible(self.detections.label[detected], self.state.labels[candidates])] = (
-            np.inf
-        )
-        found = association.associate(table, self.gates)
-        matched = found.landmark != UNASSOCIATED
-        self.detections.take(detected[matched], self.state.numbers[candidates[found.landmark[matched]]])
-        free[detected] = found.new
+        same_label = association.compatible(self.detections.label[detected], self.state.labels[candidates])
+        table[~same_label] = np.inf
+        landmark, free[detected] = association.associate(table, self.gates)
+        matched = landmark != UNASSOCIATED
+        self.detections.take(detected[matched], self.state.numbers[candidates[landmark[matched]]])
 
     def _nearby_pairs(self) -> tuple[IntArray, IntArray, Array]:
         """Return the detections (k,), ascending, landmarks and distances (m) of pairs in the rough gate."""
@@ -294,23 +284,13 @@ def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: in
     state.keep(~gone)
 
 
-@dataclass(frozen=True, eq=False)
-class LandmarkSolution:
-    trajectory_t: Array  # (n,) stamps of the perception cycles, in s
-    trajectory: Array  # (n, 3) smoothed poses (x, y, theta) in m and rad, map frame; theta is not wrapped
-    landmark_ids: Ints  # (m,) the associations' numbers of all landmarks that were detected, ascending
-    landmarks: Array  # (m, 2) positions of the landmarks in m, map frame
-    covariance: Array | None  # (2m, 2m) of the landmarks in m^2, if it was requested
-    error: float  # half the sum of the squared whitened residuals
-
-
 def solve_landmarks(
-    log: Log, associations: Ints, *, with_covariance: bool = False, settings: MapperSettings | None = None
-) -> LandmarkSolution:
+    log: Log, associations: IntArray, settings: MapperSettings | None = None
+) -> tuple[LandmarkSystem, LandmarkState]:
     """Minimize all squared Mahalanobis distances over poses, calibration and landmarks; no loss is robust.
 
-    associations (R,) holds the landmark of each detection in file order; negative ones are left out, and so
-    are orange cones.
+    associations (R,) holds the number of the landmark of each detection in file order; negative ones are left
+    out, and so are orange cones.
     """
     associations = associations[~np.concatenate([is_orange(cycle) for cycle in log.cycles])]
     settings = settings or MapperSettings()
@@ -318,17 +298,10 @@ def solve_landmarks(
     system = LandmarkSystem.of_log(log, settings, KnownNoise(log.odometry_sigma))
     state = start_oracle(system, associations)
     system.optimize(state)
-    return LandmarkSolution(
-        trajectory_t=system.chain.stamps,
-        trajectory=state.variables.poses.copy(),
-        landmark_ids=state.numbers.astype(np.int64),
-        landmarks=state.landmarks.copy(),
-        covariance=system.eliminated(state).joint(state.keys) if with_covariance else None,
-        error=system.cost(state),
-    )
+    return system, state
 
 
-def start_oracle(system: LandmarkSystem, associations: Ints) -> LandmarkState:
+def start_oracle(system: LandmarkSystem, associations: IntArray) -> LandmarkState:
     """Associate the system's detections with landmarks (R,), and return the state by dead reckoning."""
     detections, rows = system.detections, np.flatnonzero(associations >= 0)
     numbers, first, landmark = np.unique(associations[rows], return_index=True, return_inverse=True)

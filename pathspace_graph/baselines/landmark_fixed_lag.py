@@ -5,7 +5,7 @@ those not seen for long have one joint covariance. So a set of pairs can be test
 accepted pair moves all others (joint compatibility, Neira and Tardos 2001).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -156,8 +156,8 @@ class LandmarkFixedLag:
             recent, old = state.positions(detected), np.flatnonzero(self._old())
             pairs = detect_loop(self.smoother, recent, old, reach)
             if pairs is not None:
-                optimize_loop(self.smoother, pairs)
-                self._merge(pairs.recent, pairs.old)
+                optimize_loop(self.smoother, *pairs)
+                self._merge(*pairs)
                 self.closed, self.smoother.window.exact = True, False
 
     def _merge(self, gone: IntArray, kept: IntArray) -> None:
@@ -201,23 +201,6 @@ class LandmarkFixedLag:
         return vehicle_state(self.smoother)
 
 
-@dataclass(frozen=True, eq=False)
-class LoopPairs:
-    """A hypothesis: pairs of landmarks that are the same cone."""
-
-    recent: IntArray  # (k,) positions of landmarks that were seen lately
-    old: IntArray  # (k,) positions of the landmarks of the beginning that they are
-    distance: float  # squared Mahalanobis distance of all pairs together, with 2 k degrees of freedom
-
-    def score(self, gate: float) -> float:
-        """Return `k gate - d^2`: how much better the pairs explain the detections than new landmarks do."""
-        return len(self.recent) * gate - self.distance
-
-    def overlaps(self, other: "LoopPairs") -> bool:
-        pairs = set(zip(self.recent.tolist(), self.old.tolist(), strict=True))
-        return not pairs.isdisjoint(zip(other.recent.tolist(), other.old.tolist(), strict=True))
-
-
 class JointCompatibility:
     """Tests sets of pairs against the joint Gaussian of some recent and some old landmarks.
 
@@ -251,8 +234,11 @@ class JointCompatibility:
         innovation = mean[i] - mean[len(self.recent) + j]
         return mean - (gain @ innovation).reshape(-1, POINT), covariance - gain @ cross.T
 
-    def grow(self, i: int, j: int, gate: float) -> LoopPairs:
-        """Return a hypothesis that begins with one pair and adds the best pair while that is in the gate."""
+    def grow(self, i: int, j: int, gate: float) -> tuple[list[tuple[int, int]], float]:
+        """Return pairs, and the squared distance of all together: a hypothesis.
+
+        It begins with one pair, and adds the best pair while that is in the gate.
+        """
         mean, covariance, total = self.mean, self.covariance, 0.0
         distances = self.distances(mean, covariance)
         free = np.ones(distances.shape, bool)
@@ -264,14 +250,17 @@ class JointCompatibility:
             mean, covariance = self.conditioned(mean, covariance, i, j)
             distances = np.where(free, self.distances(mean, covariance), np.inf)
             i, j = divmod(int(distances.argmin()), distances.shape[1])
-        index = np.array(chosen, np.intp).reshape(-1, 2)
-        return LoopPairs(self.recent[index[:, 0]], self.old[index[:, 1]], total)
+        return chosen, total
 
 
 def detect_loop(
     smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach: float
-) -> LoopPairs | None:
-    """Return the pairs, within `reach` (m), of the best hypothesis; None if it is not clear or too small."""
+) -> tuple[IntArray, IntArray] | None:
+    """Return pairs (k,) of recent and old landmarks, within `reach` (m), that are one cone each.
+
+    They are those of the best hypothesis, and None if it is not clear or too small. It explains detections
+    better than new landmarks do, by a gate for each pair less the distance of all.
+    """
     points = smoother.map.state.landmarks
     old = old[nearest_within(points[old], points[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
@@ -282,19 +271,21 @@ def detect_loop(
     if len(seeds) == 0:
         return None
     hypotheses = [test.grow(int(i), int(j), gate) for i, j in seeds]
-    best = max(hypotheses, key=lambda pairs: pairs.score(gate))
-    others = [pairs.score(gate) for pairs in hypotheses if not pairs.overlaps(best)]
-    if best.score(gate) - max(others, default=0.0) < MIN_LEAD * gate:
+    scores = [len(pairs) * gate - distance for pairs, distance in hypotheses]
+    pairs, distance = hypotheses[int(np.argmax(scores))]
+    others = [s for s, (other, _) in zip(scores, hypotheses, strict=True) if set(other).isdisjoint(pairs)]
+    if max(scores) - max(others, default=0.0) < MIN_LEAD * gate:
         return None
-    labels = smoother.map.state.labels[best.recent]
+    i, j = np.array(pairs, np.intp).T
+    labels = smoother.map.state.labels[recent[i]]
     enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
     if not enough or len(labels) < MIN_PAIRS:
         return None
     joint = chi2_quantile(smoother.map.settings.landmark.create, POINT * len(labels))
-    return best if best.distance < joint else None
+    return (recent[i], old[j]) if distance < joint else None
 
 
-def optimize_loop(smoother: LandmarkSmoother, pairs: LoopPairs) -> None:
-    """Solve the whole loop with the pairs held together; merge them later."""
-    smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([pairs.recent, pairs.old])]
+def optimize_loop(smoother: LandmarkSmoother, recent: IntArray, old: IntArray) -> None:
+    """Solve the whole loop with pairs (k,) held together; merge them later."""
+    smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([recent, old])]
     smoother.solve_loop(smoother.map.settings.closing.iterations, None)

@@ -19,26 +19,16 @@ from pathspace_graph.settings.batch import AssociationSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION
 
-DENSITY_STEP: Final = 0.1
-"""Step at which the density of detections along a curve is sampled (m); cones are its peaks."""
-SEPARATION: Final = 0.6
-"""Least distance of two cones along a curve over `growth.merge_radius`: inner curves of bends are shorter."""
-BANDWIDTH: Final = 0.4
-"""Standard deviation of the Gaussian that smooths the density, as a share of that least distance."""
-SHARP: Final = 0.6
-"""Largest standard deviation of detections that say where a cone stands, m."""
-SHARP_SHARE: Final = 0.1
-"""Share of so certain detections below which all of them say it."""
-MIN_SHARE: Final = 0.1
-"""Least size of a cone's cluster as a share of the median cluster's."""
-MIN_SHARE_BESIDE: Final = 0.3
-"""`MIN_SHARE` of a cluster beside a curve, whose detections aren't used."""
-MIN_CONES: Final = 4
-"""Least number of cones of a curve, below which none is removed."""
-FOLD_COSINE: Final = 0.5
-"""The row of cones folds back at a cone where the cosine of its turn is less than minus this value."""
-FOLD_DISTANCE: Final = 1.5
-"""Distance to its nearer neighbour below which a cone at which the row folds back is a duplicate (m)."""
+DENSITY_STEP: Final = 0.1  # step at which the density of detections along a curve is sampled (m)
+SEPARATION: Final = 0.6  # least distance of two cones along a curve, over `growth.merge_radius`
+BANDWIDTH: Final = 0.4  # of the Gaussian that smooths the density, over that least distance
+SHARP: Final = 0.6  # largest standard deviation of detections that say where a cone stands, m
+SHARP_SHARE: Final = 0.1  # share of so certain detections below which all of them say it
+MIN_SHARE: Final = 0.1  # least size of a cone's cluster as a share of the median cluster's
+MIN_SHARE_BESIDE: Final = 0.3  # `MIN_SHARE` of a cluster beside a curve, whose detections aren't used
+MIN_CONES: Final = 4  # least number of cones of a curve, below which none is removed
+FOLD_COSINE: Final = 0.5  # a row of cones folds back where the cosine of its turn is less than minus this
+FOLD_DISTANCE: Final = 1.5  # from its nearer neighbour (m), below which a cone at such a turn is a duplicate
 
 
 # --- poses along the curves ------------------------------------------------------------------------------
@@ -181,12 +171,9 @@ def _nearest_in_view(
 class Cones:
     """Cones of a boundary in the order of travel."""
 
-    points: Array
-    """Weighted means (k, 2) of the cones' detections in m, map frame."""
-    u: Array
-    """Parameters (k,) along the curve or path (m)."""
-    count: IntArray
-    """Numbers (k,) of detections."""
+    points: Array  # weighted means (k, 2) of the cones' detections in m, map frame
+    u: Array  # parameters (k,) along the curve or path (m)
+    count: IntArray  # numbers (k,) of detections
 
     def where(self, chosen: BoolArray | IntArray) -> "Cones":
         """Return the chosen cones, in the order in which they are chosen."""

@@ -41,24 +41,17 @@ from .simplification import associate_again, boundary_of, own_settings, scatter_
 from .start import Recurrence, start_odometry
 from .system import BatchSystem, Biweight, Evaluation, curve_gauge
 
-USED_AGAIN: Final = 0.85
-"""Least share of the detections after the first lap on a closed result, over that of the first lap."""
-MISFIT: Final = 1.5
-"""Most distance of detections after the first lap from its curves, in sigmas (root mean square)."""
-GAP: Final = 25.0
-"""Longest stretch of a boundary without detections on it (m)."""
-OVERLAP: Final = 15.0
-"""Least length that has been driven again (m)."""
+USED_AGAIN: Final = 0.85  # least share of the detections used after the first lap, over that of the first lap
+MISFIT: Final = 1.5  # most root mean square distance of detections after the first lap (sigmas)
+GAP: Final = 25.0  # longest stretch of a boundary without detections on it (m)
+OVERLAP: Final = 15.0  # least length that has been driven again (m)
 SIGMA: Final = 0.3
 """Largest standard deviation by which later laps' detections hold their drive beside the curves (m)."""
-WIDER: Final = 2.5
-"""Largest ratio of a boundary point's distance from the road driven to the drive's distance beside it."""
-MOSTLY: Final = 95.0
-"""Percentile of the poses' distances: the drive may begin or end off the track."""
+WIDER: Final = 2.5  # most ratio of a boundary point's distance from the drive to the drive's beside it
+MOSTLY: Final = 95.0  # percentile of the poses' distances: the drive may begin or end off the track
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)
 """A lap that begins at the online map, so that its batch is in time."""
-FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)
-"""A lap that begins at odometry."""
+FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)  # a lap that begins at odometry
 
 
 # --- the lap ---------------------------------------------------------------------------------------------
@@ -68,28 +61,20 @@ FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)
 class ClosedMap:
     """A map that has just been closed, and the poses beside it."""
 
-    splines: dict[int, BSpline]
-    """Closed curves by label, map frame."""
-    poses: Array
-    """(P, 3) Poses of all cycles, map frame."""
-    calibration: Array
-    """(2,) or (7,) Calibration of the odometry, and of the sensor where it is estimated."""
+    splines: dict[int, BSpline]  # closed curves by label, map frame
+    poses: Array  # (P, 3) poses of all cycles, map frame
+    calibration: Array  # (2,) or (7,) calibration of the odometry, and of the sensor where it is estimated
 
 
 @dataclass(frozen=True, eq=False)
 class OpenLap:
     """Everything measured from the start to the closing cycle, and what to begin with."""
 
-    settings: MapperSettings
-    """Settings of the online mapper."""
-    chain: LogOdometry
-    """Odometry between all cycles."""
-    detections: DetectionTable
-    """Detections of all cycles; their associations are found anew."""
-    first_kept: int
-    """The poses from this cycle on stay variables of the window."""
-    start: ClosedMap | Recurrence
-    """Start of the search: a map, or odometry alone, where the path driven recurs after a lap."""
+    settings: MapperSettings  # settings of the online mapper
+    chain: LogOdometry  # odometry between all cycles
+    detections: DetectionTable  # detections of all cycles; their associations are found anew
+    first_kept: int  # the poses from this cycle on stay variables of the window
+    start: ClosedMap | Recurrence  # a map, or odometry alone, where the path driven recurs after a lap
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,26 +85,16 @@ class LapMarginal:
     """
 
     convergence: Convergence
-    splines: dict[int, BSpline]
-    """Simplified closed curves by label, map frame."""
-    calibration: Array
-    """(2,) or (7,) Calibration of odometry and sensor at the optimum."""
-    poses: Array
-    """(P, 3) Poses of all cycles of the lap, map frame."""
-    first_kept: int
-    """Cycle before whose pose all measurements are in the marginal, and no later ones."""
-    mean: Array
-    """(n,) Mean of the marginal."""
-    information: Array
-    """(n, n) Its information, the inverse of its covariance."""
-    scatter: dict[int, Array]
-    """Standard deviation (m,) of each boundary's cones about the curve at each control point (m)."""
-    cones: dict[int, Array]
-    """Parameters (k,) of each boundary's detected cones on its curve (m)."""
-    seconds: float
-    """Wall time (s)."""
-    objection: str = ""
-    """What speaks against the map; empty where nothing does."""
+    splines: dict[int, BSpline]  # simplified closed curves by label, map frame
+    calibration: Array  # (2,) or (7,) calibration of odometry and sensor at the optimum
+    poses: Array  # (P, 3) poses of all cycles of the lap, map frame
+    first_kept: int  # cycle before whose pose all measurements are in the marginal, and no later ones
+    mean: Array  # (n,) mean of the marginal
+    information: Array  # (n, n) its information, the inverse of its covariance
+    scatter: dict[int, Array]  # sigma (m,) of each boundary's cones about the curve at each control point (m)
+    cones: dict[int, Array]  # parameters (k,) of each boundary's detected cones on its curve (m)
+    seconds: float  # wall time (s)
+    objection: str = ""  # what speaks against the map; empty where nothing does
 
 
 def solve_lap(lap: OpenLap) -> LapMarginal | None:
@@ -218,18 +193,12 @@ def is_worth_trying(recurrence: Recurrence, settings: MapperSettings) -> bool:
 class Evidence:
     """What speaks for or against a closed result."""
 
-    closed: bool
-    """Whether both boundaries are closed."""
-    used: float
-    """Share of the coloured detections of the first lap that lies on the curves."""
-    used_again: float
-    """Share of those after the first lap."""
-    misfit: float
-    """Root mean square distance of those from their curves, in sigmas."""
-    gap: float
-    """Longest stretch of a boundary on which no detection lies (m)."""
-    overlap: float
-    """Length over which the boundary that was driven less far has been driven again (m)."""
+    closed: bool  # whether both boundaries are closed
+    used: float  # share of the coloured detections of the first lap that lies on the curves
+    used_again: float  # share of those after the first lap
+    misfit: float  # root mean square distance of those from their curves, in sigmas
+    gap: float  # longest stretch of a boundary on which no detection lies (m)
+    overlap: float  # length over which the boundary that was driven less far has been driven again (m)
     sigma: float
     """Standard deviation in the worst direction by which the detections after the first lap hold their drive
     in place, beside the curves (m). It is infinite on a straight, whose stretches all agree."""

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.errors import SettingsError, solving
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.noise import KnownNoise
@@ -53,22 +53,14 @@ from .simplification import Scatter, map_block, own_settings, scatter_of_cones, 
 from .start import CurveMapper, find_recurrence, start_odometry, start_online
 from .system import BatchSystem, Biweight, CurveGauge, Evaluation
 
-ROOM: Final = 4.0
-"""Distance from its foot points in which a factor searches them (m along the curve)."""
-HALVINGS: Final = 6
-"""Most halvings of the room while another foot point in it is nearer, as in a bend about a detection."""
-SAME: Final = 1e-3
-"""Distance below which two foot points are the same (m along the curve)."""
-STRETCH: Final = 25.0
-"""Length of the stretches of the drive by which a map is judged (m)."""
-FEW: Final = 20
-"""Number of detections below which a stretch says nothing."""
-USUALLY: Final = 80.0
-"""Percentile of the stretches' shares of explained detections that is usual for a log."""
-POOR: Final = 0.6
-"""Share of the usual one below which a stretch is poorly mapped; those of a good map are above 0.9."""
-MOST_POOR: Final = 1.0 / 3.0
-"""Most of the drive that may be so: the way to a track and from it has no boundaries."""
+ROOM: Final = 4.0  # distance from its foot points in which a factor searches them (m along the curve)
+HALVINGS: Final = 6  # most halvings of the room while another foot point in it is nearer, as in a bend
+SAME: Final = 1e-3  # distance below which two foot points are the same (m along the curve)
+STRETCH: Final = 25.0  # length of the stretches of the drive by which a map is judged (m)
+FEW: Final = 20  # number of detections below which a stretch says nothing
+USUALLY: Final = 80.0  # percentile of the stretches' shares of explained detections that is usual for a log
+POOR: Final = 0.6  # share of the usual one below which a stretch is poorly mapped; good maps have 0.9
+MOST_POOR: Final = 1.0 / 3.0  # most of the drive that may be so: ways to a track have no boundaries
 
 
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
@@ -201,8 +193,7 @@ def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) ->
     return room
 
 
-NAME: Final = "spline"
-"""Name of the estimator on the command line."""
+NAME: Final = "spline"  # name of the estimator on the command line
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -272,10 +263,6 @@ class BatchMapper:
         By default `batch.start` decides. `on_round` is called after each round. SettingsError if there is no
         online mapper to begin with, and SolveError where the log leaves no way to an optimum.
         """
-        with threadpool_limits(limits=1), solving("the batch"):
-            return self._solve(log, start or self.settings.batch.start, on_round)
-
-    def _solve(self, log: Log, start: Start, on_round: Callable[[], None] | None) -> BatchResult:
         watch = Stopwatch()
         judged = judge_log(log, self.noise, own_settings(self.settings))
         settings = judged.settings
@@ -283,7 +270,7 @@ class BatchMapper:
         system = BatchSystem(detections, chain, settings, Biweight(LOOSE_GATE))
         optimizer = Optimizer(system, on_round=on_round)
         watch.lap("integrate")
-        if start == "odometry":
+        if (start or self.settings.batch.start) == "odometry":
             online = None
             at, convergence = find_optimum_from_odometry(optimizer)
         else:

@@ -20,26 +20,17 @@ from .association import associate, cone_counts, locate_poses
 from .simplification import reknot
 from .system import BatchSystem, Biweight, Evaluation, moved
 
-LOOSE_GATE: Final = 8.0
-"""Gate of the first round (sigmas)."""
-GATE_FACTOR: Final = 0.7
-"""Factor of the gate from each round to the next, down to `batch.gate`."""
-SEARCH: Final = 20
-"""Rounds in which associations are found anew."""
-SETTLE: Final = 8
-"""Most refinements of the foot points before a step."""
-POSE_STEPS: Final = 3
-"""Gauss-Newton steps of the poses alone at first, while the map of the start is held."""
-ROUGH_TOLERANCE: Final = 8.0
-"""Factor of the tolerances in the first optimization, on knots that follow the start."""
-TOLERANCE_COST: Final = 1e-5
-"""Largest |cost_before - cost_after| over a round at convergence, as a share of the cost."""
+LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
+GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
+SEARCH: Final = 20  # rounds in which associations are found anew
+SETTLE: Final = 8  # most refinements of the foot points before a step
+POSE_STEPS: Final = 3  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
+ROUGH_TOLERANCE: Final = 8.0  # factor of the tolerances in the first optimization
+TOLERANCE_COST: Final = 1e-5  # most |cost_before - cost_after| over a round at convergence, over the cost
 TOLERANCE_CURVE: Final = 2e-3
 """Largest move of a point of a curve across it in a round then, as seen from its poses (m)."""
-TOLERANCE_DECREASE: Final = 5e-3
-"""Largest decrease of the cost by an undamped step then; a step of one sigma decreases it by 1/2."""
-CURVE_SAMPLES: Final = 2
-"""Points in each knot interval at which the movement of a curve is measured."""
+TOLERANCE_DECREASE: Final = 5e-3  # most decrease of the cost by an undamped step then; one sigma has 1/2
+CURVE_SAMPLES: Final = 2  # points in each knot interval at which the movement of a curve is measured
 SHARES: Final = (0.3, 0.97)
 """Sizes of a step's share of the one before between which it becomes the sum of all that would follow."""
 
@@ -67,14 +58,10 @@ class Convergence:
 class Effort:
     """Length of the search for the optimum of a log."""
 
-    rough_rounds: int = 24
-    """Most rounds of the first optimization, on knots that follow the start."""
-    rounds: int = 80
-    """Most rounds of a later one; one that uses them all is reported as not converged."""
-    knot_passes: int = 2
-    """Most later ones; there is more than one only if the number of cones has changed."""
-    tolerance: float = 1.0
-    """Factor of every tolerance."""
+    rough_rounds: int = 24  # most rounds of the first optimization, on knots that follow the start
+    rounds: int = 80  # most rounds of a later one; one that uses them all is reported as not converged
+    knot_passes: int = 2  # most later ones; there is more than one only if the number of cones has changed
+    tolerance: float = 1.0  # factor of every tolerance
 
 
 class Optimizer:
@@ -90,8 +77,7 @@ class Optimizer:
         self.system = system
         self.settings = system.settings.batch
         self.effort = effort or Effort()
-        self.steps = 0
-        """Steps that were tried."""
+        self.steps = 0  # steps that were tried
         self._on_round = on_round
         self._damping = damping or Damping()
         self._last_step: Array | None = None  # of the map and the calibration

@@ -3,7 +3,6 @@
 Simplification: the optimum's curves on few knots, their covariance, and how far cones lie from them.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
@@ -14,7 +13,6 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.graph.variables import CONTROL_LETTERS, POINT, Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.batch import BatchSettings, FitSettings
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
@@ -22,14 +20,11 @@ from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 
 from .association import MIN_CONES, associate, cones_of_curve, first_parameter, locate_poses
 
-MIN_SIZE_SHARE: Final = 0.6
-"""Least share of the largest number of control points that the map's curves are tried with."""
+MIN_SIZE_SHARE: Final = 0.6  # least share of the largest number of control points that is tried
 ALIKE: Final = (3.0, 0.01)
 """Parameters of two curves through the same cones differ by less than `a + b L` (m), with L their length."""
-FOLDS: Final = 4
-"""Groups of the cross-validation, dealt in turn: the neighbours of a cone left out are always there."""
-FOOT_ROOM: Final = 1.5
-"""Distance from its own place in which the foot point of a cone is searched (m along the curve)."""
+FOLDS: Final = 4  # groups of the cross-validation, dealt in turn, so that the neighbours of a cone are there
+FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched (m along the curve)
 
 
 # --- knots -----------------------------------------------------------------------------------------------
@@ -41,26 +36,18 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
     `dense` places so many knots that the curves meet the cones; else they are as few as the map has.
     """
     state = state.copy()
-    cones = {label: cones_of_curve(state, detections, label, settings) for label in state.boundaries}
-    share = size_share({label: len(found.u) for label, found in cones.items()}, settings.batch)
     for label, boundary in list(state.boundaries.items()):
-        points = cones[label].points
+        points = cones_of_curve(state, detections, label, settings).points
         if len(points) < MIN_CONES:
             continue
         if dense:
             beyond = 0.0 if boundary.periodic else settings.growth.merge_radius
             points, share_of = extended(points, beyond), (settings.batch.dense_share, 1.0)
         else:
-            share_of = share, MIN_SIZE_SHARE
+            share_of = settings.batch.size_share, MIN_SIZE_SHARE
         spline = fit_through(points, boundary.periodic, settings, *share_of)
         state.replace_boundary(label, *boundary_of(spline, settings))
     return state
-
-
-def size_share(cones: Mapping[int, int], batch: BatchSettings) -> float:
-    """Return the control points per cone: the settings' share, or their size over all cones."""
-    total = sum(cones.values())
-    return batch.size_share if batch.size is None or total == 0 else batch.size / total
 
 
 def fit_through(
@@ -75,9 +62,9 @@ def fit_through(
     most = max(smallest, int(share * len(points)))
     if periodic:
         points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
-    fit = FitSettings(degree=settings.spline.degree)
-    chosen = chosen_breaks(points, periodic, fit, max(smallest, int(least_share * most)), most)
-    return fit_spline(points, chosen.size, periodic, fit, chosen.breaks)
+    degree = settings.spline.degree
+    chosen = chosen_breaks(points, periodic, degree, max(smallest, int(least_share * most)), most)
+    return fit_spline(points, chosen.size, periodic, degree, chosen.breaks)
 
 
 def extended(points: Array, beyond: float) -> Array:
@@ -193,14 +180,10 @@ class Scatter:
 
     LENGTHS: ClassVar = {"seen": 1, "unseen": 1, "places": 1, "lengths": 1}
 
-    seen: float
-    """Root mean square distance of the detected cones from the curves (m)."""
-    unseen: float
-    """Root mean square distance of the same cones from curves that are fitted without them (m)."""
-    places: dict[int, Array]
-    """Parameters (k,) of the detected cones of each boundary (m)."""
-    lengths: dict[int, float]
-    """Length of each closed curve in units of its parameter, else infinity."""
+    seen: float  # root mean square distance of the detected cones from the curves (m)
+    unseen: float  # root mean square distance of the same cones from curves that are fitted without them (m)
+    places: dict[int, Array]  # parameters (k,) of the detected cones of each boundary (m)
+    lengths: dict[int, float]  # length of each closed curve in units of its parameter, else infinity
 
     def sigma(self, label: int, u: Array) -> Array:
         """Return the standard deviation (m,) of the scatter at parameters u (m,) of a boundary, in m."""

@@ -36,10 +36,8 @@ from .simplification import boundary_of, exact_settings, fit_through
 
 ComplexArray = NDArray[np.complex128]
 
-PROFILE_STEP: Final = 0.5
-"""Step at which the path driven is sampled (m)."""
-SMOOTHING: Final = 3.0
-"""Length over which the curvature is averaged (m)."""
+PROFILE_STEP: Final = 0.5  # step at which the path driven is sampled (m)
+SMOOTHING: Final = 3.0  # length over which the curvature is averaged (m)
 CORRELATION_SHARE: Final = 0.8
 """Least correlation of a lap's lag as a share of the largest one; a lap is about the shortest such lag."""
 RECURS: Final = 0.7
@@ -47,16 +45,11 @@ RECURS: Final = 0.7
 it is 0.56 at most after one of them."""
 MIN_OVERLAP: Final = 20.0
 """Least length of the path after a lap (m): over less, straights agree with straights."""
-REFERENCE_STEP: Final = 8.0
-"""Distance of the reference poses that every lap passes (m)."""
-LAP_SIGMAS: Final = np.array([1.5, 1.5, 0.15])
-"""Standard deviations of a lap's pose about the reference pose that it passes (m, m, rad)."""
-ALIGN_STEPS: Final = 8
-"""Most Gauss-Newton steps that bring the laps together."""
-ALIGN_TOLERANCE: Final = 1e-6
-"""Largest move of a step at which they are together (m, rad)."""
-MAX_LATERAL: Final = 15.0
-"""Distance from the driven path within which a boundary has detections (m)."""
+REFERENCE_STEP: Final = 8.0  # distance of the reference poses that every lap passes (m)
+LAP_SIGMAS: Final = np.array([1.5, 1.5, 0.15])  # of a lap's pose about a reference pose (m, m, rad)
+ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the laps together
+ALIGN_TOLERANCE: Final = 1e-6  # largest move of a step at which they are together (m, rad)
+MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
 
 
 # --- from an online run ----------------------------------------------------------------------------------
@@ -66,27 +59,14 @@ class CurveMapper(OnlineEstimator, Protocol):
     """An online estimator with curves, such as `FixedLagMapper`, with whose map the batch can begin."""
 
     @property
-    def boundaries(self) -> dict[int, Boundary]:
-        """Return the curves by label, without their control points."""
-
+    def boundaries(self) -> dict[int, Boundary]: ...
     @property
-    def calibrations(self) -> Array:
-        """Return the calibration of the odometry (2,), or of odometry and sensor (7,)."""
-
+    def calibrations(self) -> Array: ...
     @property
-    def closed(self) -> bool:
-        """Return whether the loop has closed."""
-
-    def control_points(self, label: int) -> Array:
-        """Return the control points (m, 2) of a boundary in m, map frame."""
-
+    def corrected_poses(self) -> Array: ...
     @property
-    def corrected_poses(self) -> Array:
-        """Return the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
-
-    @property
-    def revisits(self) -> tuple[Revisit, ...]:
-        """Return the revisits of the drive, which an open map is optimized with."""
+    def revisits(self) -> tuple[Revisit, ...]: ...
+    def control_points(self, label: int) -> Array: ...
 
 
 def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
@@ -116,14 +96,10 @@ def unwrap(poses: Array) -> Array:
 class Recurrence:
     """Length of the path driven, and after which length it recurs."""
 
-    driven: Array
-    """Path lengths (P,) from the first pose to each pose (m)."""
-    lap: float
-    """Path length of a lap (m), infinite where the path doesn't recur."""
-    turn: float
-    """Change of the heading in a lap, by the odometry (rad)."""
-    correlation: float
-    """How well the curvature agrees with itself a lap later, 1 where it is the same."""
+    driven: Array  # path lengths (P,) from the first pose to each pose (m)
+    lap: float  # path length of a lap (m), infinite where the path doesn't recur
+    turn: float  # change of the heading in a lap, by the odometry (rad)
+    correlation: float  # how well the curvature agrees with itself a lap later, 1 where it is the same
 
     @property
     def recurs(self) -> bool:
@@ -147,10 +123,11 @@ def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
     is the best within `closing.radius` after it.
     """
     closing, driven = settings.closing, path_lengths(poses)
-    profile = profile_of(poses, driven)
+    s = np.arange(0.0, driven[-1], PROFILE_STEP)
+    x, y, heading = (np.interp(s, driven, poses[:, k]) for k in range(POSE))
     first, last = int(closing.min_path / PROFILE_STEP), int(MIN_OVERLAP / PROFILE_STEP)
-    lags = np.arange(first, len(profile.heading) - last)
-    scores = profile.correlations(lags, closing) if len(lags) else np.zeros(0)
+    lags = np.arange(first, len(s) - last)
+    scores = correlations(x + 1j * y, heading, lags, closing) if len(lags) else np.zeros(0)
     if not scores.max(initial=-np.inf) >= RECURS:
         return Recurrence(driven, np.inf, 0.0, 0.0)
     best = int(np.argmax(scores >= CORRELATION_SHARE * scores.max()))
@@ -158,45 +135,27 @@ def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
     while (step := int(np.argmax(scores[best : best + reach]))) > 0:
         best += step
     lag = int(lags[best])
-    turn = float(np.median(profile.heading[lag:] - profile.heading[:-lag]))
+    turn = float(np.median(heading[lag:] - heading[:-lag]))
     return Recurrence(driven, lag * PROFILE_STEP, turn, float(scores[best]))
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """The path driven, sampled at steps of PROFILE_STEP along it."""
+def correlations(place: ComplexArray, heading: Array, lags: IntArray, settings: ClosingSettings) -> Array:
+    """Return how well the curvature of a path agrees with itself each of the lags (l,) later, in samples.
 
-    position: Array
-    """Positions (n, 2) in m, in the frame of the poses."""
-    heading: Array
-    """Headings (n,) in rad, not wrapped."""
-    curvature: Array
-    """Averaged curvatures (n,) in 1/m."""
-
-    def correlations(self, lags: IntArray, settings: ClosingSettings) -> Array:
-        """Return how well the curvature agrees with itself each of the lags (l,) later, in samples.
-
-        `1 - mean((a - b)^2) / (mean(a^2) + mean(b^2))`, and -inf where the path isn't back at about the same
-        place and heading, by the limits of a loop closure. The sums come from a Fourier transform.
-        """
-        off = self.position - self.position.mean(axis=0)
-        place, curvature = off[:, 0] + 1j * off[:, 1], self.curvature.astype(complex)
-        square = _mean_square_difference(place, lags)
-        along = _mean_products(np.exp(1j * self.heading), lags).real
-        radius = settings.radius + settings.drift * lags * PROFILE_STEP
-        power = np.maximum(_mean_squares(curvature, lags), np.finfo(float).tiny)
-        agreement = 1.0 - _mean_square_difference(curvature, lags) / power
-        back = (square < radius**2) & (along > np.cos(HEADING))
-        return np.where(back, agreement, -np.inf)
-
-
-def profile_of(poses: Array, driven: Array) -> Profile:
-    """Return the path through poses (P, 3) with path lengths (P,), sampled at equal steps."""
-    s = np.arange(0.0, driven[-1], PROFILE_STEP)
-    x, y, heading = (np.interp(s, driven, poses[:, k]) for k in range(POSE))
-    half, number = max(int(0.5 * SMOOTHING / PROFILE_STEP), 1), np.arange(len(s))
-    later, before = np.minimum(number + half, len(s) - 1), np.maximum(number - half, 0)
-    return Profile(np.column_stack([x, y]), heading, (heading[later] - heading[before]) / SMOOTHING)
+    `1 - mean((a - b)^2) / (mean(a^2) + mean(b^2))`, and -inf where the path isn't back at about the same
+    place and heading, by the limits of a loop closure. The path is sampled at steps of `PROFILE_STEP`: places
+    x + i y (n,) and headings (n,), which aren't wrapped. The sums come from a Fourier transform.
+    """
+    half, number = max(int(0.5 * SMOOTHING / PROFILE_STEP), 1), np.arange(len(heading))
+    later, before = np.minimum(number + half, len(heading) - 1), np.maximum(number - half, 0)
+    curvature = ((heading[later] - heading[before]) / SMOOTHING).astype(complex)
+    square = _mean_square_difference(place - place.mean(), lags)
+    along = _mean_products(np.exp(1j * heading), lags).real
+    radius = settings.radius + settings.drift * lags * PROFILE_STEP
+    power = np.maximum(_mean_squares(curvature, lags), np.finfo(float).tiny)
+    agreement = 1.0 - _mean_square_difference(curvature, lags) / power
+    back = (square < radius**2) & (along > np.cos(HEADING))
+    return np.where(back, agreement, -np.inf)
 
 
 def _mean_square_difference(values: ComplexArray, lags: IntArray) -> Array:
@@ -242,20 +201,27 @@ def start_odometry(
 def align_laps(chain: LogOdometry, recurrence: Recurrence) -> tuple[Array, Array]:
     """Return the poses (P, 3) and the calibration (2,) at which every lap passes the same reference poses.
 
-    Gauss-Newton on the odometry and the lap correspondences, from the yaw-rate bias by which the heading
-    changes by whole turns in a lap. The keys of the reference poses, also unknown, follow the last cycle's.
+    Gauss-Newton on the odometry and the residuals `(x_k - reference_k - (0, 0, turns_k)) / sigmas` of poses
+    k that pass a reference pose, from the yaw-rate bias by which the heading changes by whole turns in a lap.
+    The keys of the reference poses, also unknown, follow the last cycle's.
     """
     seconds = (chain.stamps[-1] - chain.stamps[0]) / (recurrence.driven[-1] / recurrence.lap)
     calibration = np.array([0.0, (recurrence.turn - recurrence.whole_turn) / seconds])
-    correspondences, poses = lap_correspondences(recurrence), chain.dead_reckoned(calibration)
-    poses, variables = np.concatenate([poses, correspondences.references_at(poses)]), Variables()
+    poses, (cycles, reference, turns) = chain.dead_reckoned(calibration), lap_correspondences(recurrence)
+    passed = np.unique(reference, return_index=True)[1]  # by the first pose that passes each
+    references = poses[cycles[passed]] - turns[passed, None] * [0.0, 0.0, 1.0]
+    poses, variables = np.concatenate([poses, references]), Variables()
     variables.insert(np.array([CALIBRATION_KEY]), calibration)
     variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
     count = len(chain)
+    keys = np.repeat(pose_keys(np.column_stack([cycles, count + reference])), POSE, axis=0)
+    jacobian = np.concatenate([np.diag(1.0 / LAP_SIGMAS), np.diag(-1.0 / LAP_SIGMAS)], axis=1)
+    jacobian, owner = np.tile(jacobian, (len(cycles), 1)), np.repeat(owners(cycles), POSE)
     for _ in range(ALIGN_STEPS):
         poses, calibration = variables.poses[:count], variables.calibration
-        rows = chain.rows(poses, calibration)
-        rows.append(correspondences.rows(poses, variables.poses[count:]))
+        off = poses[cycles] - variables.poses[count:][reference]
+        off[:, 2] -= turns
+        rows = [*chain.rows(poses, calibration), Rows(keys, jacobian, (off / LAP_SIGMAS).ravel(), owner)]
         step = Elimination(linear_graph(rows, variables), variables.layout).step(np.zeros(CALIBRATION_SIZE))
         variables.values = variables.values + step
         if np.abs(step).max() < ALIGN_TOLERANCE:
@@ -263,38 +229,11 @@ def align_laps(chain: LogOdometry, recurrence: Recurrence) -> tuple[Array, Array
     return variables.poses[:count], variables.calibration
 
 
-@dataclass(frozen=True, eq=False)
-class LapCorrespondences:
-    """Residuals `(x_k - reference_k - (0, 0, turns_k)) / sigmas` of poses k that pass a reference pose."""
+def lap_correspondences(recurrence: Recurrence) -> tuple[IntArray, IntArray, Array]:
+    """Return the cycles (k,) nearest to where each lap passes each reference pose, and its number (k,).
 
-    cycles: IntArray
-    """Perception cycles (k,) of the poses."""
-    reference: IntArray
-    """Numbers (k,) of the reference poses that they pass."""
-    turns: Array
-    """Change of the heading (k,) in the whole laps before each pose (rad)."""
-
-    def references_at(self, poses: Array) -> Array:
-        """Return the reference poses (c, 3): the first of the poses (P, 3) that passes each of them."""
-        first = np.unique(self.reference, return_index=True)[1]
-        return poses[self.cycles[first]] - self.turns[first, None] * [0.0, 0.0, 1.0]
-
-    def rows(self, poses: Array, references: Array) -> Rows:
-        """Return whitened rows at poses (P, 3) and reference poses (c, 3), whose keys follow the poses'."""
-        off = poses[self.cycles] - references[self.reference]
-        off[:, 2] -= self.turns
-        keys = pose_keys(np.column_stack([self.cycles, len(poses) + self.reference]))
-        jacobian = np.concatenate([np.diag(1.0 / LAP_SIGMAS), np.diag(-1.0 / LAP_SIGMAS)], axis=1)
-        return Rows(
-            keys=np.repeat(keys, POSE, axis=0),
-            jacobian=np.tile(jacobian, (len(off), 1)),
-            residual=(off / LAP_SIGMAS).ravel(),
-            owner=np.repeat(owners(self.cycles), POSE),
-        )
-
-
-def lap_correspondences(recurrence: Recurrence) -> LapCorrespondences:
-    """Return the correspondences of the poses nearest to where each lap passes each reference pose."""
+    The change of the heading (k,) in the whole laps before is returned, too (rad).
+    """
     count = max(int(np.ceil(recurrence.lap / REFERENCE_STEP)), 1)
     places = recurrence.driven / recurrence.lap * count
     whole = np.arange(np.ceil(places[0]), np.floor(places[-1]) + 1.0)
@@ -303,7 +242,7 @@ def lap_correspondences(recurrence: Recurrence) -> LapCorrespondences:
     cycles = np.unique(np.where(nearer, after - 1, after))
     reference = np.mod(np.round(places[cycles]).astype(np.intp), count)
     turns = recurrence.whole_turn * np.round((places[cycles] - reference) / count)
-    return LapCorrespondences(cycles, reference, turns)
+    return cycles, reference, turns
 
 
 def _begin_boundary(

@@ -23,8 +23,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import headings
 
-POINTS_A_FACTOR: Final = 8
-"""Neighbouring control points in one factor of their anchors; it changes the speed, not the result."""
+POINTS_A_FACTOR: Final = 8  # neighbouring control points in one factor of their anchors; only for speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,21 +36,13 @@ class CurveGauge:
     """
 
     label: int
-    keys: IntArray
-    """Keys (m,) of the control points."""
-    cycle: IntArray
-    """Perception cycles (m,) of the poses beside them."""
-    ahead: Array
-    """Distances (m,) of the control points ahead of their poses (m)."""
-    sigma: float
-    """Standard deviation of that distance (m)."""
-    smoothness: Array
-    """D (r, m)."""
-    sigma_smoothness: float
-    """Standard deviation of a second difference (m)."""
-    sigma_anchor: float
-    """Standard deviation (m) that holds each control point where it is linearized. The anchor has no
-    gradient, so it isn't part of the cost."""
+    keys: IntArray  # keys (m,) of the control points
+    cycle: IntArray  # perception cycles (m,) of the poses beside them
+    ahead: Array  # distances (m,) of the control points ahead of their poses (m)
+    sigma: float  # standard deviation of that distance (m)
+    smoothness: Array  # D (r, m)
+    sigma_smoothness: float  # standard deviation of a second difference (m)
+    sigma_anchor: float  # that holds each control point where it is linearized (m), without any cost
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
         """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives."""
@@ -187,8 +178,7 @@ class Biweight:
     A detection at the gate has no weight, so nothing moves when one more or one less is used.
     """
 
-    gate: float
-    """Gate g in sigmas."""
+    gate: float  # gate g in sigmas
 
     def loss(self, whitened: Array) -> Array:
         """Return `rho(z)` (m,) of whitened residuals z (m,)."""
@@ -215,16 +205,12 @@ class Projected:
     past a detection.
     """
 
-    rows: IntArray
-    """Rows (m,) of the detections in their table."""
+    rows: IntArray  # rows (m,) of the detections in their table
     foot: FootPoints
     projection: ProjectionRows
-    sigma: Array
-    """Standard deviations (m,) across the curve in m."""
-    inside: BoolArray
-    """Whether each foot point (m,) was inside the curve when the round began."""
-    by: SensorRows
-    """Derivatives of the residuals by the calibration of the sensor."""
+    sigma: Array  # standard deviations (m,) across the curve in m
+    inside: BoolArray  # whether each foot point (m,) was inside the curve when the round began
+    by: SensorRows  # derivatives of the residuals by the calibration of the sensor
 
     @property
     def whitened(self) -> Array:
@@ -237,12 +223,9 @@ class Evaluation:
     """Problem at one state."""
 
     state: State
-    projected: dict[int, Projected]
-    """Used detections of each boundary."""
-    drive: list[Rows]
-    """Rows of odometry, priors and revisits."""
-    cost: float
-    """Half the sum of squares, with the robust losses of the detections."""
+    projected: dict[int, Projected]  # used detections of each boundary
+    drive: list[Rows]  # rows of odometry, priors and revisits
+    cost: float  # half the sum of squares, with the robust losses of the detections
 
 
 class BatchSystem:
@@ -255,8 +238,7 @@ class BatchSystem:
         self.chain = chain
         self.settings = settings
         self.kernel = kernel
-        self.gauges: dict[int, CurveGauge] = {}
-        """Weak priors of each boundary."""
+        self.gauges: dict[int, CurveGauge] = {}  # weak priors of each boundary
         self.revisits: tuple[Revisit, ...] = ()
         """Poses measured in the frame of earlier ones, where an open road was driven twice."""
         count = len(detections)

@@ -19,8 +19,7 @@ from pathspace_graph.mapping.registration import RefinedMotion
 from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.mapping.smoother import CurveSmoother
 
-SIGMA_STEP: Final = 10.0
-"""Free motion of a control point in a step while the loop is optimized (m): it is hardly damped."""
+SIGMA_STEP: Final = 10.0  # free motion of a control point in a step while the loop is optimized (m)
 
 
 def apply_correspondences(smoother: CurveSmoother, registration: RefinedMotion) -> None:

@@ -27,7 +27,6 @@ from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
@@ -61,12 +60,9 @@ def _moved(poses: Array, frames: Array, to: Array) -> Array:
 
 # --- the record ------------------------------------------------------------------------------------------
 
-WORKER_IDLE: Final = 600
-"""Time with nothing to do after which the process that solves laps ends (s)."""
-WATCH_SECONDS: Final = 1.0
-"""Interval (s) at which a worker checks whether the process that started it is still there."""
-LATE: Final = "the batch of the lap was late"
-"""Why a batch was given up that the process has not solved in time."""
+WORKER_IDLE: Final = 600  # time with nothing to do after which the process that solves laps ends (s)
+WATCH_SECONDS: Final = 1.0  # at which a worker checks whether the process that started it is still there
+LATE: Final = "the batch of the lap was late"  # why a batch was given up in the end
 SOLVED: Final = 3.0
 """Distance from its optimum at which a batch counts as solved (joint sigmas): its marginal has the rest."""
 
@@ -77,15 +73,11 @@ class DriveRecord:
     def __init__(self, settings: MapperSettings, noise: NoiseLearner) -> None:
         self.settings = settings
         self._noise = noise
-        self.unsolvable: str | None = None
-        """Why the drive cannot be solved as a batch; None if it can be."""
+        self.unsolvable: str | None = None  # why the drive cannot be solved as a batch; None if it can be
         self.poses: list[Array] = []
         """Pose (3,) of each cycle, map frame, as it was estimated then or by the newest batch."""
-        self.stamps: list[float] = []
-        """Stamp of each cycle (s)."""
-        self._motions: list[MeasuredMotion] = []
-        self._detections: list[Detections] = []
-        self._orange: list[Detections] = []
+        self.stamps: list[float] = []  # stamp of each cycle (s)
+        self._readings: list[Reading] = []  # whose detections have their stated covariances
         self._beside: dict[int, list[float]] = {}  # parameter on each curve by cycle, NaN before it
         self._reckoned: list[Array] = []
         self._prepared = False
@@ -94,32 +86,25 @@ class DriveRecord:
         """Drop the measurements, since the lap cannot be solved for this reason."""
         if self.unsolvable is None:
             self.unsolvable = reason
-        self._motions, self._detections, self._orange = [], [], []
+        self._readings = []
 
     def measured(self, reading: Reading) -> None:
         """Add the motion that leads to a pose, and the detections there with their stated covariances."""
-        motion = reading.motion
         self.stamps.append(reading.detections.t)
         if self.unsolvable is not None:
             return
-        self._motions.append(motion)
-        self._detections.append(replace(reading.detections, covariances=reading.stated))
-        self._orange.append(reading.orange)
+        stated = replace(reading.detections, covariances=reading.stated)
+        self._readings.append(replace(reading, detections=stated))
         last = self._reckoned[-1] if self._reckoned else np.zeros(3)
-        self._reckoned.append(_kept(compose(last, motion.odometry.delta)))
+        self._reckoned.append(_kept(compose(last, reading.motion.odometry.delta)))
         if len(self.stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
     def measured_late(self, cycle: int, detections: Detections) -> None:
         """Add detections to those of an earlier cycle, as they would be seen from its pose."""
         if self.unsolvable is None:
-            known = self._detections[cycle]
-            self._detections[cycle] = Detections(
-                known.t,
-                np.concatenate([known.points_vehicle, detections.points_vehicle]),
-                np.concatenate([known.covariances, detections.covariances]),
-                np.concatenate([known.labels, detections.labels]),
-            )
+            known = self._readings[cycle]
+            self._readings[cycle] = replace(known, detections=_together(known.detections, detections))
 
     def estimated(self, state: State) -> None:
         """Add the newest pose, and its parameter on each of the curves."""
@@ -145,14 +130,10 @@ class DriveRecord:
 
     def seen(self, cycle: int, sensor: Array) -> Detections:
         """Return all detections of a cycle, corrected by the calibration (5,) of the sensor, or (0,)."""
-        both = self._noise.for_map(self._detections[cycle]), self._orange[cycle]
-        twist = self._motions[cycle].odometry.twist
-        points, covariances, labels = (
-            np.concatenate([getattr(seen, name) for seen in both])
-            for name in ("points_vehicle", "covariances", "labels")
-        )
-        points = corrected(points, np.tile(twist, (len(points), 1)), sensor)
-        return Detections(both[0].t, points, covariances, labels)
+        reading = self._readings[cycle]
+        seen = _together(self._noise.for_map(reading.detections), reading.orange)
+        twists = np.tile(reading.motion.odometry.twist, (len(seen.labels), 1))
+        return replace(seen, points_vehicle=corrected(seen.points_vehicle, twists, sensor))
 
     def recurrence(self) -> Recurrence | None:
         """Return the recurrence of the path driven, if odometry alone says that the lap is over."""
@@ -192,15 +173,16 @@ class DriveRecord:
 
         The priors of the calibrations are those of the settings, which may have become wide.
         """
-        motions, detections = self._noise.for_lap(self._motions, self._detections)
+        measured = [one.motion for one in self._readings], [one.detections for one in self._readings]
+        motions, detections = self._noise.for_lap(*measured)
         chain = chained(self.stamps, motions, settings.odometry)
-        return OpenLap(
-            settings=settings,
-            chain=chain,
-            detections=DetectionTable.of(detections, twists=chain.twists),
-            first_kept=first_kept,
-            start=start,
-        )
+        table = DetectionTable.of(detections, twists=chain.twists)
+        return OpenLap(settings, chain, table, first_kept, start)
+
+
+def _together(a: Detections, b: Detections) -> Detections:
+    names = ("points_vehicle", "covariances", "labels")
+    return Detections(a.t, *(np.concatenate([getattr(a, name), getattr(b, name)]) for name in names))
 
 
 def _kept(poses: Array) -> Array:
@@ -212,14 +194,11 @@ class LapBatch:
     """A lap that is being solved in a process of its own, while the mapper goes on."""
 
     def __init__(self, lap: OpenLap, t: float, due: int, last: int) -> None:
-        self.t = t
-        """Stamp of the cycle in which the lap was sent (s)."""
+        self.t = t  # stamp of the cycle in which the lap was sent (s)
         self.due = due
         """Cycle in which the marginal replaces the prior, or the first later one in which it is there."""
-        self.last = last
-        """Latest cycle in which it does so."""
-        self.first_kept = lap.first_kept
-        """Cycle from which on the window holds the poses until then."""
+        self.last = last  # latest cycle in which it does so
+        self.first_kept = lap.first_kept  # cycle from which on the window holds the poses until then
         self._lap = lap
         self._future: Future[LapMarginal | None] | None = None
         self.send()

@@ -6,10 +6,8 @@ loop, and the best places are refined by the registration. The farther the vehic
 agree. Once one is clearly better than all others, and twice in a row, the window starts anew there.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -29,74 +27,42 @@ from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-_POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])
-NO_CONES: Final = np.zeros(0)
-"""Unit vectors that choose the position of a pose."""
+_POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors that choose a pose's position
 FOUND: Final = "the vehicle was lost, and is found again"
 """Beginning of the notice of a cycle in which the window starts anew at the place that was found."""
-BESIDE: Final = 1.0
-"""Distance from the closed curve of its colour within which an unused detection is explained (m)."""
-GAP: Final = 3.0
-"""Least distance of neighbouring cones with a gap between them, over the median."""
-INTERVAL: Final = 0.5
-"""Least time between two attempts (s)."""
-MEMORY: Final = 60.0
-"""Length of the newest path whose detections are compared with the map (m)."""
-MOST_DETECTIONS: Final = 200
-"""Largest number of detections, evenly chosen, that are compared with the map."""
-MIN_DETECTIONS: Final = 40
-"""Least number of detections that are compared with the map."""
-STEP: Final = 2.0
-"""Distance of the places along the loop (m)."""
-LEAD: Final = 4.0
-"""Distance ahead of the point on the middle of the track that the vehicle heads for (m)."""
-MISFIT: Final = 3.0
-"""Rms distance of the path driven from the middle within which a place is compared (m)."""
-REACH: Final = 3.0
-"""Distance from its curve that any farther detection counts as (m)."""
-STARTS: Final = 12
-"""Largest number of places that are refined."""
-APART: Final = 4.0
-"""Distance below which two places are one (m)."""
-SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)
-"""Standard deviations of the pose about a place, before it is refined (m, m, rad)."""
-SIGMA_FIT: Final = 0.3
-"""A detection at a distance d from a curve of its colour scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)."""
-MIN_SCORE: Final = 0.6
-"""Least score of the place that is accepted; the true one has about 0.85."""
-MARGIN: Final = 0.1
-"""Least lead of its score over that of every other place."""
-SIGMA_MAX: Final = 0.5
-"""Largest standard deviation of the position there in its worst direction (m)."""
-CONFIRMATIONS: Final = 2
-"""Attempts, one after the other, that must find the same place."""
+BESIDE: Final = 1.0  # distance from the closed curve within which an unused detection is explained (m)
+GAP: Final = 3.0  # least distance of neighbouring cones with a gap between them, over the median
+INTERVAL: Final = 0.5  # least time between two attempts (s)
+MEMORY: Final = 60.0  # length of the newest path whose detections are compared with the map (m)
+MOST_DETECTIONS: Final = 200  # largest number of detections, evenly chosen, that are compared with the map
+MIN_DETECTIONS: Final = 40  # least number of detections that are compared with the map
+STEP: Final = 2.0  # distance of the places along the loop (m)
+LEAD: Final = 4.0  # distance ahead of the point on the middle of the track that the vehicle heads for (m)
+MISFIT: Final = 3.0  # rms distance of the path driven from the middle within which a place is compared (m)
+REACH: Final = 3.0  # distance from its curve that any farther detection counts as (m)
+STARTS: Final = 12  # largest number of places that are refined
+APART: Final = 4.0  # distance below which two places are one (m)
+SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)  # of the pose about a place, before it is refined (m, m, rad)
+SIGMA_FIT: Final = 0.3  # a detection at a distance d from its curve scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)
+MIN_SCORE: Final = 0.6  # least score of the place that is accepted; the true one has about 0.85
+MARGIN: Final = 0.1  # least lead of its score over that of every other place
+SIGMA_MAX: Final = 0.5  # largest standard deviation of the position there in its worst direction (m)
+CONFIRMATIONS: Final = 2  # attempts, one after the other, that must find the same place
 WIDENING: Final = 3.0
 """Factor of the registration's sigmas in the prior of the found pose: its detections are used again."""
-STEPS: Final = 2
-"""Gauss-Newton steps at the place that was found."""
+STEPS: Final = 2  # Gauss-Newton steps at the place that was found
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
     """A closed map as the search needs it."""
 
-    middle: Array
-    """(n, 2) Points on the middle of the track in driving order, in m, map frame."""
-    stations: Array
-    """(n,) Length along the middle up to each of them (m)."""
-    length: float
-    """Length of the middle (m)."""
-    beside: Mapping[int, Array]
-    """(n,) Parameters beside the points of the middle on each boundary (m)."""
-    curves: Mapping[int, KDTree]
-    """Densely sampled points of each boundary."""
-    mapped: Mapping[int, BoolArray]
-    """Whether each of these lies between cones that were detected (see `is_mapped`)."""
-
-    @cached_property
-    def with_gaps(self) -> list[int]:
-        """Return the boundaries whose curves have gaps."""
-        return [label for label, mapped in self.mapped.items() if not mapped.all()]
+    middle: Array  # (n, 2) points on the middle of the track in driving order, in m, map frame
+    stations: Array  # (n,) length along the middle up to each of them (m)
+    length: float  # length of the middle (m)
+    beside: Mapping[int, Array]  # (n,) parameters beside the points of the middle on each boundary (m)
+    curves: Mapping[int, KDTree]  # densely sampled points of each boundary
+    mapped: Mapping[int, BoolArray]  # whether each of these lies between detected cones (`is_mapped`)
 
     def at(self, stations: Array) -> Array:
         """Return the points of the middle at stations of any shape, as complex numbers x + i y."""
@@ -128,26 +94,14 @@ def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) 
     The others lie in a gap, which is longer than `gap` times the median distance of neighbours, and farther
     than the margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
     """
-    return _is_between(u, *_neighbours(cones, length, gap), length, margin)
-
-
-def _neighbours(cones: Array, length: float, gap: float) -> tuple[Array, Array, BoolArray]:
-    """Return places (n,) of cones (k,) on a closed curve, steps (n,) to the next, and which are no gap."""
     if len(cones) < 2:
-        return np.zeros(1), np.full(1, length), np.ones(1, bool)
+        return np.ones(len(u), bool)
     places = np.unique(np.mod(cones, length))
     steps = np.diff(places, append=places[0] + length)
-    return places, steps, np.asarray(steps <= gap * np.median(steps))
-
-
-def _is_between(
-    u: Array, places: Array, steps: Array, known: BoolArray, length: float, margin: float
-) -> BoolArray:
-    """Return `is_mapped` of parameters (m,), given the `_neighbours` of a curve."""
     before = np.searchsorted(places, np.mod(u, length)) - 1
     past = np.mod(u - places[before], length)
     near_end = np.minimum(past, steps[before] - past) < margin
-    return np.asarray(near_end | known[before])
+    return np.asarray(near_end | (steps <= gap * np.median(steps))[before])
 
 
 def lay_out_loop(state: State, is_mapped_on: Callable[[int, Array], BoolArray] | None = None) -> Loop:
@@ -177,7 +131,6 @@ class KnownLoop:
     def __init__(self, smoother: CurveSmoother) -> None:
         self._smoother = smoother
         self._laid_out: tuple[list[Boundary], Loop] | None = None
-        self._cones: dict[int, tuple[Array, tuple[Array, Array, BoolArray]]] = {}
 
     def get(self) -> Loop:
         """Return the loop as it was when it was laid out, which changes no variable."""
@@ -198,15 +151,13 @@ class KnownLoop:
 
     def with_gaps(self) -> list[int]:
         """Return the boundaries whose curves have gaps."""
-        return self.get().with_gaps
+        return [label for label, mapped in self.get().mapped.items() if not mapped.all()]
 
     def is_mapped(self, label: int, u: Array) -> BoolArray:
         """Return which parameters (m,) of a boundary lie between cones that were detected."""
         track, settings = self._smoother.map, self._smoother.map.settings
-        cones, length = track.cones.get(label, NO_CONES), track.state.boundaries[label].length
-        if self._cones.get(label, (None,))[0] is not cones:
-            self._cones[label] = cones, _neighbours(cones, length, GAP)
-        return _is_between(u, *self._cones[label][1], length, settings.growth.merge_radius)
+        cones, length = track.cones.get(label, np.zeros(0)), track.state.boundaries[label].length
+        return is_mapped(u, cones, length, GAP, settings.growth.merge_radius)
 
 
 def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_again: BoolArray) -> Evidence:
@@ -261,8 +212,7 @@ def _sigma_of_position(smoother: CurveSmoother) -> float:
     if last is None:
         return np.nan
     half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())
-    (xx, xy), (_, yy) = (half.T @ half).tolist()
-    return math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))
+    return worst_sigma(half.T @ half)
 
 
 class Search:
@@ -270,11 +220,9 @@ class Search:
 
     def __init__(self, smoother: CurveSmoother) -> None:
         self.settings: MapperSettings = smoother.map.settings
-        self.loop: Loop
-        """The map as it was in the last attempt."""
+        self.loop: Loop  # the map as it was in the last attempt
         self._smoother = smoother
-        self.first_cycle = smoother.next_cycle
-        """Cycle from which on detections are remembered."""
+        self.first_cycle = smoother.next_cycle  # cycle from which on detections are remembered
         self._poses: list[Array] = []
         self._seen: list[Detections] = []
         self._tried = smoother.times[-1]

@@ -32,30 +32,17 @@ from .finding import KnownLoop, Loop
 
 MENDED: Final = "the map was mended"
 """Beginning of the notice of a cycle in which mended curves take the place of the old ones."""
-SIGHTINGS: Final = 6
-"""Detections after which a cone contradicts the map: one that the vehicle passes is detected about twenty
-times, and a place in clutter hardly more than once."""
-MEMORY: Final = 30.0
-"""Time after its last detection at which a contradiction is forgotten (s)."""
-CONES: Final = 3
-"""Least number of contradictions in a row that is mended."""
-BESIDE: Final = 0.5
-"""Distance from a curve within which a cone does not contradict it (m)."""
-CERTAIN: Final = 1.0
-"""Standard deviation along its worst direction below which a detection may contradict the map (m): those of a
-far cone, smeared along their ray, are tracks beside a curve that the cone is on."""
-ROW: Final = 11.0
-"""Largest distance of neighbours in a row (m): two regular gaps, since a cone may never be detected."""
-SETTLE: Final = 1.5
-"""Time without detections of its cones after which the vehicle has passed a stretch (s)."""
-MOST: Final = 20
-"""Number of contradictions passed after which enough of a stretch is seen, whatever the time."""
-INTERVAL: Final = 0.5
-"""Time after which contradictions are looked for again (s)."""
-ATTEMPTS: Final = 8
-"""Largest number of attempts to mend a map."""
-EXPLAINED: Final = 0.5
-"""Least share of the contradictions that a mended map explains; otherwise the old one stays for a lap."""
+SIGHTINGS: Final = 6  # detections of a cone that contradicts the map; clutter has one, a cone passed twenty
+MEMORY: Final = 30.0  # time after its last detection at which a contradiction is forgotten (s)
+CONES: Final = 3  # least number of contradictions in a row that is mended
+BESIDE: Final = 0.5  # distance from a curve within which a cone does not contradict it (m)
+CERTAIN: Final = 1.0  # most sigma of a detection that may contradict the map (m): far cones are smeared
+ROW: Final = 11.0  # most distance of neighbours in a row (m): two regular gaps, since one cone may be missed
+SETTLE: Final = 1.5  # time without detections of its cones after which the vehicle has passed a stretch (s)
+MOST: Final = 20  # number of contradictions passed after which enough of a stretch is seen, whatever the time
+INTERVAL: Final = 0.5  # time after which contradictions are looked for again (s)
+ATTEMPTS: Final = 8  # largest number of attempts to mend a map
+EXPLAINED: Final = 0.5  # least share of the contradictions that a mended map explains, or the old one stays
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +50,7 @@ class Stretch:
     """Cones of a boundary's colour that stand in a row beside its curve."""
 
     label: int
-    cones: Array
-    """(k, 2) Positions in m, map frame, in no order."""
+    cones: Array  # (k, 2) positions in m, map frame, in no order
 
 
 class Contradictions:

@@ -29,23 +29,17 @@ from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.online import ClosingSettings
 
-STRETCH: Final = 150.0
-"""Length at the end of the curves that is registered with an earlier stretch (m): it holds the bends that
-tell the place along the track."""
-STRETCH_ROOM: Final = 10.0
-"""Room beyond the ends of the earlier stretch in which foot points are searched (m)."""
-STARTS: Final = 6
-"""Largest number of earlier stretches, which turn as the newest does, that it is registered with."""
+STRETCH: Final = 150.0  # length at the end of the curves that is registered (m): its bends tell the place
+STRETCH_ROOM: Final = 10.0  # beyond the ends of the earlier stretch in which foot points are searched (m)
+STARTS: Final = 6  # most earlier stretches, alike in their turns, that it is registered with
 
 
 @dataclass(frozen=True, eq=False)
 class RecognizedPlace:
     """Place where the newest stretch of the curves lies on an earlier stretch."""
 
-    motion: Motion
-    """Motion of the newest stretch onto the earlier one."""
-    beside: dict[int, float]
-    """Parameter of each boundary beside which the newest pose was there (m), a lap or more before."""
+    motion: Motion  # motion of the newest stretch onto the earlier one
+    beside: dict[int, float]  # parameter of each boundary beside the newest pose (m), a lap or more before
 
 
 def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:

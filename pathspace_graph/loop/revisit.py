@@ -24,29 +24,18 @@ from pathspace_graph.mapping.smoother import CurveSmoother
 from .closing import SIGMA_STEP
 from .drive_record import DriveRecord
 
-ATTEMPTS: Final = 3.0
-"""Least distance of two attempts (m along the path)."""
-INTERVAL: Final = 15.0
-"""Least distance from one revisit to the next (m along the path)."""
-RETURN: Final = 30.0
-"""Least length of the path between both passes (m)."""
-RADIUS: Final = 4.0
-"""Largest distance of both passes, as the map has them (m)."""
-DIVERGED: Final = 8.0
-"""Distance that the ways to the place must have had, as seen from the place (m)."""
-WAY, WAY_STEP = 100.0, 4.0
-"""Length of the ways that are compared, and the step at which they are (m)."""
-NEWEST: Final = 8.0
-"""Length of the newest path whose detections are laid on earlier ones (m)."""
-ABOUT: Final = 12.0
-"""Length of the earlier path, on each side of the place, whose detections these are laid on (m)."""
+ATTEMPTS: Final = 3.0  # least distance of two attempts (m along the path)
+INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
+RETURN: Final = 30.0  # least length of the path between both passes (m)
+RADIUS: Final = 4.0  # largest distance of both passes, as the map has them (m)
+DIVERGED: Final = 8.0  # distance that the ways to the place must have had, as seen from the place (m)
+WAY, WAY_STEP = 100.0, 4.0  # length of the ways that are compared, and the step at which they are (m)
+NEWEST: Final = 8.0  # length of the newest path whose detections are laid on earlier ones (m)
+ABOUT: Final = 12.0  # length of the earlier path, on each side of the place, that these are laid on (m)
 MIN_DETECTIONS: Final = 25
-MIN_SHARE: Final = 0.8
-"""Least share of the detections that lie on earlier ones."""
-MOST_MISFIT: Final = 3.0
-"""Largest mean square of their whitened distances."""
-MOST_DRIFT: Final = 1.2
-"""Largest distance of the place from where the map has it (m): cones of a row are some 3 m apart."""
+MIN_SHARE: Final = 0.8  # least share of the detections that lie on earlier ones
+MOST_MISFIT: Final = 3.0  # largest mean square of their whitened distances
+MOST_DRIFT: Final = 1.2  # from where the map has the place (m): cones of a row are some 3 m apart
 
 
 class Revisits:

@@ -29,14 +29,10 @@ from .mending import Mending
 from .recognition import recognize
 from .revisit import Revisits
 
-OWN_PRIOR: Final = "the map goes on from the window's own prior"
-"""Beginning of the notice of a cycle in which the batch of the lap does not replace the prior."""
-LONGEST_WAIT: Final = 1.0
-"""Longest time that a cycle waits for a batch (s), however long ago the cycle before it was."""
-REST: Final = 10.0
-"""Distance for which the loop is left as it is after a failure (m)."""
-RECOGNITION_INTERVAL: Final = 10.0
-"""Least distance of two attempts to recognize the place (m along the path)."""
+OWN_PRIOR: Final = "the map goes on from the window's own prior"  # begins the notice where no batch came
+LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cycle before it was
+REST: Final = 10.0  # distance for which the loop is left as it is after a failure (m)
+RECOGNITION_INTERVAL: Final = 10.0  # least distance of two attempts to recognize the place (m along the path)
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
 """Notice of the first cycle with a revisit."""
 NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
@@ -54,16 +50,13 @@ class TrackLoop:
 
     def __init__(self, smoother: CurveSmoother, path: DrivenPath, noise: NoiseLearner) -> None:
         self.settings = smoother.map.settings
-        self.closed = False
-        """Whether the loop has closed: the map has its final size."""
-        self.health = Health()
-        """How far the newest estimate can be trusted."""
+        self.closed = False  # whether the loop has closed: the map has its final size
+        self.health = Health()  # how far the newest estimate can be trusted
         self.corrected_poses: Array = np.zeros((0, 3))
         """(k, 3) Poses of the first k cycles as the closing of the loop has corrected them."""
         self.lap_seconds = float("nan")
         """Wall time (s) of the batch of the lap in its own process, once it has replaced the prior."""
-        self.late_cycles = 0
-        """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
+        self.late_cycles = 0  # cycles by which the slowest batch is late in a vehicle, by its wall time
         self.record = DriveRecord(self.settings, noise)
         self.revisits = Revisits(smoother, path, self.record)
         self.mending = Mending(smoother)

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.settings.batch import BreakSettings, FitSettings, Knots
+from pathspace_graph.settings.batch import Knots
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
@@ -80,10 +80,10 @@ def _breaks(
     u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
     if knots == "curvature" or size >= len(u):
-        baseline = BreakSettings(settings.spline.linear_baseline)
-        return curvature_weighted_breaks(boundary.spline(control_points), size, baseline, 0.0, period)
+        spline, baseline = boundary.spline(control_points), settings.spline.linear_baseline
+        return curvature_weighted_breaks(spline, size, baseline, 0.0, period)
     points = boundary.evaluate(control_points, u)
-    *_, thinned = thin(points, u, period, True, FitSettings(boundary.degree), size)
+    *_, thinned = thin(points, u, period, True, boundary.degree, size)
     return thinned.breaks
 
 

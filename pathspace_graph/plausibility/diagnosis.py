@@ -21,7 +21,7 @@ class Cause(NamedTuple):
     signs: tuple[str, str]  # words for a positive and for a negative calibration
 
 
-CAUSES: Final = {
+CAUSES: Final = {  # causes by the name of the calibration
     "scale": Cause("odometry", "speeds are {:.1f} % too {}", 100.0, ("high", "low")),
     "bias": Cause("odometry", "the yaw rate is {:.4f} rad/s too {}", 1.0, ("high", "low")),
     "yaw": Cause(
@@ -32,7 +32,6 @@ CAUSES: Final = {
     "range_scale": Cause("calibration", "ranges are {:.1f} % too {}", 100.0, ("long", "short")),
     "range_bias": Cause("calibration", "ranges are {:.2f} m too {}", 1.0, ("long", "short")),
 }
-"""Causes by the name of the calibration."""
 
 
 def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, float]:

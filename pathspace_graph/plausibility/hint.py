@@ -6,7 +6,7 @@ from typing import ClassVar, Final, Literal
 
 from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE
 
-Cause = Literal[
+Cause = Literal[  # the kinds of mistakes that are told
     "stamps",
     "clocks",
     "positions",
@@ -22,7 +22,6 @@ Cause = Literal[
     "labels",
     "unexplained",
 ]
-"""The kinds of mistakes that are told."""
 
 
 @dataclass(frozen=True)

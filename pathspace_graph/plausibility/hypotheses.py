@@ -4,20 +4,159 @@ Each lays the detections of nearby cycles on each other, since cones stand still
 of them than the log as it is written is the likely truth.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, Literal, Self
 
 import numpy as np
 from scipy.special import bdtrc
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import rotation
-from pathspace_graph.io.log import Log
+from pathspace_graph.factors.se2 import rotation, se2_exp, wrap_angle
+from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, UNKNOWN
 
-from .pairs import DEGREE, SOME_CYCLES, Meaning, Pairs, motions
+# --- pairs of cycles -------------------------------------------------------------------------------------
+
+MIN_DETECTIONS: Final = 2  # least number of detections of a cycle that is compared
+MOST_DETECTIONS: Final = 14  # most detections of a cycle that are compared, the nearest ones
+SOME_CYCLES: Final = 200  # approximate number of cycles from which the spacing of the cones is told
+GAPS: Final = (1, 2, 4, 8)  # numbers of cycles between the two that are compared
+PAIRS_OF_GAP: Final = 60  # approximate number of pairs of cycles that are compared for each of the gaps
+LONGEST: Final = 1.3  # longest time between the cycles of a pair (s), if cycles do not come more rarely
+REACH: Final = 0.2  # distance that counts as the same by `exp(-1/2)`, over the cones' spacing
+SEEN: Final = 0.95  # share of the detections within the range, and between the bearings, that a cycle sees
+ROUND: Final = 0.1  # length of the mean direction to the detections below which a sensor sees all around
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of cycles, whose detections are in the frame of the log; what is not there is NaN."""
+
+    begin: Array  # stamps (P,) of the earlier cycles (s)
+    end: Array  # stamps (P,) of the later cycles (s)
+    before: Array  # detections (P, m, 2) of the earlier cycles (m)
+    after: Array  # detections (P, m, 2) of the later cycles (m)
+    variances: Array  # variances (P, m, m) of one coordinate of each difference of two detections (m^2)
+    gap: IntArray  # number (P,) of cycles from the earlier to the later one
+    reach: float  # a detection explains another one at distance d with the weight `exp(-d^2 / 2 reach^2)`
+
+    def __len__(self) -> int:
+        return len(self.begin)
+
+    def distances(self, frame: Array, motion: Array) -> Array:
+        """Return the squared distances (P, m, m) of earlier from later detections, infinite without any.
+
+        frame (2, 2) leads from the log's frame to the vehicle's, motion (P, 3) from the later to the earlier.
+        """
+        laid = self.laid(frame, motion)
+        off = (self.before @ frame.T)[:, :, None] - laid[:, None]
+        square = np.einsum("pijk,pijk->pij", off, off)
+        return np.where(np.isnan(square), np.inf, square)
+
+    def laid(self, frame: Array, motion: Array) -> Array:
+        """Return the later detections (P, m, 2) in the earlier vehicle frame."""
+        c, s = np.cos(motion[:, 2]), np.sin(motion[:, 2])
+        turn = np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2)  # the transpose, for points in rows
+        return np.asarray((self.after @ frame.T) @ turn + motion[:, None, :2])
+
+    def explained(self, frame: Array, motion: Array) -> Array:
+        """Return the share (P,) of the detections of both cycles that lie on one of the other cycle."""
+        weights = np.exp(self.distances(frame, motion) / (-2.0 * self.reach**2))
+        total = weights.max(axis=2).sum(axis=1) + weights.max(axis=1).sum(axis=1)
+        return np.asarray(total / np.maximum(self.count, 1))
+
+    def chosen(self, rows: BoolArray) -> Self:
+        arrays = {name: value[rows] for name, value in vars(self).items() if name != "reach"}
+        return replace(self, **arrays)
+
+    def overlap(self, motion: Array) -> Array:
+        """Return the share (P,) of the later detections that the earlier cycle could have seen."""
+        ranges, bearings = _polar(self.before)
+        vector = np.nanmean(np.exp(1j * bearings))
+        middle = float(np.angle(vector)) if abs(vector) > ROUND else 0.0
+        farthest = np.nanquantile(ranges, SEEN)
+        widest = np.nanquantile(np.abs(wrap_angle(bearings - middle)), SEEN)
+        ranges, bearings = _polar(self.laid(np.eye(2), motion))
+        inside = (ranges < farthest) & (np.abs(wrap_angle(bearings - middle)) < widest)
+        return np.asarray(inside.sum(axis=1) / np.isfinite(ranges).sum(axis=1))
+
+    @property
+    def count(self) -> IntArray:
+        before, after = (np.isfinite(points[..., 0]).sum(axis=1) for points in (self.before, self.after))
+        return np.asarray(before + after)
+
+
+def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
+    """Return pairs of cycles spread over a log, or None where there are none with detections."""
+    full = [cycle for cycle in cycles if len(cycle.labels) >= MIN_DETECTIONS]
+    spacing = spacing_of(full[:: max(1, len(full) // SOME_CYCLES)])
+    if spacing is None:
+        return None
+    stamps = np.array([cycle.t for cycle in full])
+    pairs = []
+    shortest = float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
+    for gap in GAPS:
+        later = np.arange(gap, len(full))
+        near = stamps[later] - stamps[later - gap] <= max(LONGEST, 1.5 * shortest)
+        later = later[near]
+        chosen = later[:: max(1, len(later) // PAIRS_OF_GAP)]
+        pairs.append([chosen - gap, chosen, np.full(len(chosen), gap)])
+    first, second, gaps = np.concatenate(pairs, axis=1)
+    if len(first) == 0:
+        return None
+    points, variances = padded(full, MOST_DETECTIONS)
+    both = variances[first][:, :, None] + variances[second][:, None]
+    begin, end = stamps[first], stamps[second]
+    return Pairs(begin, end, points[first], points[second], both, gaps, REACH * spacing)
+
+
+def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:
+    """Return the nearest detections (C, m, 2) of each cycle, and a coordinate's variances (C, m), or NaN."""
+    points = np.full((len(cycles), most, 2), np.nan)
+    variances = np.full((len(cycles), most), np.nan)
+    for k, cycle in enumerate(cycles):
+        nearest = np.argsort(np.hypot(*cycle.points_vehicle.T), kind="stable")[:most]
+        points[k, : len(nearest)] = cycle.points_vehicle[nearest]
+        variances[k, : len(nearest)] = 0.5 * np.trace(cycle.covariances[nearest], axis1=1, axis2=2)
+    return points, variances
+
+
+def spacing_of(cycles: Sequence[Detections]) -> float | None:
+    """Return the median distance from a detection to the next one of its cycle, or None without any."""
+    found = []
+    for cycle in cycles:
+        points = cycle.points_vehicle
+        off = points[:, None] - points
+        square = (off * off).sum(axis=-1)
+        np.fill_diagonal(square, np.inf)
+        found.append(np.sqrt(square.min(axis=1)))
+    return float(np.median(np.concatenate(found))) if found else None
+
+
+def _polar(points: Array) -> tuple[Array, Array]:
+    return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
+
+
+def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
+    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning."""
+    first, last = _at(odometry_t, poses, begin), _at(odometry_t, poses, end)
+    moved = turned(last[:, :2] - first[:, :2], -first[:, 2])
+    return np.column_stack([moved, last[:, 2] - first[:, 2]])
+
+
+def _at(odometry_t: Array, poses: Array, stamps: Array) -> Array:
+    """Return the poses (P, 3) at stamps (P,) by linear interpolation; beyond the ends they are held."""
+    return np.column_stack([np.interp(stamps, odometry_t, column) for column in poses.T])
+
+
+def turned(vectors: Array, angles: Array) -> Array:
+    c, s = np.cos(angles), np.sin(angles)
+    return np.column_stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]])
+
+
+# --- what the columns may mean ---------------------------------------------------------------------------
 
 TURN_STEP: Final = 15.0  # step of the angles that the frame of the detections is tried at (degrees)
 EQUAL: Final = 0.02  # difference of explained shares below which hypotheses are equally good
@@ -32,52 +171,60 @@ WORST_CONDITION: Final = 1e6  # largest condition number at which the mounting i
 LATEST: Final = 10.0  # largest delay or lead of detections that is tried (s)
 LATE_STEP: Final = 0.25  # step of these (s)
 QUARTER: Final = 90.0  # a quarter turn in degrees
-MEANINGS: Final = (
-    Meaning(),
-    Meaning(content="nothing"),
-    Meaning(rate=DEGREE),
-    Meaning(rate=1.0 / DEGREE),
-    Meaning(speed=1.0 / 3.6),
-    Meaning(speed=0.44704),
-    Meaning(speed=0.514444),
-    Meaning(speed=1e-2),
-    Meaning(speed=1e-3),
-    Meaning(speed=3.6),
-    Meaning(speed=1e3),
-    Meaning(speed=1.0 / 3.6, rate=DEGREE),
-    Meaning(speed=1e-2, rate=DEGREE),
-    Meaning(speed=1e-3, rate=DEGREE),
-    Meaning(content="twist in the map frame"),
-    Meaning(content="twist in the map frame", rate=DEGREE),
-    Meaning(content="pose"),
-    Meaning(content="pose", rate=DEGREE),
-    Meaning(speed=1e-3, rate=1e-3),
-)
-"""Meanings of the odometry that are tried; of equally good ones the first is told."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """How the frame of the detections stands in that of the vehicle."""
-
-    turn: float = 0.0  # turn to the left (degrees)
-    mirrored: bool = False  # whether the y axis points to the other side, seen from the x axis
-
-    @property
-    def matrix(self) -> Array:
-        return rotation(self.turn * DEGREE) @ np.diag([1.0, -1.0 if self.mirrored else 1.0])
+DEGREE: Final = float(np.pi / 180.0)  # in radians
+Content = Literal["twist", "twist in the map frame", "pose", "nothing"]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """What the columns of a log mean."""
 
-    frame: Frame = Frame()
-    meaning: Meaning = field(default_factory=Meaning)
+    content: Content = "twist"  # of the odometry; with `nothing` the vehicle does not move at all
+    speed: float = 1.0  # unit of the speeds (m/s)
+    rate: float = 1.0  # unit of the yaw rate (rad/s)
+    turn: float = 0.0  # of the detections' frame in the vehicle's, to the left (degrees)
+    mirrored: bool = False  # whether its y axis points to the other side, seen from its x axis
     late: float = 0.0  # how much too large the stamps of the detections are (s)
+
+    @property
+    def stands(self) -> tuple[float, bool]:
+        """Return how the frame of the detections stands in that of the vehicle."""
+        return self.turn, self.mirrored
+
+    @property
+    def frame(self) -> Array:
+        return rotation(self.turn * DEGREE) @ np.diag([1.0, -1.0 if self.mirrored else 1.0])
+
+    def poses(self, odometry: Odometry) -> Array:
+        """Return the poses (N, 3) at the stamps, in a frame of their own; theta is not wrapped."""
+        measured = odometry.twist * [self.speed, self.speed, self.rate]
+        if self.content == "pose":
+            return np.column_stack([measured[:, :2], np.unwrap(measured[:, 2])])
+        if self.content == "nothing":
+            return np.zeros_like(measured)
+        dt = np.diff(odometry.t)[:, None]
+        heading = np.append(0.0, np.cumsum(measured[:-1, 2:] * dt))
+        if self.content == "twist":
+            steps = turned(se2_exp(measured[:-1] * dt)[:, :2], heading[:-1])
+        else:
+            steps = measured[:-1, :2] * dt
+        return np.column_stack([np.cumsum(np.vstack([np.zeros(2), steps]), axis=0), heading])
 
 
 AS_WRITTEN: Final = Hypothesis()  # the log means what it should
+MEANINGS: Final = (  # of the odometry; of equally good ones the first is told
+    AS_WRITTEN,
+    Hypothesis("nothing"),
+    Hypothesis(rate=DEGREE),
+    Hypothesis(rate=1.0 / DEGREE),
+    *(Hypothesis(speed=speed) for speed in (1.0 / 3.6, 0.44704, 0.514444, 1e-2, 1e-3, 3.6, 1e3)),
+    *(Hypothesis(speed=speed, rate=DEGREE) for speed in (1.0 / 3.6, 1e-2, 1e-3)),
+    Hypothesis("twist in the map frame"),
+    Hypothesis("twist in the map frame", rate=DEGREE),
+    Hypothesis("pose"),
+    Hypothesis("pose", rate=DEGREE),
+    Hypothesis(speed=1e-3, rate=1e-3),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,49 +240,33 @@ class Trial:
         return float(self.explained.mean())
 
 
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Comparison of a hypothesis with the log as it is written, on the pairs that tell them apart."""
-
-    telling: int  # number of these pairs
-    better: int  # number of those that the hypothesis explains better
-    share: float  # share of their detections that it explains
-    share_as_written: float  # share of their detections that the log as it is written explains
-
-    def is_clear(self) -> bool:
-        chance = float(bdtrc(self.better - 1, self.telling, 0.5))
-        far_better = self.share > FAR_BETTER * self.share_as_written
-        return chance < CHANCE and far_better and self.share > LEAST_SHARE
-
-    @property
-    def figures(self) -> dict[str, float]:
-        return {"as_written": self.share_as_written, "share": self.share}
-
-
-def verdict(trial: Trial, reference: Trial) -> Verdict:
+def far_better(trial: Trial, reference: Trial) -> dict[str, float] | None:
+    """Return the shares that both explain where they differ, or None unless the trial is clearly better."""
     gain = trial.explained - reference.explained
     telling: BoolArray = np.abs(gain) > TELLING
     if not telling.any():
-        return Verdict(0, 0, 0.0, 0.0)
-    shares = (float(one.explained[telling].mean()) for one in (trial, reference))
-    return Verdict(int(telling.sum()), int((gain[telling] > 0.0).sum()), *shares)
+        return None
+    share, as_written = (float(one.explained[telling].mean()) for one in (trial, reference))
+    chance = float(bdtrc(int((gain[telling] > 0.0).sum()) - 1, int(telling.sum()), 0.5))
+    clear = chance < CHANCE and share > FAR_BETTER * as_written and share > LEAST_SHARE
+    return {"as_written": as_written, "share": share} if clear else None
 
 
 class Trials:
     def __init__(self, log: Log, pairs: Pairs) -> None:
         self.log, self.pairs = log, pairs
-        self._poses: dict[Meaning, Array] = {}
+        self._poses: dict[Hypothesis, Array] = {}  # by what the odometry means
 
     def motion(self, hypothesis: Hypothesis) -> Array:
         """Return the motion (P, 3) of the vehicle from the earlier to the later cycle of each pair."""
-        odometry, pairs, meaning = self.log.odometry, self.pairs, hypothesis.meaning
+        odometry, pairs, meaning = self.log.odometry, self.pairs, of_odometry(hypothesis)
         if meaning not in self._poses:
             self._poses[meaning] = meaning.poses(odometry)
         begin, end = pairs.begin - hypothesis.late, pairs.end - hypothesis.late
         return motions(odometry.t, self._poses[meaning], begin, end)
 
     def trial(self, hypothesis: Hypothesis) -> Trial:
-        matrix = hypothesis.frame.matrix
+        matrix = hypothesis.frame
         explained = self.pairs.explained(matrix, self.motion(hypothesis))
         return Trial(hypothesis, explained, self.sided(matrix))
 
@@ -153,12 +284,11 @@ class Trials:
     def _others(self) -> Iterator[Hypothesis]:
         """Yield frames in fine steps for a right odometry, and in quarter turns for any other."""
         for meaning in MEANINGS:
-            step = TURN_STEP if meaning == Meaning() else QUARTER
+            step = TURN_STEP if meaning == AS_WRITTEN else QUARTER
             for turn in np.arange(0.0, 360.0, step).tolist():
                 for mirrored in (False, True):
-                    one = Hypothesis(Frame(turn - 360.0 if turn > 180.0 else turn, mirrored), meaning)
-                    is_tried = meaning.content != "nothing" or one.frame == Frame()
-                    if one != AS_WRITTEN and is_tried:
+                    one = replace(meaning, turn=turn - 360.0 if turn > 180.0 else turn, mirrored=mirrored)
+                    if one != AS_WRITTEN and (meaning.content != "nothing" or one == meaning):
                         yield one
 
     def sided(self, matrix: Array) -> float:
@@ -178,6 +308,10 @@ class Trials:
         return points[near], labels[near]
 
 
+def of_odometry(hypothesis: Hypothesis) -> Hypothesis:
+    return replace(hypothesis, turn=0.0, mirrored=False, late=0.0)
+
+
 # --- where the sensor is in the vehicle, and how late it is ----------------------------------------------
 
 MEDIAN_SQUARE: Final = 2.0 * float(np.log(2.0))  # median of |x|^2 of two standard normals
@@ -192,16 +326,6 @@ class Mounting:
     scatter: float  # median distance of detections of one cone (m)
     claimed: float  # the same by their covariances (m)
 
-    @property
-    def yaw(self) -> tuple[float, float]:
-        """Turn to the left and its standard deviation in degrees."""
-        return float(self.values[0]) / DEGREE, float(self.sigmas[0]) / DEGREE
-
-    @property
-    def arm(self) -> tuple[float, float]:
-        """Length of the lever arm, and the larger standard deviation of its components (m)."""
-        return float(np.hypot(*self.values[1:])), float(self.sigmas[1:].max())
-
 
 def mounting_of(trials: Trials, hypothesis: Hypothesis) -> Mounting | None:
     """Return the mounting under which nearby detections lie on each other best; None without any.
@@ -209,7 +333,7 @@ def mounting_of(trials: Trials, hypothesis: Hypothesis) -> Mounting | None:
     A cone at a (vehicle frame, earlier cycle) and b (later) with the motion (R, t) between them leaves
     `a - R b - t + (J t) yaw + (I - R) l`, in first order of the yaw and exactly in the lever arm l.
     """
-    motion, frame = trials.motion(hypothesis), hypothesis.frame.matrix
+    motion, frame = trials.motion(hypothesis), hypothesis.frame
     values, sigmas = np.zeros(3), np.full(3, np.inf)
     for _ in range(MOUNTING_STEPS):
         turned = rotation(values[0]) @ frame

@@ -19,9 +19,21 @@ from pathspace_graph.settings.online import LimitSettings
 
 from . import hypotheses
 from .hint import Hint, because, told
-from .hypotheses import LEAST_SHARE, Frame, Mounting, Trial, Trials, Verdict, verdict
+from .hypotheses import (
+    AS_WRITTEN,
+    DEGREE,
+    GAPS,
+    LEAST_SHARE,
+    Hypothesis,
+    Mounting,
+    Pairs,
+    Trial,
+    Trials,
+    far_better,
+    motions,
+    pairs_of,
+)
 from .noise import noise_hints
-from .pairs import DEGREE, GAPS, Meaning, Pairs, motions, pairs_of
 
 LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is said
 OVERLAP: Final = 0.5  # share of its detections that another cycle sees, from which they are compared
@@ -47,7 +59,7 @@ UNEXPLAINED: Final = 0.15  # share of the detections that the best motion must e
 LINE_RATIO: Final = 0.1  # ratio of the variations of two coordinates below which detections lie on a line
 TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size in s
 LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # units of positions by their size in m
-SPEEDS: Final = {
+SPEEDS: Final = {  # what a unit of the speeds (m/s) means
     1.0 / 3.6: "are in km/h, not in m/s",
     0.44704: "are in miles per hour, not in m/s",
     0.514444: "are in knots, not in m/s",
@@ -56,22 +68,19 @@ SPEEDS: Final = {
     3.6: "were divided by 3.6 although they were in m/s",
     1e3: "were divided by 1000 although they were in m/s",
 }
-"""What a unit of the speeds (m/s) means."""
-RATES: Final = {
+RATES: Final = {  # what a unit of the yaw rate (rad/s) means
     DEGREE: "is in degrees per second, not in rad/s",
     1.0 / DEGREE: "was turned from degrees to radians although it was in rad/s",
 }
-"""What a unit of the yaw rate (rad/s) means."""
-FRAMES: Final = {
-    Frame(180.0): "the sensor's frame has x to the rear and y to the right",
-    Frame(-90.0): "the sensor's frame has x to the right and y ahead",
-    Frame(90.0): "the sensor's frame has x to the left and y to the rear",
-    Frame(90.0, True): "the columns x and y are swapped",
-    Frame(180.0, True): "the sensor's frame has x to the rear",
-    Frame(-90.0, True): "the sensor's frame has x to the right and y to the rear",
+FRAMES: Final = {  # what a turn of the sensor (degrees), mirrored or not, means
+    (180.0, False): "the sensor's frame has x to the rear and y to the right",
+    (-90.0, False): "the sensor's frame has x to the right and y ahead",
+    (90.0, False): "the sensor's frame has x to the left and y to the rear",
+    (90.0, True): "the columns x and y are swapped",
+    (180.0, True): "the sensor's frame has x to the rear",
+    (-90.0, True): "the sensor's frame has x to the right and y to the rear",
 }
-"""What a frame in quarter turns means; the one with y to the right has its own hint."""
-MIRRORED: Final = Frame(0.0, True)  # frame in which y points to the right and x ahead
+MIRRORED: Final = 0.0, True  # frame in which y points to the right and x ahead
 
 
 def hints(log: Log) -> list[Hint]:
@@ -183,7 +192,7 @@ def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
     """
     if beyond_any_vehicle(log.odometry):
         return pairs.chosen(pairs.gap <= GAPS[1])
-    motion = motions(log.odometry.t, Meaning().poses(log.odometry), pairs.begin, pairs.end)
+    motion = motions(log.odometry.t, AS_WRITTEN.poses(log.odometry), pairs.begin, pairs.end)
     return pairs.chosen(pairs.overlap(motion) >= OVERLAP)
 
 
@@ -191,7 +200,7 @@ def _by_motion(trials: Trials) -> list[Hint]:
     if len(trials.pairs) == 0:
         return beyond_any_vehicle(trials.log.odometry)
     best, found = _meant(trials)
-    if best.hypothesis.meaning.content == "nothing" or (found and is_a_line(trials.pairs)):
+    if best.hypothesis.content == "nothing" or (found and is_a_line(trials.pairs)):
         return found
     late, of_clocks = _late(trials, best)
     if best.share < LEAST_SHARE and late is best:
@@ -206,37 +215,37 @@ def _by_motion(trials: Trials) -> list[Hint]:
 
 def _meant(trials: Trials) -> tuple[Trial, list[Hint]]:
     best = trials.best()
-    compared = verdict(best, trials.as_written)
-    if best is trials.as_written or not compared.is_clear():
+    figures = far_better(best, trials.as_written)
+    if figures is None:
         return trials.as_written, beyond_any_vehicle(trials.log.odometry)
     if is_a_line(trials.pairs):
         return trials.as_written, [_optical(trials.pairs)]
-    return best, _of_frame(best, trials, compared) + _of_odometry(best.hypothesis.meaning, compared)
+    return best, _of_frame(best, trials, figures) + _of_odometry(best.hypothesis, figures)
 
 
-def _of_frame(best: Trial, trials: Trials, compared: Verdict) -> list[Hint]:
+def _of_frame(best: Trial, trials: Trials, figures: dict[str, float]) -> list[Hint]:
     """Return a hint about the frame of the detections, or an odometry that goes backward or to a side."""
-    frame = best.hypothesis.frame
+    frame = best.hypothesis
     vx, vy = np.median(trials.log.odometry.twist[:, :2], axis=0)
     sees_ahead = np.nanmedian(trials.pairs.before[..., 0]) > 0.0
-    if frame == Frame():
+    if frame.stands == AS_WRITTEN.stands:
         return []
-    if frame == MIRRORED:
+    if frame.stands == MIRRORED:
         of_detections = best.sided >= trials.as_written.sided
         mistake = "y to the right" if of_detections else "yaw rate to the right"
     elif abs(vy) > abs(vx) and abs(frame.turn) == 90.0:
         mistake = "vx and vy swapped"
-    elif vx < 0.0 and sees_ahead and frame == Frame(180.0):
+    elif vx < 0.0 and sees_ahead and frame.stands == (180.0, False):
         mistake = "backward"
     else:
         mistake = "frame"
     side = "with y to the right, and " if frame.mirrored else ""
-    what = FRAMES.get(frame, f"the sensor's frame is {side}turned by {_angle(frame.turn)}")
-    return [told(mistake, what=what, how=_mended(frame), **compared.figures)]
+    what = FRAMES.get(frame.stands, f"the sensor's frame is {side}turned by {_angle(frame.turn)}")
+    return [told(mistake, what=what, how=_mended(frame), **figures)]
 
 
-def _mended(frame: Frame) -> str:
-    matrix = frame.matrix
+def _mended(frame: Hypothesis) -> str:
+    matrix = frame.frame
     if np.allclose(matrix, np.round(matrix), atol=1e-9):
         signs = {1: "", -1: "-"}
         rows = np.round(matrix)
@@ -250,10 +259,9 @@ def _angle(turn: float, decimals: int = 0) -> str:
     return f"{abs(turn):.{decimals}f} degrees to the {'left' if turn > 0.0 else 'right'}"
 
 
-def _of_odometry(meaning: Meaning, compared: Verdict) -> list[Hint]:
+def _of_odometry(meaning: Hypothesis, figures: dict[str, float]) -> list[Hint]:
     """Return hints about what the odometry means, where it is not a twist of the vehicle in SI units."""
-    figures = compared.figures
-    if meaning == Meaning(speed=1e-3, rate=1e-3):
+    if (meaning.speed, meaning.rate) == (1e-3, 1e-3):
         return [told("milliseconds", **figures)]
     if meaning.content == "nothing":
         return [told("nothing", **figures)]
@@ -267,17 +275,17 @@ def _of_odometry(meaning: Meaning, compared: Verdict) -> list[Hint]:
 
 def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
     late = hypotheses.best_lateness(trials, best)
-    compared = verdict(late, best)
-    if not compared.is_clear():
+    figures = far_better(late, best)
+    if figures is None:
         return best, []
     seconds = late.hypothesis.late
     way = "late" if seconds > 0.0 else "early"
-    return late, [told("late", seconds=abs(seconds), way=way, **compared.figures)]
+    return late, [told("late", seconds=abs(seconds), way=way, **figures)]
 
 
 def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
-    yaw, sigma = mounting.yaw
-    frame = best.hypothesis.frame
+    yaw, sigma = mounting.values[0] / DEGREE, mounting.sigmas[0] / DEGREE
+    frame = best.hypothesis
     if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURNED or sigma > TURNED_SIGMA):
         return found
     side = ", with y to the right" if frame.mirrored else ""
@@ -288,7 +296,7 @@ def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
 
 
 def _placed(mounting: Mounting) -> list[Hint]:
-    length, sigma = mounting.arm
+    length, sigma = np.hypot(*mounting.values[1:]), mounting.sigmas[1:].max()
     if length < ARM or sigma > ARM_SIGMA * length:
         return []
     ahead, left = mounting.values[1:].tolist()

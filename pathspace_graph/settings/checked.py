@@ -109,7 +109,7 @@ recording: widest_band 5.0
 batch: pose_steps 3, rough_rounds 24, rough_tolerance 8.0, knot_passes 2, max_rounds 80, loose_gate 8.0,
  gate_factor 0.7, damping 1e-2, damping_up 5.0, damping_down 0.1, damping_least 1e-6, damping_most 1e6,
  share_least 0.3, share_most 0.97, tolerance_cost 1e-5, tolerance_curve 2e-3, tolerance_decrease 5e-3,
- min_size_share 0.6, curve_samples 2
+ min_size_share 0.6, curve_samples 2, size none
 batch.recurrence: profile_step 0.5, smoothing 3.0, correlation_share 0.8, min_correlation 0.7,
  min_overlap 20.0
 batch.laps: reference_step 8.0, sigma_position 1.5, sigma_heading 0.15, max_steps 8, tolerance 1e-6

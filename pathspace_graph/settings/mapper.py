@@ -7,6 +7,7 @@ share it.
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.settings.batch import CenterlineSettings, CkfSettings, Knots, LandmarkSettings
 from pathspace_graph.settings.online import (
     ClosingSettings,
@@ -60,6 +61,13 @@ class SplineSettings(Positive):
     """Weight of second differences where new control points are fitted to tentative tracks."""
     fit_held: ClassVar[int] = 4
     """Points at the end of the known curve that the same fit passes, so that the curve keeps its shape."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.linear_baseline > 1.0:
+            raise SettingsError(
+                f"spline.linear_baseline: expected a share of at most 1, found {self.linear_baseline}"
+            )
 
 
 @dataclass(frozen=True)

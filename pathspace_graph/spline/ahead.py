@@ -32,18 +32,13 @@ _LARGEST_GAP: Final = 2.0  # largest number of steps between neighbours
 class CurveAhead:
     """A boundary in the direction of travel, and the vehicle's place on it."""
 
-    tables: SpanPolynomials
-    """Basis, whose parameter is about a length in m."""
-    control_points: Array
-    """(n, 2) Control points in m, map frame; those of a closed curve repeat."""
-    beside: float
-    """Parameter of about the vehicle's foot point."""
-    until: float = np.inf
-    """Parameter up to which an open curve is confirmed, where it ends."""
+    tables: SpanPolynomials  # basis, whose parameter is about a length in m
+    control_points: Array  # (n, 2) control points in m, map frame; those of a closed curve repeat
+    beside: float  # parameter of about the vehicle's foot point
+    until: float = np.inf  # parameter up to which an open curve is confirmed, where it ends
     tentative: Array | None = None
     """(k, 2) Points through which the boundary leads on from its end, as far as is known (m, map frame)."""
-    confirmed: bool = True
-    """Whether the curve itself is sure not to be taken back."""
+    confirmed: bool = True  # whether the curve itself is sure not to be taken back
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,16 +11,21 @@ from scipy.linalg.blas import dger
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import foot_points
-from pathspace_graph.settings.batch import BreakSettings, FitSettings
 from pathspace_graph.spline.bspline import BSpline
 
+DEGREE: Final = 3  # of a curve, where none is given
+BASELINE: Final = 0.5  # share in [0, 1] of the knots that is spread evenly, so that straights have some
+CURVATURE_MAX: Final = 0.7  # that larger ones count as (1/m), so that a kink does not attract all knots
+SMOOTHNESS: Final = 1e-3  # weight (m^3) of the integral of |S''|^2 beside the sum of squared distances
+ROUNDS: Final = 4  # times that a fit's knots are placed anew by curvature, after evenly spaced ones
+REFITS: Final = 4  # least-squares fits on each set of knots, with refreshed foot points
 _SAMPLES_PER_BREAK: Final = 40  # equally spaced samples of the curvature for each requested break
 _SAMPLES_PER_SPAN: Final = 8  # least-squares samples of a refit on each span: enough for any degree up to 7
 _BRIDGE: Final = 1e-3  # weight of second derivatives on spans with too few samples of a refit
 _BENDING_PER_SPAN: Final = 3  # places on each such span at which the second derivative is taken
 
 
-def quantile_breaks(u: Array, curvature: Array, count: int, settings: BreakSettings) -> Array:
+def quantile_breaks(u: Array, curvature: Array, count: int, baseline: float = BASELINE) -> Array:
     """Return breaks (count + 1,) at equal quantiles of (1 - b) |kappa| / sum |kappa| + b / N.
 
     The N equally long intervals between parameters u (N + 1,) have curvature kappa (N,) in 1/m; b is the
@@ -28,10 +33,10 @@ def quantile_breaks(u: Array, curvature: Array, count: int, settings: BreakSetti
     """
     if count < 1:
         raise SettingsError(f"at least one knot interval is needed, not {count}")
-    bent = np.minimum(np.abs(curvature), settings.curvature_max)
+    bent = np.minimum(np.abs(curvature), CURVATURE_MAX)
     total = float(bent.sum())
     equal = np.full(len(bent), 1.0 / len(bent))
-    share = (1.0 - settings.baseline) * bent / total + settings.baseline * equal if total > 0.0 else equal
+    share = (1.0 - baseline) * bent / total + baseline * equal if total > 0.0 else equal
     cumulative = np.concatenate([[0.0], np.cumsum(share)])
     breaks = np.interp(np.linspace(0.0, 1.0, count + 1), cumulative / cumulative[-1], u)
     breaks[0], breaks[-1] = u[0], u[-1]
@@ -39,7 +44,11 @@ def quantile_breaks(u: Array, curvature: Array, count: int, settings: BreakSetti
 
 
 def curvature_weighted_breaks(
-    spline: BSpline, count: int, settings: BreakSettings, low: float | None = None, high: float | None = None
+    spline: BSpline,
+    count: int,
+    baseline: float = BASELINE,
+    low: float | None = None,
+    high: float | None = None,
 ) -> Array:
     """Return breaks (count + 1,) in the spline's own parameter between low and high (default: its domain).
 
@@ -55,7 +64,7 @@ def curvature_weighted_breaks(
     curvature = spline.curvature(middle)
     if not spline.periodic:
         curvature[(middle < first) | (middle > last)] = 0.0
-    return quantile_breaks(u, curvature, count, settings)
+    return quantile_breaks(u, curvature, count, baseline)
 
 
 def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Array:
@@ -150,7 +159,7 @@ def _bending_rows(spline: BSpline) -> Array:
 
 
 def fit_spline(
-    points: Array, size: int, periodic: bool, settings: FitSettings | None = None, breaks: Array | None = None
+    points: Array, size: int, periodic: bool, degree: int = DEGREE, breaks: Array | None = None
 ) -> BSpline:
     """Fit a spline of `size` distinct control points to ordered points (k, 2) in m, by least squares.
 
@@ -158,18 +167,17 @@ def fit_spline(
     and the fit with the smallest rmse is returned. Bending energy makes two points enough, or three on a
     loop. SettingsError where there are fewer, or too few control points for the degree.
     """
-    settings = FitSettings() if settings is None else settings
     u, high = _chord_lengths(points, periodic)
-    count = size if periodic else size - settings.degree
-    if count < 1 or (periodic and count <= settings.degree):
-        raise SettingsError(f"{size} control points are too few for a spline of degree {settings.degree}")
+    count = size if periodic else size - degree
+    if count < 1 or (periodic and count <= degree):
+        raise SettingsError(f"{size} control points are too few for a spline of degree {degree}")
     knots = np.linspace(0.0, high, count + 1) if breaks is None else breaks
     best, best_rmse = None, np.inf
-    for _ in range(settings.rounds + 1 if breaks is None else 1):
-        spline, u, rmse = _fit_on(points, u, knots, periodic, settings)
+    for _ in range(ROUNDS + 1 if breaks is None else 1):
+        spline, u, rmse = _fit_on(points, u, knots, periodic, degree)
         if rmse < best_rmse or best is None:
             best, best_rmse = spline, rmse
-        knots = curvature_weighted_breaks(spline, count, settings.breaks)
+        knots = curvature_weighted_breaks(spline, count)
     assert best is not None
     return best
 
@@ -184,14 +192,14 @@ def _chord_lengths(points: Array, periodic: bool) -> tuple[Array, float]:
 
 
 def _fit_on(
-    points: Array, u: Array, breaks: Array, periodic: bool, settings: FitSettings
+    points: Array, u: Array, breaks: Array, periodic: bool, degree: int
 ) -> tuple[BSpline, Array, float]:
-    frame = _frame(breaks, periodic, settings.degree)
-    bending = np.sqrt(settings.smoothness) * energy_rows(frame)
+    frame = _frame(breaks, periodic, degree)
+    bending = np.sqrt(SMOOTHNESS) * energy_rows(frame)
     zeros = np.zeros((len(bending), 2))
     reach = (breaks[-1] - breaks[0]) / max(len(breaks) - 1, len(points))
     rmse = np.inf
-    for _ in range(settings.refits):
+    for _ in range(REFITS):
         stacked = np.concatenate([frame.basis_matrix(u), bending])
         solution = np.linalg.lstsq(stacked, np.concatenate([points, zeros]), rcond=None)[0]
         frame = frame.with_points(solution)
@@ -234,7 +242,7 @@ class Thinned:
         return float(((self.residual / (1.0 - self.leverage)[:, None]) ** 2).sum())
 
 
-def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, most: int) -> Thinned:
+def chosen_breaks(points: Array, periodic: bool, degree: int, least: int, most: int) -> Thinned:
     """Choose, among the curves of `thin` with `least` to `most` control points, by cross-validation.
 
     The largest is chosen, unless a smaller one predicts a point left out better by `MARGIN`. BIC takes a knot
@@ -242,14 +250,12 @@ def chosen_breaks(points: Array, periodic: bool, fit: FitSettings, least: int, m
     """
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
-    path = list(thin(points, along, high, periodic, fit, least))
+    path = list(thin(points, along, high, periodic, degree, least))
     within = [curve for curve in path if curve.size <= most] or path[-1:]
     return min(within, key=lambda curve: (1.0 if curve is within[0] else 1.0 + MARGIN) * curve.crossed)
 
 
-def thin(
-    points: Array, u: Array, high: float, periodic: bool, fit: FitSettings, least: int
-) -> Iterator[Thinned]:
+def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, least: int) -> Iterator[Thinned]:
     """Yield least-squares curves with one knot less each, from a knot at each point down to `least` points.
 
     The points (k, 2) have the parameters u (k,) in [0, high]; `least` counts control points, and where there
@@ -262,13 +268,13 @@ def thin(
     one, where the rows of W are the jumps A at all knots and the basis at the points.
     """
     breaks = _breaks(u, high)
-    while periodic and len(breaks) <= fit.degree + 1:
+    while periodic and len(breaks) <= degree + 1:
         breaks = np.sort(np.append(breaks, 0.5 * (breaks[1:] + breaks[:-1])))
-    frame = _frame(breaks, periodic, fit.degree)
+    frame = _frame(breaks, periodic, degree)
     B, bending = frame.basis_matrix(u), energy_rows(frame)
-    highest = frame.basis_matrix(0.5 * (frame.breaks[1:] + frame.breaks[:-1]), frame.degree)
+    highest = frame.basis_matrix(0.5 * (frame.breaks[1:] + frame.breaks[:-1]), degree)
     jumps = np.diff(highest, axis=0)  # of the highest derivative at each inner break, by control point
-    factor = cho_factor(B.T @ B + fit.smoothness * bending.T @ bending)
+    factor = cho_factor(B.T @ B + SMOOTHNESS * bending.T @ bending)
     watched, n, remaining = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
     spread = np.asfortranarray(watched @ cho_solve(factor, jumps.T))
     values = watched @ cho_solve(factor, B.T @ points)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.start import (
-    LAP_SIGMAS,
     Recurrence,
     align_laps,
     find_recurrence,
@@ -18,7 +17,6 @@ from pathspace_graph.batch.start import (
 )
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
-from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
@@ -53,35 +51,10 @@ def by_hand() -> Recurrence:
 
 def test_each_lap_passes_every_reference_pose_once() -> None:
     """Reference poses stand at 0 and 7.5 m of each lap, and poses at 0, 3, 6 ... m."""
-    found = lap_correspondences(by_hand())
-    np.testing.assert_array_equal(found.cycles * 3.0, [0.0, 9.0, 15.0, 24.0, 30.0, 39.0])
-    np.testing.assert_array_equal(found.reference, [0, 1, 0, 1, 0, 1])
-    np.testing.assert_allclose(found.turns, 2.0 * np.pi * np.array([0, 0, 1, 1, 2, 2]))
-
-
-def test_reference_poses_begin_at_the_first_pose_that_passes_them() -> None:
-    """The heading is counted without the whole laps before."""
-    found, poses = lap_correspondences(by_hand()), np.random.default_rng(0).normal(size=(14, 3))
-    np.testing.assert_array_equal(found.references_at(poses), poses[[0, 3]])
-    later = replace(
-        found, cycles=found.cycles[2:], reference=found.reference[2:], turns=found.turns[2:]
-    ).references_at(poses)
-    np.testing.assert_allclose(later, poses[[5, 8]] - [0.0, 0.0, 2.0 * np.pi])
-
-
-def test_the_rows_are_whitened_differences_and_their_derivatives() -> None:
-    found, rng = lap_correspondences(by_hand()), np.random.default_rng(1)
-    poses, references = rng.normal(size=(14, 3)), rng.normal(size=(2, 3))
-    rows, h = found.rows(poses, references), 1e-6
-    expected = (poses[5] - references[0] - [0.0, 0.0, 2.0 * np.pi]) / LAP_SIGMAS
-    np.testing.assert_allclose(rows.residual[6:9], expected)
-    np.testing.assert_array_equal(rows.keys[6], pose_keys(np.array([5, 14])))
-    for k in range(3):
-        step = h * np.eye(3)[k]
-        by_pose = (found.rows(poses + step, references).residual - rows.residual) / h
-        by_reference = (found.rows(poses, references + step).residual - rows.residual) / h
-        np.testing.assert_allclose(rows.jacobian[:, k], by_pose, atol=1e-6)
-        np.testing.assert_allclose(rows.jacobian[:, 3 + k], by_reference, atol=1e-6)
+    cycles, reference, turns = lap_correspondences(by_hand())
+    np.testing.assert_array_equal(cycles * 3.0, [0.0, 9.0, 15.0, 24.0, 30.0, 39.0])
+    np.testing.assert_array_equal(reference, [0, 1, 0, 1, 0, 1])
+    np.testing.assert_allclose(turns, 2.0 * np.pi * np.array([0, 0, 1, 1, 2, 2]))
 
 
 # --- drift -----------------------------------------------------------------------------------------------
@@ -102,7 +75,7 @@ def test_what_is_aligned_is_a_minimum_of_odometry_and_correspondences() -> None:
     _, chain = drifting()
     recurrence = find_recurrence(chain.dead_reckoned(np.zeros(2)), SETTINGS)
     poses, calibration = align_laps(chain, recurrence)
-    free = np.setdiff1d(np.arange(1, len(poses) - 1), lap_correspondences(recurrence).cycles)
+    free = np.setdiff1d(np.arange(1, len(poses) - 1), lap_correspondences(recurrence)[0])
     h = 1e-5
     for k in free[:: len(free) // 8]:
         for axis in range(3):

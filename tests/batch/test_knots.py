@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,9 +11,7 @@ from pathspace_graph.batch.simplification import (
     boundary_of,
     fit_through,
     reknot,
-    size_share,
 )
-from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import ring, straight
@@ -58,13 +54,6 @@ def test_a_closed_curve_begins_at_the_cone_nearest_to_the_start() -> None:
     )
     np.testing.assert_allclose(one.knots, other.knots)
     np.testing.assert_allclose(one.control_points, other.control_points)
-
-
-def test_a_fixed_size_is_shared_by_the_cones_of_both_boundaries() -> None:
-    cones = {LEFT: 30, RIGHT: 50}
-    assert size_share(cones, SETTINGS.batch) == SETTINGS.batch.size_share
-    assert size_share(cones, replace(SETTINGS.batch, size=20)) == 0.25
-    assert size_share({}, replace(SETTINGS.batch, size=20)) == SETTINGS.batch.size_share
 
 
 def test_a_boundary_of_a_curve_is_that_curve_all_of_it_confirmed() -> None:

@@ -23,7 +23,6 @@ from pathspace_graph.io.log import Log, write_log
 from pathspace_graph.io.map import SplineBoundary, read_map
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import ahead, bean_track, corridor, exact_log, lap_log, noisy, true_poses
 
@@ -76,13 +75,6 @@ def test_the_size_keeps_to_its_budget() -> None:
     result, truth = solved("odometry"), bean().truth
     assert truth is not None
     assert result.map.size <= 0.44 * len(truth.cones)
-
-
-def test_a_fixed_budget_is_kept() -> None:
-    settings = replace(MapperSettings(), batch=replace(MapperSettings().batch, size=24))
-    result = BatchMapper(settings, bean().odometry_sigma).solve(bean(), "odometry")
-    assert result.convergence.converged
-    assert 22 <= result.map.size <= 24
 
 
 def test_an_open_track_has_open_curves() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.start import PROFILE_STEP, Recurrence, find_recurrence, profile_of
+from pathspace_graph.batch.start import PROFILE_STEP, SMOOTHING, Recurrence, correlations, find_recurrence
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import COURSE, course_curvature
@@ -81,11 +81,12 @@ def test_the_search_climbs_to_the_peak_of_a_smooth_track() -> None:
 def test_correlations_are_those_of_the_two_stretches() -> None:
     poses = laps_of_course(1.5, 3e-4)
     driven = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-    profile = profile_of(poses, driven)
-    lag = round(COURSE / PROFILE_STEP)
-    first, second = profile.curvature[:-lag], profile.curvature[lag:]
+    x, y, heading = (np.interp(np.arange(0.0, driven[-1], PROFILE_STEP), driven, part) for part in poses.T)
+    padded, lag = np.pad(heading, 3, "edge"), round(COURSE / PROFILE_STEP)
+    curvature = (padded[6:] - padded[:-6]) / SMOOTHING
+    first, second = curvature[:-lag], curvature[lag:]
     expected = 1.0 - np.mean((first - second) ** 2) / (np.mean(first**2) + np.mean(second**2))
-    found = profile.correlations(np.array([lag // 2, lag]), SETTINGS.closing)
+    found = correlations(x + 1j * y, heading, np.array([lag // 2, lag]), SETTINGS.closing)
     np.testing.assert_allclose(found, [-np.inf, expected], atol=1e-9)
 
 

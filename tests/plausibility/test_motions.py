@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.io.log import Odometry
-from pathspace_graph.plausibility.pairs import DEGREE, Meaning, motions
+from pathspace_graph.plausibility.hypotheses import DEGREE, Hypothesis, motions
 
 T = 0.1 * np.arange(11)
 
@@ -17,18 +17,18 @@ def twists(vx: float, vy: float, wz: float) -> Odometry:
 
 def test_a_quarter_circle_is_exact() -> None:
     radius = 2.0
-    poses = Meaning().poses(twists(0.5 * np.pi * radius, 0.0, 0.5 * np.pi))
+    poses = Hypothesis().poses(twists(0.5 * np.pi * radius, 0.0, 0.5 * np.pi))
     np.testing.assert_allclose(poses[-1], [radius, radius, 0.5 * np.pi], atol=1e-12)
 
 
 def test_units_scale_speeds_and_rates() -> None:
-    poses = Meaning(speed=1e-3, rate=DEGREE).poses(twists(3000.0, 0.0, 0.0))
+    poses = Hypothesis(speed=1e-3, rate=DEGREE).poses(twists(3000.0, 0.0, 0.0))
     np.testing.assert_allclose(poses[-1], [3.0, 0.0, 0.0], atol=1e-12)
-    assert Meaning(rate=DEGREE).poses(twists(0.0, 0.0, 90.0))[-1, 2] == pytest.approx(0.5 * np.pi)
+    assert Hypothesis(rate=DEGREE).poses(twists(0.0, 0.0, 90.0))[-1, 2] == pytest.approx(0.5 * np.pi)
 
 
 def test_a_twist_in_the_map_frame_is_not_turned() -> None:
-    poses = Meaning(content="twist in the map frame").poses(twists(1.0, 2.0, 3.0))
+    poses = Hypothesis(content="twist in the map frame").poses(twists(1.0, 2.0, 3.0))
     np.testing.assert_allclose(poses[-1], [1.0, 2.0, 3.0], atol=1e-12)
 
 
@@ -36,7 +36,7 @@ def test_a_pose_is_taken_as_it_is_with_its_heading_unwrapped() -> None:
     heading = np.linspace(3.0, 4.0, len(T))
     wrapped = (heading + np.pi) % (2.0 * np.pi) - np.pi
     odometry = Odometry(T, np.column_stack([T, 2.0 * T, wrapped]))
-    poses = Meaning(content="pose").poses(odometry)
+    poses = Hypothesis(content="pose").poses(odometry)
     np.testing.assert_allclose(poses, np.column_stack([T, 2.0 * T, heading]), atol=1e-12)
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pathspace_graph.plausibility.hypotheses import AS_WRITTEN, Trials, lever, mounting_of
-from pathspace_graph.plausibility.pairs import pairs_of
+from pathspace_graph.plausibility.hypotheses import AS_WRITTEN, Trials, lever, mounting_of, pairs_of
 from pathspace_graph.sim.mistakes import in_frame
 
 from ..scenes.batch import course_log

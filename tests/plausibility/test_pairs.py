@@ -7,7 +7,7 @@ import pytest
 
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.io.log import Detections
-from pathspace_graph.plausibility.pairs import LONGEST, REACH, Pairs, pairs_of, spacing_of
+from pathspace_graph.plausibility.hypotheses import LONGEST, REACH, Pairs, pairs_of, spacing_of
 
 CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1]])
 MOTION = np.array([1.0, 0.3, 0.2])

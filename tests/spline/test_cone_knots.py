@@ -7,11 +7,10 @@ import pytest
 
 from pathspace_graph.eval.metrics.accuracy import closest_points
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.settings.batch import FitSettings
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import chosen_breaks, energy_rows, fit_spline, thin
+from pathspace_graph.spline.knots import SMOOTHNESS, chosen_breaks, energy_rows, fit_spline, thin
 
-FIT = FitSettings(rounds=1)
+DEGREE = 3
 
 
 def keyhole(count: int = 60) -> Array:
@@ -34,7 +33,7 @@ def circle(count: int, noise: float) -> Array:
 def test_each_step_takes_out_one_knot_and_misses_more() -> None:
     points = keyhole()
     u = along(points)
-    path = list(thin(points, u, float(u[-1]), False, FIT, 8))
+    path = list(thin(points, u, float(u[-1]), False, DEGREE, 8))
     assert [curve.size for curve in path] == list(range(path[0].size, 7, -1))
     assert path[0].size == len(points) + 2
     assert (np.diff([(curve.residual**2).sum() for curve in path]) > -1e-6).all()
@@ -44,7 +43,7 @@ def test_the_price_of_a_knot_is_what_the_fit_loses() -> None:
     """The knot taken out is the one without which a least-squares fit of its own is best, of all."""
     points = keyhole(24)
     u = along(points)
-    path = list(thin(points, u, float(u[-1]), False, FIT, 12))
+    path = list(thin(points, u, float(u[-1]), False, DEGREE, 12))
     before, after = path[8], path[9]
     best = min(
         sum_of_squares(points, u, np.delete(before.breaks, k)) for k in range(1, len(before.breaks) - 1)
@@ -55,7 +54,7 @@ def test_the_price_of_a_knot_is_what_the_fit_loses() -> None:
 def sum_of_squares(points: Array, u: Array, breaks: Array) -> float:
     """What `thin` minimizes, bending included."""
     frame = BSpline.clamped_from(breaks, np.zeros((len(breaks) + 2, 2)), 3)
-    stacked = np.concatenate([frame.basis_matrix(u), np.sqrt(FIT.smoothness) * energy_rows(frame)])
+    stacked = np.concatenate([frame.basis_matrix(u), np.sqrt(SMOOTHNESS) * energy_rows(frame)])
     target = np.concatenate([points, np.zeros((len(stacked) - len(points), 2))])
     solution = np.linalg.lstsq(stacked, target, rcond=None)[0]
     return float(((stacked @ solution - target) ** 2).sum())
@@ -63,7 +62,7 @@ def sum_of_squares(points: Array, u: Array, breaks: Array) -> float:
 
 def test_knots_go_where_the_curve_bends() -> None:
     points = keyhole()
-    chosen = chosen_breaks(points, False, FIT, 8, 20)
+    chosen = chosen_breaks(points, False, DEGREE, 8, 20)
     middle = along(points)[len(points) // 2]
     inside = np.abs(chosen.breaks - middle) < 10.0
     assert inside.mean() > 0.5
@@ -72,9 +71,11 @@ def test_knots_go_where_the_curve_bends() -> None:
 
 def test_it_fits_better_than_knots_at_equal_distances() -> None:
     points = keyhole()
-    chosen = chosen_breaks(points, False, FIT, 8, 16)
+    chosen = chosen_breaks(points, False, DEGREE, 8, 16)
     even = np.linspace(0.0, along(points)[-1], len(chosen.breaks))
-    ours, theirs = (fit_spline(points, chosen.size, False, FIT, breaks) for breaks in (chosen.breaks, even))
+    ours, theirs = (
+        fit_spline(points, chosen.size, False, DEGREE, breaks) for breaks in (chosen.breaks, even)
+    )
     off = [np.abs(distances(spline, points)).max() for spline in (ours, theirs)]
     assert off[0] < 0.3 * off[1]
 
@@ -85,22 +86,22 @@ def distances(spline: BSpline, points: Array) -> Array:
 
 def test_a_smaller_curve_is_taken_where_it_foretells_better() -> None:
     """A circle is a curve of few control points; more of them only follow the noise."""
-    chosen = chosen_breaks(circle(80, 0.2), True, FIT, 8, 40)
+    chosen = chosen_breaks(circle(80, 0.2), True, DEGREE, 8, 40)
     assert chosen.size < 40
     x = 2.0 * np.arange(60)
-    waves = chosen_breaks(np.column_stack([x, np.sin(x / 2.0)]), False, FIT, 8, 24)
+    waves = chosen_breaks(np.column_stack([x, np.sin(x / 2.0)]), False, DEGREE, 8, 24)
     assert waves.size == 24
 
 
 @pytest.mark.parametrize("periodic", [True, False])
 def test_the_budget_is_kept(periodic: bool) -> None:
-    assert chosen_breaks(circle(40, 0.01), periodic, FIT, 8, 17).size <= 17
+    assert chosen_breaks(circle(40, 0.01), periodic, DEGREE, 8, 17).size <= 17
 
 
 def test_knots_of_a_straight_that_needs_none_stay_spread() -> None:
     """Every knot is then missed equally little, but for rounding: none may leave a long interval behind."""
     points = np.column_stack([4.0 * np.arange(16.0), np.zeros(16)])
-    *_, last = thin(points, points[:, 0], 60.0, False, FIT, 8)
+    *_, last = thin(points, points[:, 0], 60.0, False, DEGREE, 8)
     assert np.diff(last.breaks).max() <= 4 * 4.0 + 1e-9
 
 
@@ -110,7 +111,7 @@ def test_cones_at_one_place_share_a_knot(gap: float) -> None:
     points = np.insert(keyhole(), 30, keyhole()[30], axis=0)
     u = np.insert(along(keyhole()), 30, along(keyhole())[30] - gap)
     with np.errstate(all="raise"):
-        path = list(thin(points, u, float(u[-1]), False, FIT, 8))
+        path = list(thin(points, u, float(u[-1]), False, DEGREE, 8))
     assert path[0].size == len(points) + 1
     assert np.diff(path[0].breaks).min() > 1.0
 
@@ -119,7 +120,7 @@ def test_cones_at_the_ends_up_to_rounding_add_no_knot() -> None:
     points = keyhole()
     u = along(points)
     u[0], high = 1e-12, float(u[-1]) + 1e-12
-    first = next(thin(points, u, high, False, FIT, 8))
+    first = next(thin(points, u, high, False, DEGREE, 8))
     assert (first.size, first.breaks[0], first.breaks[-1]) == (len(points) + 2, 0.0, high)
 
 
@@ -128,6 +129,6 @@ def test_cones_at_the_ends_up_to_rounding_add_no_knot() -> None:
 def test_few_cones_have_a_curve_through_them(count: int, periodic: bool) -> None:
     """There are fewer than the control points that are asked for."""
     points = circle(count, 0.0)
-    chosen = chosen_breaks(points, periodic, FIT, 8, 8)
-    spline = fit_spline(points, chosen.size, periodic, FIT, chosen.breaks)
+    chosen = chosen_breaks(points, periodic, DEGREE, 8, 8)
+    spline = fit_spline(points, chosen.size, periodic, DEGREE, chosen.breaks)
     assert np.abs(closest_points(spline, points).distance).max() < 0.5

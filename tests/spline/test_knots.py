@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.settings.batch import BreakSettings, FitSettings
+from pathspace_graph.settings.mapper import SplineSettings
+from pathspace_graph.spline import knots
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import curvature_weighted_breaks, fit_spline, quantile_breaks, refit
 
@@ -49,7 +50,7 @@ def test_knots_gather_in_a_corner_and_keep_a_minimum_on_straights() -> None:
     corner = spline.foot_points(np.array([[40.0, 0.0], [40.0, 8.0]])).u
     densities = []
     for baseline in (1.0, 0.5, 0.2):
-        breaks = curvature_weighted_breaks(spline, 24, BreakSettings(baseline))
+        breaks = curvature_weighted_breaks(spline, 24, baseline)
         assert (np.diff(breaks) > 0.0).all()
         assert (breaks[0], breaks[-1]) == spline.domain
         bent = (breaks > corner[0]) & (breaks < corner[1])
@@ -63,11 +64,11 @@ def test_knots_gather_in_a_corner_and_keep_a_minimum_on_straights() -> None:
 
 def test_equal_quantiles_done_by_hand() -> None:
     u = np.arange(5.0)
-    breaks = quantile_breaks(u, np.array([0.0, 0.0, 0.3, 0.1]), 2, BreakSettings(baseline=0.0))
+    breaks = quantile_breaks(u, np.array([0.0, 0.0, 0.3, 0.1]), 2, 0.0)
     np.testing.assert_allclose(breaks, [0.0, 2.0 + 2.0 / 3.0, 4.0])
-    mixed = quantile_breaks(u, np.array([0.0, 0.0, 0.3, 0.1]), 2, BreakSettings(baseline=0.5))
+    mixed = quantile_breaks(u, np.array([0.0, 0.0, 0.3, 0.1]), 2, 0.5)
     np.testing.assert_allclose(mixed, [0.0, 2.0 + 0.25 / 0.5, 4.0])
-    straight = quantile_breaks(u, np.zeros(4), 4, BreakSettings(baseline=0.0))
+    straight = quantile_breaks(u, np.zeros(4), 4, 0.0)
     np.testing.assert_allclose(straight, u)
 
 
@@ -75,7 +76,7 @@ def test_a_kink_does_not_draw_all_knots() -> None:
     u = np.arange(101.0)
     curvature = np.full(100, 0.1)
     curvature[50] = 1e9
-    breaks = quantile_breaks(u, curvature, 20, BreakSettings(baseline=0.0))
+    breaks = quantile_breaks(u, curvature, 20, 0.0)
     assert np.diff(breaks).max() < 7.0
 
 
@@ -84,7 +85,7 @@ def test_a_kink_does_not_draw_all_knots() -> None:
 def test_breaks_never_decrease_and_keep_both_ends(seed: int, baseline: float, count: int) -> None:
     spline = ring(9, seed)
     low, high = spline.domain
-    breaks = curvature_weighted_breaks(spline, count, BreakSettings(baseline), low + 5.0, high + 5.0)
+    breaks = curvature_weighted_breaks(spline, count, baseline, low + 5.0, high + 5.0)
     assert len(breaks) == count + 1
     assert (np.diff(breaks) >= 0.0).all()
     assert (breaks[0], breaks[-1]) == (low + 5.0, high + 5.0)
@@ -165,14 +166,18 @@ def test_a_fit_goes_through_points_of_a_spline() -> None:
     assert np.abs(fitted.foot_points(points).distance).max() < 0.05
 
 
-def test_curvature_weighted_knots_fit_a_hairpin_better_than_equal_ones() -> None:
+def test_curvature_weighted_knots_fit_a_hairpin_better_than_equal_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     points = hairpin()
 
-    def mean_rmse(fit: FitSettings) -> float:
-        fitted = [fit_spline(points, size, periodic=False, settings=fit) for size in range(9, 16)]
+    def mean_rmse() -> float:
+        fitted = [fit_spline(points, size, periodic=False) for size in range(9, 16)]
         return float(np.mean([np.sqrt(np.mean(each.foot_points(points).distance ** 2)) for each in fitted]))
 
-    assert mean_rmse(FitSettings()) < 0.4 * mean_rmse(FitSettings(rounds=0))
+    by_curvature = mean_rmse()
+    monkeypatch.setattr(knots, "ROUNDS", 0)
+    assert by_curvature < 0.4 * mean_rmse()
 
 
 @pytest.mark.parametrize(("count", "size"), [(2, 4), (3, 9), (5, 30)])
@@ -187,15 +192,13 @@ def test_a_fit_to_few_points_does_not_blow_up(count: int, size: int) -> None:
 
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(SettingsError, match="baseline"):
-        BreakSettings(baseline=1.5)
-    with pytest.raises(SettingsError, match="curvature"):
-        BreakSettings(curvature_max=0.0)
+        SplineSettings(linear_baseline=1.5)
     with pytest.raises(SettingsError, match="too few"):
         fit_spline(hairpin(), 3, periodic=True)
     with pytest.raises(SettingsError, match="distinct points"):
         fit_spline(np.zeros((5, 2)), 5, periodic=False)
     with pytest.raises(SettingsError, match="at least one"):
-        quantile_breaks(np.arange(3.0), np.zeros(2), 0, BreakSettings())
+        quantile_breaks(np.arange(3.0), np.zeros(2), 0)
 
 
 @pytest.mark.skipif(not TRACKS.is_dir(), reason="needs the real tracks beside the repository")

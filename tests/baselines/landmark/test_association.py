@@ -43,36 +43,36 @@ def test_gates_are_those_of_two_degrees_of_freedom() -> None:
 
 def test_the_assignment_is_the_best_of_all_not_that_of_each_detection() -> None:
     cost = np.array([[1.0, 2.0], [1.5, 5.5]])  # greedy would take 1.0 and leave 5.5
-    np.testing.assert_array_equal(associate(cost, GATES).landmark, [1, 0])
+    np.testing.assert_array_equal(associate(cost, GATES)[0], [1, 0])
 
 
 def test_a_bad_pair_is_not_taken_to_save_another() -> None:
     cost = np.array([[0.5, 50.0], [0.1, 50.0]])
-    found = associate(cost, GATES)
-    np.testing.assert_array_equal(found.landmark, [UNASSOCIATED, 0])
+    landmark, _ = associate(cost, GATES)
+    np.testing.assert_array_equal(landmark, [UNASSOCIATED, 0])
 
 
 def test_a_detection_between_the_gates_is_neither_associated_nor_new() -> None:
     between = 0.5 * (GATES.match + GATES.create)
-    found = associate(np.array([[between, 99.0], [99.0, 99.0], [99.0, 1.0]]), GATES)
-    np.testing.assert_array_equal(found.landmark, [UNASSOCIATED, UNASSOCIATED, 1])
-    np.testing.assert_array_equal(found.new, [False, True, False])
+    landmark, is_new = associate(np.array([[between, 99.0], [99.0, 99.0], [99.0, 1.0]]), GATES)
+    np.testing.assert_array_equal(landmark, [UNASSOCIATED, UNASSOCIATED, 1])
+    np.testing.assert_array_equal(is_new, [False, True, False])
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0)])
 def test_there_pairs_no_detections_or_no_landmarks(shape: tuple[int, int]) -> None:
-    found = associate(np.zeros(shape), GATES)
-    np.testing.assert_array_equal(found.landmark, np.full(shape[0], UNASSOCIATED))
-    assert found.new.all()
+    landmark, is_new = associate(np.zeros(shape), GATES)
+    np.testing.assert_array_equal(landmark, np.full(shape[0], UNASSOCIATED))
+    assert is_new.all()
 
 
 @given(arrays(float, (4, 5), elements=st.floats(0.0, 20.0) | st.just(np.inf)))
 def test_it_is_one_to_one_and_inside_the_gate(cost: Array) -> None:
-    found = associate(cost, GATES)
-    matched = np.flatnonzero(found.landmark != UNASSOCIATED)
-    assert len(np.unique(found.landmark[matched])) == len(matched)
-    assert (cost[matched, found.landmark[matched]] < GATES.match).all()
-    assert not found.new[matched].any()
+    landmark, is_new = associate(cost, GATES)
+    matched = np.flatnonzero(landmark != UNASSOCIATED)
+    assert len(np.unique(landmark[matched])) == len(matched)
+    assert (cost[matched, landmark[matched]] < GATES.match).all()
+    assert not is_new[matched].any()
 
 
 def test_an_unknown_label_is_compatible_with_both() -> None:
@@ -113,7 +113,7 @@ def test_a_held_pair_is_kept_however_its_assignment_is_summed() -> None:
         (cost[:, ::-1], [UNASSOCIATED, 1]),
     ):
         held = np.isfinite(own)
-        assert associate(hysteresis_costs(own, held, gates), gates).landmark.tolist() == expected
+        assert associate(hysteresis_costs(own, held, gates), gates)[0].tolist() == expected
 
 
 # --- online ----------------------------------------------------------------------------------------------

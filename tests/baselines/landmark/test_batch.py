@@ -17,11 +17,11 @@ from ...scenes.drives import ahead, exact_log, true_poses
 def test_it_finds_the_landmarks_of_the_oracle(bean: Log) -> None:
     assert bean.truth is not None
     result = LandmarkBatch(odometry_sigma=bean.odometry_sigma).solve(bean)
-    oracle = solve_oracle_landmarks(bean)
+    _, oracle = solve_oracle_landmarks(bean)
     assert result.converged
     assert result.map.closed and result.laps == 2
     assert len(result.trajectory) == len(bean.cycles)
-    labels = bean.truth.cone_labels[oracle.landmark_ids]
+    labels = bean.truth.cone_labels[oracle.numbers]
     for label in BOUNDARIES:
         boundary, expected = result.map.boundaries[label], oracle.landmarks[labels == label]
         assert isinstance(boundary, PointBoundary)

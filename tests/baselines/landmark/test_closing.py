@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from pathspace_graph.baselines.landmark_association import merge
 from pathspace_graph.baselines.landmark_fixed_lag import (
     JointCompatibility,
-    LoopPairs,
     detect_loop,
     optimize_loop,
 )
@@ -61,22 +60,14 @@ def test_an_accepted_pair_is_a_kalman_update() -> None:
 def test_the_distance_of_a_hypothesis_is_that_of_all_pairs_together() -> None:
     """The sum of the sequential distances is `r' S^-1 r` of the stacked differences."""
     test, mean, covariance = four_landmarks()
-    found = test.grow(0, 0, gate=1e6)
-    np.testing.assert_array_equal(found.recent, [2, 3])
-    np.testing.assert_array_equal(found.old, [0, 1])
+    pairs, distance = test.grow(0, 0, gate=1e6)
+    assert pairs == [(0, 0), (1, 1)]
     H = np.concatenate([difference(0, 0), difference(1, 1)])
     r, S = H @ mean.ravel(), H @ covariance @ H.T + 0.01 * np.eye(4)
-    assert found.distance == pytest.approx(r @ np.linalg.solve(S, r), rel=1e-6)
-    assert found.score(6.0) == pytest.approx(12.0 - found.distance)
+    assert distance == pytest.approx(r @ np.linalg.solve(S, r), rel=1e-6)
 
 
-def test_hypotheses_overlap_if_they_share_a_pair() -> None:
-    first = LoopPairs(np.array([4, 5]), np.array([0, 1]), 1.0)
-    assert first.overlaps(LoopPairs(np.array([5, 6]), np.array([1, 2]), 1.0))
-    assert not first.overlaps(LoopPairs(np.array([5, 4]), np.array([0, 1]), 1.0))
-
-
-def detected(gaps: Array, sigma: float) -> LoopPairs | None:
+def detected(gaps: Array, sigma: float) -> tuple[Array, Array] | None:
     """Returns the pairs of two old rows and the same rows seen again, with a common shift of `sigma` (m)."""
     n, x = len(gaps), np.cumsum(gaps)
     old = np.concatenate([np.column_stack([x, np.full(n, y)]) for y in (2.0, -2.0)])
@@ -92,8 +83,9 @@ def test_rows_are_recognized_as_a_whole() -> None:
     """The shift is more than half the distance of the cones, so each is nearest to a wrong one."""
     found = detected(np.array([3.0, 4.0, 3.3, 5.0, 2.8, 4.4]), 3.5)
     assert found is not None
-    np.testing.assert_array_equal(np.sort(found.recent) - 12, np.arange(12))
-    np.testing.assert_array_equal(found.recent - 12, found.old)
+    recent, old = found
+    np.testing.assert_array_equal(np.sort(recent) - 12, np.arange(12))
+    np.testing.assert_array_equal(recent - 12, old)
 
 
 def test_a_row_with_equal_distances_is_not_recognized() -> None:
@@ -107,10 +99,10 @@ def test_too_few_landmarks_close_no_loop() -> None:
 def test_the_loop_is_optimized_with_its_pairs_held_together() -> None:
     smoother = driven(4)
     apart = np.hypot(*(smoother.map.state.landmarks[4] - smoother.map.state.landmarks[0]))
-    pairs = LoopPairs(np.array([4]), np.array([0]), 0.0)
-    optimize_loop(smoother, pairs)
+    pairs = np.array([4]), np.array([0])
+    optimize_loop(smoother, *pairs)
     np.testing.assert_array_equal(smoother.map.loop_pairs, [[4, 0]])
     assert np.hypot(*(smoother.map.state.landmarks[4] - smoother.map.state.landmarks[0])) < 0.9 * apart
-    merge(smoother, pairs.recent, pairs.old)
+    merge(smoother, *pairs)
     assert len(smoother.map.loop_pairs) == 0
     assert len(smoother.map.state) == 4

@@ -99,9 +99,9 @@ def test_with_oracle_associations_it_is_gtsams_optimum(bean: Log) -> None:
     """GTSAM's detections are polar, so the two differ by how Gaussian a detection is in each."""
     beginning, associations = beginning_of(bean, 60)
     settings = MapperSettings(calibration=KNOWN)
-    ours = solve_landmarks(beginning, associations, settings=settings)
+    _, ours = solve_landmarks(beginning, associations, settings)
     theirs = gtsam_optimum(beginning, associations)
-    expected = np.array([theirs.atPoint2(L(int(j))) for j in ours.landmark_ids])
+    expected = np.array([theirs.atPoint2(L(int(j))) for j in ours.numbers])
     np.testing.assert_allclose(ours.landmarks, expected, atol=0.03)
     last = theirs.atPose2(X(len(beginning.cycles)))
-    np.testing.assert_allclose(ours.trajectory[-1, :2], [last.x(), last.y()], atol=0.02)
+    np.testing.assert_allclose(ours.variables.poses[-1, :2], [last.x(), last.y()], atol=0.02)

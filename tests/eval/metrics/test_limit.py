@@ -91,11 +91,11 @@ def _detect(
 def test_without_noise_the_batch_is_exact() -> None:
     log = circle_log(noise=0.0)
     assert log.truth is not None
-    solution = solve_oracle_landmarks(log)
-    assert len(solution.landmarks) == 36
-    assert landmark_rmse(solution, log.truth) < 1e-6
-    assert ate(solution.trajectory_t, solution.trajectory, log.truth) < 1e-6
-    assert solution.error < 1e-6
+    system, solved = solve_oracle_landmarks(log)
+    assert len(solved.landmarks) == 36
+    assert landmark_rmse(solved, log.truth) < 1e-6
+    assert ate(system.chain.stamps, solved.variables.poses, log.truth) < 1e-6
+    assert system.cost(solved) < 1e-6
 
 
 def test_with_noise_the_errors_are_as_large_as_the_covariance_says() -> None:
@@ -104,13 +104,13 @@ def test_with_noise_the_errors_are_as_large_as_the_covariance_says() -> None:
     for seed in range(6):
         log = circle_log(noise=1.0, seed=seed)
         assert log.truth is not None
-        solution = solve_oracle_landmarks(log, with_covariance=True)
-        errors = (solution.landmarks - log.truth.cones[solution.landmark_ids]).ravel()
-        assert solution.covariance is not None
-        ratios.append(errors @ np.linalg.solve(solution.covariance, errors) / len(errors))
+        system, solved = solve_oracle_landmarks(log)
+        errors = (solved.landmarks - log.truth.cones[solved.numbers]).ravel()
+        covariance = system.eliminated(solved).joint(solved.keys)
+        ratios.append(errors @ np.linalg.solve(covariance, errors) / len(errors))
         # l of one run has the joint covariance's size: errors are correlated, so only roughly
-        expected = np.sqrt(2.0 * np.mean(np.diag(solution.covariance)))
-        assert landmark_rmse(solution, log.truth) < 3.0 * expected
+        expected = np.sqrt(2.0 * np.mean(np.diag(covariance)))
+        assert landmark_rmse(solved, log.truth) < 3.0 * expected
     assert np.mean(ratios) == pytest.approx(1.0, abs=4 * np.sqrt(2 / (6 * 72)))
 
 
@@ -138,35 +138,32 @@ def test_a_landmark_seen_standing_is_the_information_weighted_mean(monkeypatch: 
     roots = rng.normal(0.0, 2e-3, (8, 2, 2)) + 1e-3 * np.eye(2)
     covariances = roots @ np.swapaxes(roots, 1, 2)
     detections = np.array([3.0, -4.0]) + np.einsum("kij,kj->ki", roots, rng.normal(0.0, 1.0, (8, 2)))
-    solution = solve_landmarks(
-        standing_log(detections, covariances), np.zeros(8, dtype=int), with_covariance=True, settings=CERTAIN
-    )
+    system, solved = solve_landmarks(standing_log(detections, covariances), np.zeros(8, dtype=int), CERTAIN)
     weights = np.linalg.inv(covariances)
     covariance = np.linalg.inv(weights.sum(axis=0))
     mean = covariance @ np.einsum("kij,kj->i", weights, detections)
-    np.testing.assert_allclose(solution.landmarks, [mean], atol=2e-5)
-    assert solution.covariance is not None
-    np.testing.assert_allclose(solution.covariance, covariance, atol=0.05 * covariance.max())
+    np.testing.assert_allclose(solved.landmarks, [mean], atol=2e-5)
+    found = system.eliminated(solved).joint(solved.keys)
+    np.testing.assert_allclose(found, covariance, atol=0.05 * covariance.max())
 
 
 def test_false_positives_are_left_out_and_colours_not_looked_at() -> None:
     detections = np.array([[5.0, 1.0], [50.0, 50.0], [5.0, 1.2]])
     covariances = np.tile(1e-4 * np.eye(2), (3, 1, 1))
-    solution = solve_landmarks(standing_log(detections, covariances), np.array([7, -1, 7]), settings=CERTAIN)
-    np.testing.assert_array_equal(solution.landmark_ids, [7])
-    np.testing.assert_allclose(solution.landmarks, [[5.0, 1.1]], atol=1e-3)
-    assert solution.trajectory.shape == (3, 3)
+    _, solved = solve_landmarks(standing_log(detections, covariances), np.array([7, -1, 7]), CERTAIN)
+    np.testing.assert_array_equal(solved.numbers, [7])
+    np.testing.assert_allclose(solved.landmarks, [[5.0, 1.1]], atol=1e-3)
+    assert solved.variables.poses.shape == (3, 3)
 
 
 def test_a_log_in_which_nothing_is_seen_gives_the_odometry() -> None:
     log = circle_log(noise=0.0)
     detections = sum(len(cycle.labels) for cycle in log.cycles)
-    solution = solve_landmarks(log, np.full(detections, -1), with_covariance=True)
-    assert solution.landmarks.shape == (0, 2)
-    assert solution.covariance is not None and solution.covariance.shape == (0, 0)
-    np.testing.assert_allclose(
-        solution.trajectory[:, :2], circle_poses(solution.trajectory_t)[:, :2], atol=1e-6
-    )
+    system, solved = solve_landmarks(log, np.full(detections, -1))
+    assert solved.landmarks.shape == (0, 2)
+    assert system.eliminated(solved).joint(solved.keys).shape == (0, 0)
+    expected = circle_poses(system.chain.stamps)[:, :2]
+    np.testing.assert_allclose(solved.variables.poses[:, :2], expected, atol=1e-6)
 
 
 def exact_ring_map(size: int) -> Map:
@@ -191,7 +188,7 @@ def test_the_limit_is_both_together() -> None:
     log = circle_log(noise=1.0)
     assert log.truth is not None
     found = limit(log, exact_ring_map(6))
-    assert found.l == landmark_rmse(solve_oracle_landmarks(log), log.truth) > 0.0
+    assert found.l == landmark_rmse(solve_oracle_landmarks(log)[1], log.truth) > 0.0
     assert found.f == fit_rmse(exact_ring_map(6), log.truth)
     assert Limit(l=0.3, f=0.4).total == pytest.approx(0.5)
 
@@ -199,12 +196,12 @@ def test_the_limit_is_both_together() -> None:
 def test_unknown_cones_are_not_counted() -> None:
     log = circle_log(noise=1.0)
     assert log.truth is not None
-    solution = solve_oracle_landmarks(log)
+    _, solved = solve_oracle_landmarks(log)
     some = log.truth.cone_labels.copy()
     some[16:] = UNKNOWN
     told = Truth(log.truth.pose_t, log.truth.poses, log.truth.cones, some)
-    errors = np.linalg.norm(solution.landmarks - log.truth.cones, axis=1)[:16]
-    assert landmark_rmse(solution, told) == pytest.approx(root_mean_square(errors))
+    errors = np.linalg.norm(solved.landmarks - log.truth.cones, axis=1)[:16]
+    assert landmark_rmse(solved, told) == pytest.approx(root_mean_square(errors))
 
 
 def test_a_log_without_truth_has_no_limit() -> None:
@@ -222,10 +219,11 @@ def test_a_log_without_truth_has_no_limit() -> None:
 
 def normalized_error(log: Log) -> tuple[float, int]:
     """The squared error of the told landmarks by their joint covariance, and its degrees of freedom."""
-    solution = solve_oracle_landmarks(log, with_covariance=True)
-    assert log.truth is not None and solution.covariance is not None
-    errors = (solution.landmarks - log.truth.cones[solution.landmark_ids]).ravel()
-    return float(errors @ np.linalg.solve(solution.covariance, errors)), len(errors)
+    system, solved = solve_oracle_landmarks(log)
+    assert log.truth is not None
+    errors = (solved.landmarks - log.truth.cones[solved.numbers]).ravel()
+    covariance = system.eliminated(solved).joint(solved.keys)
+    return float(errors @ np.linalg.solve(covariance, errors)), len(errors)
 
 
 @pytest.mark.parametrize("latency", [-0.12, 0.1])
@@ -282,7 +280,7 @@ def test_told_the_noise_the_batch_is_better_than_told_that_it_is_white() -> None
     for seed in range(4):
         log = simulate(bean_track(), settings, seed)
         assert log.truth is not None
-        told.append(landmark_rmse(solve_oracle_landmarks(log), log.truth))
+        told.append(landmark_rmse(solve_oracle_landmarks(log)[1], log.truth))
         plain = replace(log, truth=replace(log.truth, noise=None))
-        white.append(landmark_rmse(solve_oracle_landmarks(plain), log.truth))
+        white.append(landmark_rmse(solve_oracle_landmarks(plain)[1], log.truth))
     assert np.mean(told) < np.mean(white)
