@@ -22,7 +22,7 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES
 
 from .cells import Outcome
-from .faults import CLEAN, FaultOutcome
+from .faults import CLEAN, fault_of
 from .frame import COMBINATION, Contrast, contrasts
 from .study import Study
 
@@ -174,18 +174,22 @@ def _draw_point(axes: Axes, across: Contrast, up: Contrast, index: int, label: s
 # --- faults ----------------------------------------------------------------------------------------------
 
 
-def plot_faults(outcomes: Sequence[FaultOutcome]) -> Figure:
-    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said."""
-    panels = [(kind, list(of)) for kind, of in groupby(outcomes, key=lambda o: o.fault.kind) if kind != CLEAN]
+def plot_faults(study: Study, runs: pd.DataFrame) -> Figure:
+    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said.
+
+    The runs are those of `beside_clean`.
+    """
+    by_kind = groupby(study.noise, key=lambda noise: fault_of(noise).kind)
+    panels = {kind: [*noises] for kind, noises in by_kind if kind != CLEAN}
     rows = max(1, -(-len(panels) // _FAULT_COLUMNS))
     with style.figure_context():
         figure = Figure(figsize=(WIDTH, _LEGEND_HEIGHT + _PANEL_HEIGHT * rows), layout="constrained")
         every = figure.subplots(rows, _FAULT_COLUMNS, sharey=True, squeeze=False).ravel()
-        for axes, (kind, of) in zip(every, panels, strict=False):
-            _draw_fault(axes, kind, of)
+        for axes, noises in zip(every, panels.values(), strict=False):
+            _draw_fault(axes, noises, runs)
         for axes in every[len(panels) :]:
             axes.set_visible(False)
-        ratios = np.concatenate([np.ones(1), *(o.runs["ratio"].dropna() for o in outcomes)])
+        ratios = np.append(runs["ratio"].dropna(), 1.0)
         every[0].set_yscale("log")
         every[0].set_ylim(ratios.min() / _ROOM, ratios.max() * _ROOM)
         style.label_logarithms(every[0])
@@ -194,20 +198,23 @@ def plot_faults(outcomes: Sequence[FaultOutcome]) -> Figure:
     return figure
 
 
-def _draw_fault(axes: Axes, kind: str, outcomes: Sequence[FaultOutcome]) -> None:
+def _draw_fault(axes: Axes, noises: Sequence[str], runs: pd.DataFrame) -> None:
     axes.axhline(1.0, color=DARK, linewidth=0.6)
-    for at, outcome in enumerate(outcomes):
-        runs = outcome.runs
-        spread = _SPREAD if len(runs) > 1 else 0.0
-        places = at + np.linspace(-spread, spread, len(runs))
-        for place, *run in zip(places, runs["ratio"], runs["lost_at_end"] == 1.0, runs["told"], strict=True):
+    means = []
+    for at, noise in enumerate(noises):
+        own = runs[runs["noise"] == noise]
+        means.append(own["ratio"].mean())
+        spread = _SPREAD if len(own) > 1 else 0.0
+        places = at + np.linspace(-spread, spread, len(own))
+        for place, *run in zip(places, own["ratio"], own["lost_at_end"] == 1.0, own["told"], strict=True):
             _draw_faulty_run(axes, float(place), *run)
-    means = [(at, o.runs["ratio"].mean()) for at, o in enumerate(outcomes) if o.runs["ratio"].notna().any()]
-    if means:
-        axes.plot(*np.array(means).T, color=BLUE, linewidth=0.9, label="mean", zorder=1)
-    axes.set_xticks(range(len(outcomes)), [f"{outcome.fault.value:g}" for outcome in outcomes])
-    axes.set_xlim(-0.5, len(outcomes) - 0.5)
-    unit = outcomes[0].fault.unit
+    known = np.flatnonzero(~np.isnan(means))
+    if len(known):
+        axes.plot(known, np.array(means)[known], color=BLUE, linewidth=0.9, label="mean", zorder=1)
+    faults = [fault_of(noise) for noise in noises]
+    axes.set_xticks(range(len(faults)), [f"{fault.value:g}" for fault in faults])
+    axes.set_xlim(-0.5, len(faults) - 0.5)
+    kind, unit = faults[0].kind, faults[0].unit
     axes.set_title(_broken(f"{kind} [{unit}]" if unit else kind))
     axes.grid(axis="y")
 
