@@ -20,7 +20,7 @@ from .compare import Comparison, paired_frame, paper_frame
 from .compare import tables as comparison_tables
 from .faults import beside_clean, fault_table, outcomes
 from .frame import times_of, without_times
-from .plots import figures, find_blind_spot, plot_blind_spot, plot_faults, plot_maps
+from .plots import find_blind_spot, plot_blind_spot, plot_differences, plot_faults, plot_maps
 from .study import Study
 from .tables import as_latex, as_markdown, as_text, caption, summary_tables, track_tables
 
@@ -41,8 +41,8 @@ def write_csv(file: Path, frame: pd.DataFrame) -> None:
 
 def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write the tables and the figures of a study, and return the text of its summary."""
-    summary = write_tables(study, frame, out)
-    save_figures(out / "figures", figures(study, frame))
+    summary, differences = write_tables(study, frame, out), plot_differences(study, frame)
+    save_figures(out / "figures", {} if differences is None else {"differences": differences})
     return summary
 
 

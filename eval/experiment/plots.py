@@ -1,4 +1,4 @@
-"""Figures: differences from the baseline, accuracy against size and time, faults, and maps side by side."""
+"""Figures: differences from the baseline, faults, and maps side by side."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.eval.figures import map_plot, style
 from pathspace_graph.eval.figures.map_plot import MARGIN, WHOLE_TRACK, MapStyle
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, MARKERS, ORANGE, PALETTE, RED, WIDTH
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, ORANGE, RED, WIDTH
 from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
 from pathspace_graph.eval.metrics.metric import METRICS, PAPER
 from pathspace_graph.factors.arrays import Array
@@ -23,12 +23,8 @@ from pathspace_graph.labels import BOUNDARIES
 
 from .cells import Outcome
 from .faults import CLEAN, fault_of
-from .frame import COMBINATION, Contrast, contrasts
+from .frame import Contrast, contrasts
 from .study import Study
-
-ACCURACY: Final = "rmse"
-SIZE: Final = "size"
-TIME: Final = "ms_mean"
 
 _MAX_PANELS: Final = 3
 """Most metrics side by side in the figure of differences."""
@@ -36,8 +32,6 @@ _ROW_HEIGHT: Final = 0.24
 """Height of a combination in the figure of differences (in)."""
 _LABELS_HEIGHT: Final = 1.1
 """Height of titles and tick labels there (in)."""
-_SCATTER_HEIGHT: Final = 3.6
-"""Height of each noise in the figures of accuracy (in)."""
 _MEAN_SIZE, _PAIR_SIZE, _MARKER_SIZE = 4.5, 3.5, 4.0
 """Size of the markers of a mean, a single pair and a faulty run (pt)."""
 _JITTER: Final = 0.22
@@ -57,17 +51,6 @@ _TITLE_LENGTH: Final = 30
 """Number of characters at which the title of a panel is broken."""
 
 
-def figures(study: Study, frame: pd.DataFrame) -> dict[str, Figure]:
-    """Draw every figure that the study has runs for, by the name of its file."""
-    with style.figure_context():
-        drawn = {
-            "differences": plot_differences(study, frame),
-            "accuracy_size": plot_against(study, frame, SIZE),
-            "accuracy_time": plot_against(study, frame, TIME),
-        }
-    return {name: figure for name, figure in drawn.items() if figure is not None}
-
-
 # --- differences -----------------------------------------------------------------------------------------
 
 
@@ -82,16 +65,16 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
     if not panels:
         return None
     rows = [i for i in range(len(panels[0])) if any(_is_known(panel[i]) for panel in panels)]
-    figure = Figure(figsize=(WIDTH, _LABELS_HEIGHT + _ROW_HEIGHT * len(rows)), layout="constrained")
-    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, panel in zip(all_axes, panels, strict=True):
-        _draw_differences(axes, [panel[i] for i in rows])
-    names = [_name(study, panels[0][i], COMBINATION) for i in rows]
-    all_axes[0].set_yticks(range(len(rows)), names)
-    all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
-    figure.supxlabel(
-        "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
-    )
+    names = [_name(study, panels[0][i]) for i in rows]
+    with style.figure_context():
+        figure = Figure(figsize=(WIDTH, _LABELS_HEIGHT + _ROW_HEIGHT * len(rows)), layout="constrained")
+        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, panel in zip(all_axes, panels, strict=True):
+            _draw_differences(axes, [panel[i] for i in rows])
+        all_axes[0].set_yticks(range(len(rows)), names)
+        all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
+        text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
+        figure.supxlabel(text)
     return figure
 
 
@@ -112,63 +95,22 @@ def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
         axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=_PAIR_SIZE, zorder=2)
         mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
         look: dict[str, Any] = {"color": color, "markersize": _MEAN_SIZE, "elinewidth": 1.0}
-        axes.errorbar(mean, row, xerr=_bar(half), fmt="o", zorder=3, **look)
+        axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", zorder=3, **look)
     axes.set_title(metric.heading)
     axes.grid(axis="x")
 
 
-def _bar(half: float) -> float | None:
-    """Return the half width of an error bar, or None where it isn't known."""
-    return None if np.isnan(half) else half
-
-
-def _name(study: Study, contrast: Contrast, columns: Sequence[str]) -> str:
+def _name(study: Study, contrast: Contrast) -> str:
     """Return the names of a combination that others have differently, `sigma_spacing=1` for
     `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
     counts = {"noise": study.noise, "estimator": study.estimators, "variant": study.points}
-    several = [getattr(contrast, column) for column in columns if len(counts[column]) > 1]
+    several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
     name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
     last = {field: field.rpartition(".")[2] for field in study.varied}
     if len(set(last.values())) == len(last):
         for field, short in last.items():
             name = name.replace(f"{field}=", f"{short}=")
     return name
-
-
-# --- accuracy against ------------------------------------------------------------------------------------
-
-
-def plot_against(study: Study, frame: pd.DataFrame, metric: str) -> Figure | None:
-    """Draw the mean accuracy of each combination against the mean of another metric, with both intervals."""
-    if metric not in frame or ACCURACY not in frame:
-        return None
-    across, up = contrasts(study, frame, metric), contrasts(study, frame, ACCURACY)
-    figure = Figure(figsize=(WIDTH, _SCATTER_HEIGHT * len(study.noise)), layout="constrained")
-    all_axes = figure.subplots(len(study.noise), 1, squeeze=False)[:, 0]
-    for axes, noise in zip(all_axes, study.noise, strict=True):
-        pairs = [(a, b) for a, b in zip(across, up, strict=True) if a.noise == noise and a.value.count]
-        for index, (a, b) in enumerate(pairs):
-            _draw_point(axes, a, b, index, _name(study, a, COMBINATION[1:]))
-        axes.set(xlabel=METRICS[metric].heading, ylabel=METRICS[ACCURACY].heading)
-        axes.set_title(noise if len(study.noise) > 1 else "")
-        axes.grid()
-    style.shared_legend(figure, loc="outside right upper")
-    return figure
-
-
-def _draw_point(axes: Axes, across: Contrast, up: Contrast, index: int, label: str) -> None:
-    x, y = METRICS[across.metric], METRICS[up.metric]
-    axes.errorbar(
-        x.factor * across.value.mean,
-        y.factor * up.value.mean,
-        xerr=_bar(x.factor * across.value.half),
-        yerr=_bar(y.factor * up.value.half),
-        fmt=MARKERS[index % len(MARKERS)],
-        color=DARK if across.difference is None else PALETTE[index % len(PALETTE)],
-        markersize=_MEAN_SIZE,
-        elinewidth=0.6,
-        label=label,
-    )
 
 
 # --- faults ----------------------------------------------------------------------------------------------
