@@ -7,7 +7,7 @@ slows all alike.
 import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final, Literal, Never
+from typing import Any, Final, Literal
 
 import numpy as np
 import pandas as pd
@@ -15,7 +15,6 @@ from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.estimators import make_online
-from pathspace_graph.eval.experiment.run import Experiment, WorkerDiedError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry, timed_update, timed_wait
@@ -30,6 +29,8 @@ READINGS: Final[Sweep] = "readings"
 LAPS: Final[Sweep] = "laps"
 LEAST_POINTS: Final = 3
 """Least number of points of a slope: two would leave nothing to estimate its error from."""
+Logs = Sequence[tuple[Log, int, Array]]
+"""Log, number of detections where that is varied, and the abscissa of each cycle; NaN doesn't count."""
 JUDGED: Final = 10
 """Number of updates whose mean is compared with the budget."""
 
@@ -182,20 +183,8 @@ def fit_slope(
 # --- the measurement -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class SweepCell:
-    """A sweep of all estimators, one cell of the experiment."""
-
-    sweep: Sweep
-    logs: tuple[tuple[Log, int, Array], ...]
-    """Log, number of detections where that is varied, and the abscissa of each cycle; NaN doesn't count."""
-    edges: Array
-    """Edges of the intervals of the abscissa that are points."""
-    fit_from: float = 0.0
-
-
-def sweeps(drives: Drives, settings: ScalingSettings) -> tuple[SweepCell, ...]:
-    """Return the three sweeps over the drives."""
+def sweeps(drives: Drives, settings: ScalingSettings) -> dict[Sweep, tuple[Logs, Array, float]]:
+    """Return the logs of each sweep, the edges of its points' intervals, and where its slope begins."""
     low, high = np.log(settings.cones_min), np.log(settings.cones_max + 1.0)
     cones = np.exp(np.linspace(low, high, settings.bins + 1))
     lap = 1.0 + np.searchsorted(drives.lap_ends, [cycle.t for cycle in drives.laps.cycles])
@@ -205,11 +194,11 @@ def sweeps(drives: Drives, settings: ScalingSettings) -> tuple[SweepCell, ...]:
         counts[: settings.warm_up] = -1
         dense.append((log, wanted, np.where(counts == wanted, float(wanted), np.nan)))
     ends = np.arange(1.0, len(drives.lap_ends) + 2.0)
-    return (
-        SweepCell(CONES, ((drives.cones, 0, drives.seen),), cones, settings.fit_from),
-        SweepCell(READINGS, tuple(dense), np.append(np.sort(settings.readings), np.inf)),
-        SweepCell(LAPS, ((drives.laps, 0, lap.astype(float)),), ends, 2.0),
-    )
+    return {
+        CONES: ([(drives.cones, 0, drives.seen)], cones, settings.fit_from),
+        READINGS: (dense, np.append(np.sort(settings.readings), np.inf), 0.0),
+        LAPS: ([(drives.laps, 0, lap.astype(float))], ends, 2.0),
+    }
 
 
 def measure_scaling(
@@ -221,29 +210,20 @@ def measure_scaling(
 ) -> Scaling:
     """Measure all three sweeps, and the memory; `on_cycle` is called after each cycle of a sweep."""
     mapper = mapper or MapperSettings()
-
-    def work(cell: SweepCell) -> tuple[pd.DataFrame, list[dict[str, Any]]]:
-        lanes = {Lane(name, log, k): at for name in estimators for log, k, at in cell.logs}
+    points, slopes = [], []
+    for sweep, (logs, edges, fit_from) in sweeps(drives, settings).items():
+        lanes = {Lane(name, log, k): at for name in estimators for log, k, at in logs}
         times = run_lanes(list(lanes), mapper, settings.budget, on_cycle)
-        points, slopes = [], []
         for name in estimators:
             own = [lane for lane in times if lane.lane.estimator == name]
-            points.append(_joined([binned(cell.sweep, lane, lanes[lane.lane], cell.edges) for lane in own]))
+            points.append(_joined([binned(sweep, lane, lanes[lane.lane], edges) for lane in own]))
             stops = [(lane.lane.readings, lane.stopped) for lane in own if lane.stopped]
             stopped = "; ".join(f"{k} readings: {why}" if k else why for k, why in stops)
-            slopes.append(fit_slope(cell.sweep, name, points[-1], cell.fit_from, stopped))
-        return _joined(points), slopes
-
-    def died(cell: SweepCell, error: WorkerDiedError) -> Never:
-        raise error
-
-    # in this process, where estimators take turns
-    found = Experiment(cells=sweeps(drives, settings), work=work, died=died).run(jobs=1)
+            slopes.append(fit_slope(sweep, name, points[-1], fit_from, stopped))
     end = int(np.searchsorted([cycle.t for cycle in drives.laps.cycles], drives.lap_ends[0]))
     first_lap = first_cycles(drives.laps, end)
     memory = {name: peak_memory(Lane(name, first_lap), mapper) for name in estimators}
-    slopes = pd.DataFrame([slope for _, of in found for slope in of])
-    return Scaling(settings, asdict(mapper), _joined([points for points, _ in found]), slopes, memory)
+    return Scaling(settings, asdict(mapper), _joined(points), pd.DataFrame(slopes), memory)
 
 
 def _joined(points: Sequence[pd.DataFrame]) -> pd.DataFrame:
