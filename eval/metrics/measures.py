@@ -1,7 +1,7 @@
 """What is measured of a run: one function measures all metrics, lap by lap and of the whole."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -160,7 +160,8 @@ def _map_values(
     }
     if truth is None or not has_cones(truth):
         return values
-    values |= _cone_values(track, truth) | _curve_values(track, truth, ghost_settings)
+    values |= _cone_values(track, truth) | accuracy.curve_distance(track, truth)
+    values |= accuracy.ghosts(track, truth, ghost_settings)
     values |= _consistency_values(track, truth) | _centre_values(track, truth)
     turn = turn_from_truth(track, truth)
     turns = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
@@ -183,15 +184,6 @@ def _cone_values(track: Map, truth: Truth) -> dict[str, float]:
         "missed_1m": accuracy.missed_share(distances, 1.0),
         "rmse_capped": accuracy.capped_rmse(distances),
     }
-
-
-def _curve_values(track: Map, truth: Truth, ghost_settings: GhostSettings | None) -> dict[str, float]:
-    curve, ghost = (
-        accuracy.curve_distance(track, truth),
-        asdict(accuracy.ghosts(track, truth, ghost_settings)),
-    )
-    counted = {name if name == "duplicates" else f"ghost_{name}": value for name, value in ghost.items()}
-    return {**asdict(curve), "two_way": curve.two_way, **counted}
 
 
 def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
