@@ -350,7 +350,7 @@ def _figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]:
         "isam2": isam2,
         "isam2_p99": isam2_p99,
         **{f"mean_lap_{lap}": value for lap, value in enumerate(laps, start=1)},
-        **{f"mean_{stage.stage}": stage.mean for stage in stage_times(cycles)[1:]},
+        **{f"mean_{stage['stage']}": stage["mean"] for stage in stage_times(cycles)[1:]},
     }
     yield from ((key, 1e3 * seconds, "ms") for key, seconds in milliseconds.items())
 

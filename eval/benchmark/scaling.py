@@ -38,32 +38,27 @@ JUDGED: Final = 10
 # --- lanes -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Lane:
-    """An estimator that is to map a log."""
+    """An estimator that is to map a log, and what was measured, until the log ended or it was stopped."""
 
     estimator: str
     log: Log
+    at: Array = field(default_factory=lambda: np.zeros(0))
+    """Abscissa (n,) of each cycle of the log; NaN doesn't count."""
     readings: int = 0
     """Number of detections in each cycle of the log, where they are varied."""
-
-
-@dataclass(eq=False)
-class LaneTimes:
-    """What was measured in a lane, an entry for each cycle until it ended or was stopped."""
-
-    lane: Lane
     seconds: list[float] = field(default_factory=list)
     """Processor time of each update, s."""
     sizes: list[int] = field(default_factory=list)
     """Number of control points or landmarks after each update."""
     stopped: str = ""
-    """Why the lane did not reach the log's end; empty where it did."""
+    """Why it did not reach the log's end; empty where it did."""
 
     def updates(self, settings: MapperSettings, budget: float) -> Iterator[None]:
         """Do an update at each step, until the log ends or the lane is stopped."""
-        estimator = make_online(self.lane.estimator, settings, self.lane.log)
-        for cycle in split_odometry(self.lane.log):
+        estimator = make_online(self.estimator, settings, self.log)
+        for cycle in split_odometry(self.log):
             try:
                 timed_wait(estimator)
                 estimate, _, seconds = timed_update(estimator, *cycle)
@@ -83,21 +78,19 @@ def run_lanes(
     settings: MapperSettings,
     budget: float,
     on_cycle: Callable[[], None] = lambda: None,
-) -> list[LaneTimes]:
+) -> None:
     """Give cycle k to every lane in turn; the lane that is first moves on by one with k.
 
     So none always follows the same other. A lane is stopped where its last updates took more than `budget`
     (s) on average. BLAS has one thread.
     """
-    times = [LaneTimes(lane) for lane in lanes]
-    runners = [own.updates(settings, budget) for own in times]
+    runners = [lane.updates(settings, budget) for lane in lanes]
     with threadpool_limits(limits=1):
         for cycle in range(max(len(lane.log.cycles) for lane in lanes)):
             first = cycle % len(runners)
             for runner in (*runners[first:], *runners[:first]):
                 next(runner, None)
             on_cycle()
-    return times
 
 
 def peak_memory(lane: Lane, settings: MapperSettings) -> float:
@@ -152,13 +145,14 @@ class Scaling:
         return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
 
 
-def binned(sweep: Sweep, times: LaneTimes, at: Array, edges: Array) -> pd.DataFrame:
-    """Return a point for each interval between two `edges` that holds cycles; `at` (n,): their abscissas."""
-    frame = pd.DataFrame({"at": at[: len(times.seconds)], "seconds": times.seconds, "size": times.sizes})
+def binned(sweep: Sweep, lane: Lane, edges: Array) -> pd.DataFrame:
+    """Return a point for each interval between two `edges` that holds cycles of a lane."""
+    at = lane.at[: len(lane.seconds)]
+    frame = pd.DataFrame({"at": at, "seconds": lane.seconds, "size": lane.sizes})
     bins = np.searchsorted(edges, frame["at"], side="right") - 1
     inside = (bins >= 0) & (bins < len(edges) - 1)
     points = frame[inside].groupby(bins[inside])
-    means = points.mean().assign(sweep=sweep, estimator=times.lane.estimator, cycles=points.size())
+    means = points.mean().assign(sweep=sweep, estimator=lane.estimator, cycles=points.size())
     return means[["sweep", "estimator", "at", "seconds", "cycles", "size"]].reset_index(drop=True)
 
 
@@ -212,12 +206,12 @@ def measure_scaling(
     mapper = mapper or MapperSettings()
     points, slopes = [], []
     for sweep, (logs, edges, fit_from) in sweeps(drives, settings).items():
-        lanes = {Lane(name, log, k): at for name in estimators for log, k, at in logs}
-        times = run_lanes(list(lanes), mapper, settings.budget, on_cycle)
+        lanes = [Lane(name, log, at, k) for name in estimators for log, k, at in logs]
+        run_lanes(lanes, mapper, settings.budget, on_cycle)
         for name in estimators:
-            own = [lane for lane in times if lane.lane.estimator == name]
-            points.append(_joined([binned(sweep, lane, lanes[lane.lane], edges) for lane in own]))
-            stops = [(lane.lane.readings, lane.stopped) for lane in own if lane.stopped]
+            own = [lane for lane in lanes if lane.estimator == name]
+            points.append(_joined([binned(sweep, lane, edges) for lane in own]))
+            stops = [(lane.readings, lane.stopped) for lane in own if lane.stopped]
             stopped = "; ".join(f"{k} readings: {why}" if k else why for k, why in stops)
             slopes.append(fit_slope(sweep, name, points[-1], fit_from, stopped))
     end = int(np.searchsorted([cycle.t for cycle in drives.laps.cycles], drives.lap_ends[0]))

@@ -16,6 +16,7 @@ from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBounda
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.settings.checked import Positive
+from pathspace_graph.sim.curves import along_polyline, arc_lengths
 from pathspace_graph.spline.bspline import BSpline
 
 MISSED_DISTANCE = 3.0
@@ -135,7 +136,7 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     closed = len(cones) > _OVERLAP and len(truth.poses) > 0 and len(lap_end_indices(truth.poses)) > 0
     nodes = np.concatenate([cones[-_OVERLAP:], cones, cones[: _OVERLAP + 1]]) if closed else cones
     nodes = nodes[np.append(True, np.linalg.norm(np.diff(nodes, axis=0), axis=1) > 0.0)]
-    length = lengths_along(nodes)
+    length = arc_lengths(nodes)
     low, high = (length[_OVERLAP], length[-_OVERLAP - 1]) if closed else (length[0], length[-1])
     samples = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
     return np.asarray(scipy.interpolate.Akima1DInterpolator(length, nodes)(samples), dtype=float)
@@ -159,14 +160,9 @@ def _first_lap(truth: Truth) -> Array:
     """Return points (n, 2) of the true path up to the end of lap 1, at most PATH_STEP apart."""
     ends = lap_end_indices(truth.poses)
     path = truth.poses[: ends[0] + 1 if len(ends) else None, :2]
-    length = lengths_along(path)
+    length = arc_lengths(path)
     samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / PATH_STEP)) + 1)
-    return np.stack([np.interp(samples, length, coordinate) for coordinate in path.T], axis=1)
-
-
-def lengths_along(points: Array) -> Array:
-    """Return the length (n,) along a polygon from the first of its points (n, 2) to each of them (m)."""
-    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    return along_polyline(samples, length, path)
 
 
 def _perimeter(points: Array) -> float:
