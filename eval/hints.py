@@ -21,7 +21,7 @@ from tyro.conf import arg
 from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import PathspaceError, SolveError, check_name
 from pathspace_graph.estimators import DEFAULT, make_online
-from pathspace_graph.eval.experiment.cells import NamedTrack, load_tracks
+from pathspace_graph.eval.experiment.cells import load_tracks
 from pathspace_graph.eval.experiment.run import Experiment, OnCell, WorkerDiedError
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
@@ -36,6 +36,7 @@ from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.mistakes import MISTAKES
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track import Track
 
 Row = dict[str, Any]
 
@@ -87,12 +88,11 @@ class Good:
     open_road: bool = False
     """Whether the track is open: its second half is not there."""
 
-    def log(self, track: NamedTrack, seed: int, laps: int) -> Log:
-        cones = track.track
+    def log(self, track: Track, seed: int, laps: int) -> Log:
         if self.open_road:
-            left, right = cones.left[: len(cones.left) // 2], cones.right[: len(cones.right) // 2]
-            cones = replace(cones, left=left, right=right, closed=False)
-        log = simulate(cones, replace(self.simulation, laps=laps), seed)
+            left, right = track.left[: len(track.left) // 2], track.right[: len(track.right) // 2]
+            track = replace(track, left=left, right=right, closed=False)
+        log = simulate(track, replace(self.simulation, laps=laps), seed)
         return log if self.edit is None else self.edit(log)
 
 
@@ -224,7 +224,7 @@ class HintStudy:
             check_name(name, GOOD, "--kinds: expected a known kind of good log")
         kinds = tuple(kind for kind in GOOD if self.good or kind in self.kinds)
         tracks = load_tracks([int(one) if one.isdigit() else Path(one) for one in self.tracks])
-        cells = [HintCell(self, *cell) for cell in product(tracks, self.seeds, kinds)]
+        cells = [*product([self], tracks, self.seeds, kinds)]
         rows = Experiment(cells=cells, work=judge, died=lost).run(self.jobs, on_cell=on_cell)
         return pd.DataFrame([row for of in rows for row in of])
 
@@ -240,32 +240,28 @@ class HintStudy:
         return table
 
 
-@dataclass(frozen=True, eq=False)
-class HintCell:
-    """Logs of one kind of one drive."""
-
-    study: HintStudy
-    track: NamedTrack
-    seed: int
-    kind: str
+HintCell = tuple[HintStudy, Track, int, str]
+"""Logs of one kind of one drive: the study, the track, the seed and the kind."""
 
 
 def judge(cell: HintCell) -> list[Row]:
     """Return a row for the good log of a cell, and for each of those that are spoiled."""
-    study, spoil = cell.study, cell.kind in cell.study.kinds
-    log = GOOD[cell.kind].log(cell.track, cell.seed, study.laps)
-    good: Row = {"kind": "good", "name": cell.kind, "of": cell.kind}
+    study, track, seed, kind = cell
+    spoil = kind in study.kinds
+    log = GOOD[kind].log(track, seed, study.laps)
+    good: Row = {"kind": "good", "name": kind, "of": kind}
     rows = [good | judged(log)] if study.good else []
     clean = mapped(log) if study.maps and spoil else {}
     for name in study.mistakes if spoil else ():
         spoiled = MISTAKES[name](log)
-        row = {"of": cell.kind, "kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))}
+        row = {"of": kind, "kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))}
         rows.append(row | (outcome(mapped(spoiled), clean) if study.maps else {}))
-    return [{"track": cell.track.name, "seed": cell.seed} | row for row in rows]
+    return [{"track": track.name, "seed": seed} | row for row in rows]
 
 
 def lost(cell: HintCell, error: WorkerDiedError) -> Never:
-    raise SolveError(f"{cell.kind} on {cell.track.name}: {error}")
+    _, track, _, kind = cell
+    raise SolveError(f"{kind} on {track.name}: {error}")
 
 
 def causes_of(mistake: str) -> tuple[str, ...]:

@@ -23,9 +23,10 @@ from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.curves import arc_lengths
 
 from .experiment.cells import run_estimator
-from .metrics.accuracy import crossings, lengths_along
+from .metrics.accuracy import crossings
 from .metrics.reference import aligned_distance
 from .metrics.summary import summarize
 from .views import Figure, View
@@ -96,7 +97,7 @@ def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Ar
     short enough for odometry, and the constant errors of the sensor are taken out.
     """
     poses = np.array([cycle.pose for cycle in cycles])
-    path = lengths_along(poses[:, :2])
+    path = arc_lengths(poses[:, :2])
     if path[-1] < FIRST + LAST:
         return None
     first = [cycle for cycle, s in zip(cycles, path, strict=True) if s <= FIRST]

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -42,28 +43,17 @@ ABLATIONS: Final = ("gauge", "robust", "density", "lag", "relinearize", "degree"
 ONE_SEED: Final = ("gauge", "robust")
 """Those with so many variants that they are driven with one seed."""
 PAGES: Final = {
-    "readme-accuracy": "README.md",
-    "readme-compared": "README.md",
-    "readme-speed": "README.md",
-    "results-speed": "docs/results.md",
-    "results-tracks": "docs/results.md",
-    "results-laps": "docs/results.md",
-    "results-compared": "docs/results.md",
-    "results-scaling": "docs/results.md",
-    "readme-real": "README.md",
-    **dict.fromkeys(("real-runs", "real-maps", "real-measured"), "docs/real.md"),
-    "skidpad": "docs/closing.md",
-    "camera": "docs/studies.md",
-    "closing": "docs/studies.md",
-    "hard": "docs/studies.md",
-    "endurance": "docs/studies.md",
-    "reach": "docs/studies.md",
-    "paper": "docs/studies.md",
-    **dict.fromkeys(("faults", "recovery", "hints"), "docs/reliability.md"),
-    "centerline": "docs/ablations.md",
-    **dict.fromkeys(ABLATIONS, "docs/ablations.md"),
+    "README.md": ("readme-accuracy", "readme-compared", "readme-speed", "readme-real"),
+    "docs/results.md": (
+        *("results-speed", "results-tracks", "results-laps", "results-compared", "results-scaling"),
+    ),
+    "docs/real.md": ("real-runs", "real-maps", "real-measured"),
+    "docs/closing.md": ("skidpad",),
+    "docs/studies.md": ("camera", "closing", "hard", "endurance", "reach", "paper"),
+    "docs/reliability.md": ("faults", "recovery", "hints"),
+    "docs/ablations.md": ("centerline", *ABLATIONS),
 }
-"""Page of each table, from the root of the project."""
+"""Tables of each page, from the root of the project."""
 GENERATED: Final = (0, 1, 2)
 """Seeds of the generated tracks."""
 SPEED: Final = {
@@ -339,8 +329,7 @@ def render_pages(root: Path, tables: Tables) -> dict[Path, str]:
     """Return the text of each page below a root, with its tables; InputError where one is not known."""
     sources = sources_digest()
     return {
-        root / page: render(root / page, read_text(root / page, "a page"), tables, sources)
-        for page in dict.fromkeys(PAGES.values())
+        root / page: render(root / page, read_text(root / page, "a page"), tables, sources) for page in PAGES
     }
 
 
@@ -351,7 +340,7 @@ def render(page: Path, text: str, tables: Tables, sources: str) -> str:
 
 def _rendered(page: Path, tables: Tables, sources: str, found: re.Match[str]) -> str:
     begin, name, _, end = found.groups()
-    if name not in tables and name not in PAGES:
+    if name not in {*tables, *chain.from_iterable(PAGES.values())}:
         raise InputError(page, f"expected a table of the report, found {name}")
     shown = tables[name].markdown(sources) if name in tables else "\n*Not measured yet.*\n\n"
     return f"{begin}{shown}{end}"

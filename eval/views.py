@@ -190,14 +190,13 @@ def hints_table(rows: pd.DataFrame) -> View:
 def faults_table(study: Study, frame: pd.DataFrame, columns: Mapping[str, tuple[str, int]] = FAULTS) -> View:
     """Return what each fault costs by the clean run on the same track, and whether anything was said."""
     rows = []
-    for outcome in outcomes(study, frame):
-        values, runs = outcome.values(), max(len(outcome.runs), 1)
-        values |= {name: values[name] / runs for name in ("closed", "lost", "told")}
+    for noise, values in zip(study.noise, outcomes(study, frame), strict=True):
+        values |= {name: values[name] / max(values["runs"], 1) for name in ("closed", "lost", "told")}
         figures = tuple(
             Figure.of([values[key]], digits, 100.0 if "%" in title else 1.0)
             for title, (key, digits) in columns.items()
         )
-        rows.append((f"{outcome.fault.kind}: {outcome.fault.strength}".removesuffix(": "), figures))
+        rows.append((noise, figures))
     return ("fault", *columns), tuple(rows)
 
 

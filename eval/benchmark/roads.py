@@ -1,6 +1,6 @@
 """Roads and drives to measure time by: ever more cones, ever more detections, and lap after lap."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,31 +17,22 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
-
-@dataclass(frozen=True)
-class RoadSettings(Positive):
-    """Roads and the drives on them."""
-
-    gap: float = 5.0
-    """Distance of the cones of a row (m)."""
-    dense_gap: float = 1.0
-    """Distance of the cones of a row on the dense road, where detections are counted (m)."""
-    dense_range: float = 30.0
-    """Range of the sensor on the dense road (m)."""
-    width: float = 4.0
-    """Distance of the rows (m)."""
-    swing: float = 0.9
-    """Largest turn of an open road from its general direction (rad)."""
-    wavelength: float = 300.0
-    """Distance of the swings of an open road along it (m)."""
-    dent: float = 0.12
-    """Share of the radius by which a closed road leaves its circle."""
-    dents: int = 3
-    """Number of dents of a closed road."""
-    speed: float = 20.0
-    """Speed of the vehicle (m/s)."""
-    acceleration_lateral: float = 9.0
-    """Largest lateral acceleration in corners (m/s^2)."""
+GAP, DENSE_GAP = 5.0, 1.0
+"""Distances of the cones of a row on a road, and on the dense one, where detections are counted (m)."""
+DENSE_RANGE: Final = 30.0
+"""Range of the sensor on the dense road (m)."""
+WIDTH: Final = 4.0
+"""Distance of the rows (m)."""
+SWING, WAVELENGTH = 0.9, 300.0
+"""Largest turn of an open road from its general direction (rad), and the distance of its swings (m)."""
+DENT, DENTS = 0.12, 3
+"""Share of the radius by which a closed road leaves its circle, and how often it does."""
+SPEED, LATERAL = 20.0, 9.0
+"""Speed of the vehicle (m/s) and its largest lateral acceleration (m/s^2)."""
+STEP: Final = 0.25
+"""Distance of the samples of a road's middle (m)."""
+SPARE: Final = 1.1
+"""Factor by which an open road has more cones than are to be seen, since some are never detected."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +61,6 @@ class ScalingSettings(Positive):
     """Mean update at which an estimator is stopped (s)."""
     seed: int = 1
     """Seed of the drives and of the choice of detections."""
-    road: RoadSettings = field(default_factory=RoadSettings)
-    """Roads and the drives on them."""
 
     def __post_init__(self) -> None:
         """Raise SettingsError as well where a range is empty."""
@@ -94,11 +83,6 @@ QUICK: Final = ScalingSettings(
     budget=0.1,
 )
 """Preset that takes less than a minute and shows that everything works; its slopes mean little."""
-
-STEP: Final = 0.25
-"""Distance of the samples of a road's middle (m)."""
-SPARE: Final = 1.1
-"""Factor by which an open road has more cones than are to be seen, since some are never detected."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +108,13 @@ class Drives:
 
 def make_drives(settings: ScalingSettings) -> Drives:
     """Simulate the drives that the estimators are to be timed on."""
-    road, seed = settings.road, settings.seed
-    long = drive_log(open_road(int(settings.cones_max), road.gap, road), road, seed)
+    seed = settings.seed
+    long = drive_log(open_road(int(settings.cones_max), GAP), seed)
     seen = cones_seen(long)
     count = int(np.searchsorted(seen, settings.cones_max)) + 1
-    dense = drive_log(open_road(settings.readings_cones, road.dense_gap, road), road, seed, dense=True)
+    dense = drive_log(open_road(settings.readings_cones, DENSE_GAP), seed, dense=True)
     rng = np.random.default_rng(seed)
-    laps = drive_log(closed_road(settings.laps_cones, road), road, seed, settings.laps)
+    laps = drive_log(closed_road(settings.laps_cones), seed, settings.laps)
     return Drives(
         cones=first_cycles(long, count),
         seen=seen[:count].astype(float),
@@ -143,33 +127,33 @@ def make_drives(settings: ScalingSettings) -> Drives:
 # --- roads -----------------------------------------------------------------------------------------------
 
 
-def open_road(cones: int, gap: float, settings: RoadSettings) -> Track:
+def open_road(cones: int, gap: float) -> Track:
     """Return a winding road that never comes near itself, on which at least `cones` cones can be seen.
 
-    Its heading is `swing * sin(2 pi s / wavelength)` at the length s along it; cones are `gap` (m) apart.
+    Its heading is `SWING * sin(2 pi s / WAVELENGTH)` at the length s along it; cones are `gap` (m) apart.
     """
     length = SPARE * cones / 2 * gap
     s = np.arange(0.0, length, STEP)
-    heading = settings.swing * np.sin(2 * np.pi * s / settings.wavelength)
+    heading = SWING * np.sin(2 * np.pi * s / WAVELENGTH)
     middle = STEP * np.cumsum(np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
-    return _with_rows(middle, gap, settings, closed=False)
+    return _with_rows(middle, gap, closed=False)
 
 
-def closed_road(cones: int, settings: RoadSettings) -> Track:
-    """Return a dented circle with about `cones` cones: `r = 1 + dent cos(dents phi)`, scaled."""
-    phi = np.linspace(0.0, 2 * np.pi, max(int(cones * settings.gap / STEP), 100))
-    r = 1.0 + settings.dent * np.cos(settings.dents * phi)
+def closed_road(cones: int) -> Track:
+    """Return a dented circle with about `cones` cones: `r = 1 + DENT cos(DENTS phi)`, scaled."""
+    phi = np.linspace(0.0, 2 * np.pi, max(int(cones * GAP / STEP), 100))
+    r = 1.0 + DENT * np.cos(DENTS * phi)
     unscaled = r[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
-    middle = unscaled * (cones / 2 * settings.gap / arc_lengths(unscaled)[-1])
-    return _with_rows(middle, settings.gap, settings, closed=True)
+    middle = unscaled * (cones / 2 * GAP / arc_lengths(unscaled)[-1])
+    return _with_rows(middle, GAP, closed=True)
 
 
-def _with_rows(middle: Array, gap: float, settings: RoadSettings, closed: bool) -> Track:
+def _with_rows(middle: Array, gap: float, closed: bool) -> Track:
     """Return the road with cones on both sides of its middle (n, 2), `gap` (m) apart."""
     tangents = unit(np.gradient(middle, axis=0))
     rows = []
     for side in (0.5, -0.5):
-        row = middle + side * settings.width * left_normals(tangents)
+        row = middle + side * WIDTH * left_normals(tangents)
         s = arc_lengths(row)
         at = np.linspace(0.0, s[-1], max(round(s[-1] / gap), 2), endpoint=not closed)
         rows.append(along_polyline(at, s, row))
@@ -180,11 +164,10 @@ def _with_rows(middle: Array, gap: float, settings: RoadSettings, closed: bool) 
 # --- logs ------------------------------------------------------------------------------------------------
 
 
-def drive_log(track: Track, settings: RoadSettings, seed: int, laps: int = 1, dense: bool = False) -> Log:
+def drive_log(track: Track, seed: int, laps: int = 1, dense: bool = False) -> Log:
     """Simulate a drive along a road at full speed from the start on."""
-    speed, lateral = settings.speed, settings.acceleration_lateral
-    vehicle = VehicleSettings(speed_max=speed, speed_start=speed, acceleration_lateral=lateral)
-    sensor = SensorSettings(range_max=settings.dense_range) if dense else SensorSettings()
+    vehicle = VehicleSettings(speed_max=SPEED, speed_start=SPEED, acceleration_lateral=LATERAL)
+    sensor = SensorSettings(range_max=DENSE_RANGE) if dense else SensorSettings()
     return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, sensor=sensor), seed)
 
 

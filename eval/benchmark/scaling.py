@@ -7,7 +7,7 @@ slows all alike.
 import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final, Literal, Never
+from typing import Any, Final, Literal
 
 import numpy as np
 import pandas as pd
@@ -15,7 +15,6 @@ from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.estimators import make_online
-from pathspace_graph.eval.experiment.run import Experiment, WorkerDiedError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry, timed_update, timed_wait
@@ -30,6 +29,8 @@ READINGS: Final[Sweep] = "readings"
 LAPS: Final[Sweep] = "laps"
 LEAST_POINTS: Final = 3
 """Least number of points of a slope: two would leave nothing to estimate its error from."""
+Logs = Sequence[tuple[Log, int, Array]]
+"""Log, number of detections where that is varied, and the abscissa of each cycle; NaN doesn't count."""
 JUDGED: Final = 10
 """Number of updates whose mean is compared with the budget."""
 
@@ -37,32 +38,27 @@ JUDGED: Final = 10
 # --- lanes -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Lane:
-    """An estimator that is to map a log."""
+    """An estimator that is to map a log, and what was measured, until the log ended or it was stopped."""
 
     estimator: str
     log: Log
+    at: Array = field(default_factory=lambda: np.zeros(0))
+    """Abscissa (n,) of each cycle of the log; NaN doesn't count."""
     readings: int = 0
     """Number of detections in each cycle of the log, where they are varied."""
-
-
-@dataclass(eq=False)
-class LaneTimes:
-    """What was measured in a lane, an entry for each cycle until it ended or was stopped."""
-
-    lane: Lane
     seconds: list[float] = field(default_factory=list)
     """Processor time of each update, s."""
     sizes: list[int] = field(default_factory=list)
     """Number of control points or landmarks after each update."""
     stopped: str = ""
-    """Why the lane did not reach the log's end; empty where it did."""
+    """Why it did not reach the log's end; empty where it did."""
 
     def updates(self, settings: MapperSettings, budget: float) -> Iterator[None]:
         """Do an update at each step, until the log ends or the lane is stopped."""
-        estimator = make_online(self.lane.estimator, settings, self.lane.log)
-        for cycle in split_odometry(self.lane.log):
+        estimator = make_online(self.estimator, settings, self.log)
+        for cycle in split_odometry(self.log):
             try:
                 timed_wait(estimator)
                 estimate, _, seconds = timed_update(estimator, *cycle)
@@ -82,21 +78,19 @@ def run_lanes(
     settings: MapperSettings,
     budget: float,
     on_cycle: Callable[[], None] = lambda: None,
-) -> list[LaneTimes]:
+) -> None:
     """Give cycle k to every lane in turn; the lane that is first moves on by one with k.
 
     So none always follows the same other. A lane is stopped where its last updates took more than `budget`
     (s) on average. BLAS has one thread.
     """
-    times = [LaneTimes(lane) for lane in lanes]
-    runners = [own.updates(settings, budget) for own in times]
+    runners = [lane.updates(settings, budget) for lane in lanes]
     with threadpool_limits(limits=1):
         for cycle in range(max(len(lane.log.cycles) for lane in lanes)):
             first = cycle % len(runners)
             for runner in (*runners[first:], *runners[:first]):
                 next(runner, None)
             on_cycle()
-    return times
 
 
 def peak_memory(lane: Lane, settings: MapperSettings) -> float:
@@ -151,13 +145,14 @@ class Scaling:
         return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
 
 
-def binned(sweep: Sweep, times: LaneTimes, at: Array, edges: Array) -> pd.DataFrame:
-    """Return a point for each interval between two `edges` that holds cycles; `at` (n,): their abscissas."""
-    frame = pd.DataFrame({"at": at[: len(times.seconds)], "seconds": times.seconds, "size": times.sizes})
+def binned(sweep: Sweep, lane: Lane, edges: Array) -> pd.DataFrame:
+    """Return a point for each interval between two `edges` that holds cycles of a lane."""
+    at = lane.at[: len(lane.seconds)]
+    frame = pd.DataFrame({"at": at, "seconds": lane.seconds, "size": lane.sizes})
     bins = np.searchsorted(edges, frame["at"], side="right") - 1
     inside = (bins >= 0) & (bins < len(edges) - 1)
     points = frame[inside].groupby(bins[inside])
-    means = points.mean().assign(sweep=sweep, estimator=times.lane.estimator, cycles=points.size())
+    means = points.mean().assign(sweep=sweep, estimator=lane.estimator, cycles=points.size())
     return means[["sweep", "estimator", "at", "seconds", "cycles", "size"]].reset_index(drop=True)
 
 
@@ -182,20 +177,8 @@ def fit_slope(
 # --- the measurement -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class SweepCell:
-    """A sweep of all estimators, one cell of the experiment."""
-
-    sweep: Sweep
-    logs: tuple[tuple[Log, int, Array], ...]
-    """Log, number of detections where that is varied, and the abscissa of each cycle; NaN doesn't count."""
-    edges: Array
-    """Edges of the intervals of the abscissa that are points."""
-    fit_from: float = 0.0
-
-
-def sweeps(drives: Drives, settings: ScalingSettings) -> tuple[SweepCell, ...]:
-    """Return the three sweeps over the drives."""
+def sweeps(drives: Drives, settings: ScalingSettings) -> dict[Sweep, tuple[Logs, Array, float]]:
+    """Return the logs of each sweep, the edges of its points' intervals, and where its slope begins."""
     low, high = np.log(settings.cones_min), np.log(settings.cones_max + 1.0)
     cones = np.exp(np.linspace(low, high, settings.bins + 1))
     lap = 1.0 + np.searchsorted(drives.lap_ends, [cycle.t for cycle in drives.laps.cycles])
@@ -205,11 +188,11 @@ def sweeps(drives: Drives, settings: ScalingSettings) -> tuple[SweepCell, ...]:
         counts[: settings.warm_up] = -1
         dense.append((log, wanted, np.where(counts == wanted, float(wanted), np.nan)))
     ends = np.arange(1.0, len(drives.lap_ends) + 2.0)
-    return (
-        SweepCell(CONES, ((drives.cones, 0, drives.seen),), cones, settings.fit_from),
-        SweepCell(READINGS, tuple(dense), np.append(np.sort(settings.readings), np.inf)),
-        SweepCell(LAPS, ((drives.laps, 0, lap.astype(float)),), ends, 2.0),
-    )
+    return {
+        CONES: ([(drives.cones, 0, drives.seen)], cones, settings.fit_from),
+        READINGS: (dense, np.append(np.sort(settings.readings), np.inf), 0.0),
+        LAPS: ([(drives.laps, 0, lap.astype(float))], ends, 2.0),
+    }
 
 
 def measure_scaling(
@@ -221,29 +204,20 @@ def measure_scaling(
 ) -> Scaling:
     """Measure all three sweeps, and the memory; `on_cycle` is called after each cycle of a sweep."""
     mapper = mapper or MapperSettings()
-
-    def work(cell: SweepCell) -> tuple[pd.DataFrame, list[dict[str, Any]]]:
-        lanes = {Lane(name, log, k): at for name in estimators for log, k, at in cell.logs}
-        times = run_lanes(list(lanes), mapper, settings.budget, on_cycle)
-        points, slopes = [], []
+    points, slopes = [], []
+    for sweep, (logs, edges, fit_from) in sweeps(drives, settings).items():
+        lanes = [Lane(name, log, at, k) for name in estimators for log, k, at in logs]
+        run_lanes(lanes, mapper, settings.budget, on_cycle)
         for name in estimators:
-            own = [lane for lane in times if lane.lane.estimator == name]
-            points.append(_joined([binned(cell.sweep, lane, lanes[lane.lane], cell.edges) for lane in own]))
-            stops = [(lane.lane.readings, lane.stopped) for lane in own if lane.stopped]
+            own = [lane for lane in lanes if lane.estimator == name]
+            points.append(_joined([binned(sweep, lane, edges) for lane in own]))
+            stops = [(lane.readings, lane.stopped) for lane in own if lane.stopped]
             stopped = "; ".join(f"{k} readings: {why}" if k else why for k, why in stops)
-            slopes.append(fit_slope(cell.sweep, name, points[-1], cell.fit_from, stopped))
-        return _joined(points), slopes
-
-    def died(cell: SweepCell, error: WorkerDiedError) -> Never:
-        raise error
-
-    # in this process, where estimators take turns
-    found = Experiment(cells=sweeps(drives, settings), work=work, died=died).run(jobs=1)
+            slopes.append(fit_slope(sweep, name, points[-1], fit_from, stopped))
     end = int(np.searchsorted([cycle.t for cycle in drives.laps.cycles], drives.lap_ends[0]))
     first_lap = first_cycles(drives.laps, end)
     memory = {name: peak_memory(Lane(name, first_lap), mapper) for name in estimators}
-    slopes = pd.DataFrame([slope for _, of in found for slope in of])
-    return Scaling(settings, asdict(mapper), _joined([points for points, _ in found]), slopes, memory)
+    return Scaling(settings, asdict(mapper), _joined(points), pd.DataFrame(slopes), memory)
 
 
 def _joined(points: Sequence[pd.DataFrame]) -> pd.DataFrame:

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError, check_name
-from pathspace_graph.eval.metrics.measures import Row, StageTime, measure, online_cycles, stage_times
+from pathspace_graph.eval.metrics.measures import Row, measure
 from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times, versions
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
@@ -49,27 +49,18 @@ _latest: dict[str, Log] = {}
 """The log that was simulated last, by its drive."""
 
 
-@dataclass(frozen=True, eq=False)
-class NamedTrack:
-    """A track with the name that it has in the results."""
-
-    name: str
-    track: Track
-
-    @cached_property
-    def digest(self) -> str:
-        """Identity of the geometry, wherever it came from."""
-        track = self.track
-        parts = (track.left, track.right, track.other, track.start, track.cone_labels)
-        cones = b"|".join(np.ascontiguousarray(part, dtype=float).tobytes() for part in parts)
-        return hashlib.sha256(cones + str(self.track.closed).encode()).hexdigest()[:_IDENTITY_DIGITS]
+def track_digest(track: Track) -> str:
+    """Return the identity of a track's geometry, wherever it came from."""
+    parts = (track.left, track.right, track.other, track.start, track.cone_labels)
+    cones = b"|".join(np.ascontiguousarray(part, dtype=float).tobytes() for part in parts)
+    return hashlib.sha256(cones + str(track.closed).encode()).hexdigest()[:_IDENTITY_DIGITS]
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
     """One lap or more on a track."""
 
-    track: NamedTrack
+    track: Track
     seed: int
     """Number of the drive on its track."""
     noise: str
@@ -82,12 +73,13 @@ class Drive:
     @cached_property
     def own_seed(self) -> int:
         """Seed of the simulation: drives of one seed on several tracks are independent samples."""
-        return int(identity(track=self.track.digest, seed=self.seed)[:_SEED_DIGITS], 16)
+        return int(identity(track=track_digest(self.track), seed=self.seed)[:_SEED_DIGITS], 16)
 
     @cached_property
     def id(self) -> str:
         """Identity of everything that the log depends on, except the code."""
-        return identity(track=self.track.digest, seed=self.own_seed, simulation=asdict(self.simulation))
+        geometry = track_digest(self.track)
+        return identity(track=geometry, seed=self.own_seed, simulation=asdict(self.simulation))
 
     def load(self) -> Log:
         """Return the log; the last one is kept, since cells are in the order of their logs."""
@@ -97,7 +89,7 @@ class Drive:
         return _latest[self.id]
 
     def simulate(self) -> Log:
-        return simulate(self.track.track, self.simulation, self.own_seed)
+        return simulate(self.track, self.simulation, self.own_seed)
 
 
 def identity(**parts: Any) -> str:
@@ -119,11 +111,11 @@ def code_digest(rooms: tuple[str, ...]) -> str:
     return digest.hexdigest()[:_CODE_DIGITS]
 
 
-def load_tracks(tracks: Iterable[Path | int]) -> list[NamedTrack]:
-    """Read or generate tracks and name each of them; a folder stands for every track file in it.
+def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:
+    """Read or generate tracks, with the names that they have in the results.
 
-    A number is the seed of a generated track, and the name of an event its track. InputError where a file is
-    no track or a folder has none.
+    A folder stands for every track file in it, a number is the seed of a generated track, and the name of an
+    event stands for its track. InputError where a file is no track or a folder has none.
     """
     every = [track for entry in tracks for track in _expanded(entry)]
     stems = [track.stem for track in every if isinstance(track, Path)]
@@ -139,14 +131,14 @@ def _expanded(entry: Path | int) -> list[Path | int]:
     return [*files]
 
 
-def _load(track: Path | int, stems: list[str]) -> NamedTrack:
+def _load(track: Path | int, stems: list[str]) -> Track:
     if isinstance(track, int):
-        return NamedTrack(f"generated {track}", generate_track(np.random.default_rng(track)))
+        return replace(generate_track(np.random.default_rng(track)), name=f"generated {track}")
     if track.name in EVENTS and not track.exists():
-        return NamedTrack(track.name, EVENTS[track.name]())
+        return EVENTS[track.name]()
     _check_file(track)
     folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
-    return NamedTrack(f"{folder}{track.stem}", read_track(track))
+    return replace(read_track(track), name=f"{folder}{track.stem}")
 
 
 def _check_file(file: Path) -> None:
@@ -228,8 +220,6 @@ class Outcome:
     names: Mapping[str, Any]
     rows: Sequence[Row] = ()
     """Metrics of each lap and, as the last row, of the whole run; none where the cell failed."""
-    times: Sequence[StageTime] = ()
-    """Times of the cycles and of their stages; a batch has none."""
     result: RunResult | None = None
     """Result of the run; None where the cell failed."""
     failure: str = ""
@@ -259,8 +249,7 @@ def run_cell(cell: Cell[Any]) -> Outcome:
             begin = time.perf_counter()
             result = run_estimator(cell.estimator, cell.settings, log)
             seconds = time.perf_counter() - begin - result.observing
-            rows, cycles = measure(result, log, seconds, **cell.measured), online_cycles(result)
-            return Outcome(cell.names, rows, stage_times(cycles) if cycles else (), result)
+            return Outcome(cell.names, measure(result, log, seconds, **cell.measured), result)
     except Exception as error:  # whatever ends a run belongs into the results
         return Outcome.failed(cell, error)
 

@@ -13,6 +13,7 @@ import pandas as pd
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
+from pathspace_graph.eval.metrics.measures import online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.eval.metrics.summary import has_cones
@@ -81,7 +82,12 @@ class Comparison:
 
     def times(self) -> pd.DataFrame:
         """Return a tidy row per run and stage, in s."""
-        rows = [{**outcome.names, **asdict(stage)} for outcome in self.outcomes for stage in outcome.times]
+        rows = [
+            {**outcome.names, **stage}
+            for outcome in self.outcomes
+            if outcome.result is not None
+            for stage in stage_times(online_cycles(outcome.result))
+        ]
         return pd.DataFrame(rows, columns=[*RUN, "stage", "mean", "median", "p99", "share"])
 
     def of(self, log: str) -> list[Outcome]:

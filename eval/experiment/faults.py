@@ -33,10 +33,17 @@ NOTHING: Final = "nothing"
 """Text where no run said anything."""
 _SAID_LENGTH: Final = 60
 """Number of characters that a notice is shortened to; the JSON file has the whole of it."""
-_MEASURED: Final = [
-    *("rmse", "size", "missed", "closed_at_end", "lost_at_end", "error_max", "error_end"),
-    *("astray_time", "astray_way", "told_degraded", "told_lost"),
-]
+_WORST: Final = ("error_max", "error_end", "astray_time", "astray_way")
+_MEASURED: Final = (
+    "rmse",
+    "size",
+    "missed",
+    "closed_at_end",
+    "lost_at_end",
+    *_WORST,
+    "told_degraded",
+    "told_lost",
+)
 _NAME: Final = re.compile(r"(?P<kind>.+): (?P<strength>(?P<value>[-+.\d]+)(?: (?P<unit>\S+))?)")
 
 
@@ -107,64 +114,52 @@ def _with(study: Study, noises: Sequence[str]) -> Study:
 # --- outcomes --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class FaultOutcome:
-    """What came of one fault of one strength."""
+def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return plain values of every noise of a suite, in its order, at the end of the last lap.
 
-    fault: Fault
-    runs: pd.DataFrame
-    """Runs that finished, with the `ratio` of the rmse and the `size_ratio` to those of the clean run, NaN
-    where either has no map, and whether anything was `told`."""
-    failed: int
-
-    def values(self) -> dict[str, Any]:
-        """Return the outcome as a row of plain values; what is not known is NaN."""
-        runs, ratios = self.runs, self.runs["ratio"].dropna()
-        return {
-            "fault": self.fault.kind,
-            "strength": self.fault.value,
-            "unit": self.fault.unit,
-            "runs": len(runs),
-            "failed": self.failed,
-            "with_map": len(ratios),
-            "ratio_mean": float(ratios.mean()),
-            "ratio_min": float(ratios.min()),
-            "ratio_max": float(ratios.max()),
-            "size_ratio": float(runs["size_ratio"].mean()),
-            "missed": float(runs["missed"].mean()),
-            "closed": int((runs["closed_at_end"] == 1.0).sum()),
-            "lost": int((runs["lost_at_end"] == 1.0).sum()),
-            **{
-                name: float(runs[name].max())
-                for name in ("error_max", "error_end", "astray_time", "astray_way")
-            },
-            "told": int(runs["told"].sum()),
-            "told_degraded": float(runs["told_degraded"].mean()),
-            "told_lost": float(runs["told_lost"].mean()),
-            "calibration": self._calibration(),
-            "said": dict(Counter(text for text in runs["said"] if text).most_common()),
-        }
-
-    def _calibration(self) -> dict[str, float]:
-        means = {
-            key: float(self.runs[key].astype(float).mean()) for key in self.runs if key.endswith(BY_PRIOR)
-        }
-        titles = {key: METRICS[key].title.removesuffix(TITLE_BY_PRIOR) for key in means}
-        return {titles[key]: value for key, value in means.items() if abs(value) > LIMIT}
-
-
-def outcomes(study: Study, frame: pd.DataFrame) -> list[FaultOutcome]:
-    """Return the outcome of every noise of a suite, in its order, each at the end of the last lap."""
+    `runs` that finished count, `failed` ones don't. What is not known is NaN.
+    """
     runs = beside_clean(frame)
     failures = frame[frame["failure"] != ""].groupby("noise").size()
     return [
-        FaultOutcome(fault_of(noise), runs[runs["noise"] == noise], int(failures.get(noise, 0)))
+        _outcome(fault_of(noise), runs[runs["noise"] == noise], int(failures.get(noise, 0)))
         for noise in study.noise
     ]
 
 
+def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
+    ratios = runs["ratio"].dropna()
+    sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith(BY_PRIOR)}
+    titles = {key: METRICS[key].title.removesuffix(TITLE_BY_PRIOR) for key in sigmas}
+    return {
+        "fault": fault.kind,
+        "strength": fault.value,
+        "unit": fault.unit,
+        "runs": len(runs),
+        "failed": failed,
+        "with_map": len(ratios),
+        "ratio_mean": float(ratios.mean()),
+        "ratio_min": float(ratios.min()),
+        "ratio_max": float(ratios.max()),
+        "size_ratio": float(runs["size_ratio"].mean()),
+        "missed": float(runs["missed"].mean()),
+        "closed": int((runs["closed_at_end"] == 1.0).sum()),
+        "lost": int((runs["lost_at_end"] == 1.0).sum()),
+        **{name: float(runs[name].max()) for name in _WORST},
+        "told": int(runs["told"].sum()),
+        "told_degraded": float(runs["told_degraded"].mean()),
+        "told_lost": float(runs["told_lost"].mean()),
+        "calibration": {titles[key]: value for key, value in sigmas.items() if abs(value) > LIMIT},
+        "said": dict(Counter(text for text in runs["said"] if text).most_common()),
+    }
+
+
 def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the last laps of the runs that finished, beside the clean run of the same track and seed."""
+    """Return the last laps of the runs that finished, beside the clean run of the same track and seed.
+
+    `ratio` of the rmse and `size_ratio` are to those of that run, NaN where either has no map; `told` is
+    whether anything was said.
+    """
     last = last_laps(frame)
     last = last.reindex(columns=[*dict.fromkeys([*last, *_MEASURED])]).astype(dict.fromkeys(_MEASURED, float))
     clean = last[last["noise"] == CLEAN].set_index([*RUN])
@@ -175,10 +170,9 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     return last.assign(told=(last["said"] != "") | (last["told_lost"] > 0.0))
 
 
-def fault_table(study: Study, found: Sequence[FaultOutcome]) -> TextTable:
+def fault_table(study: Study, found: Sequence[Values]) -> TextTable:
     """Return a row for each fault and strength, without columns that no run knows anything of."""
-    values = [outcome.values() for outcome in found]
-    columns = {title: tuple(map(text, values)) for title, text in COLUMNS.items()}
+    columns = {title: tuple(map(text, found)) for title, text in COLUMNS.items()}
     kept = {title: texts for title, texts in columns.items() if not {"", UNKNOWN}.issuperset(texts)}
     title = (
         f"{study.name}: {study.question} {len(study.tracks)} tracks, {len(study.seeds)} seeds, "
@@ -186,8 +180,8 @@ def fault_table(study: Study, found: Sequence[FaultOutcome]) -> TextTable:
         "of the clean run on the same track and with the same seed, as its mean and its range. "
         "Lost means more than 5 m off in the last second."
     )
-    names = tuple((outcome.fault.kind, outcome.fault.strength) for outcome in found)
-    rows = tuple((*name, *texts) for name, *texts in zip(names, *kept.values(), strict=True))
+    faults = map(fault_of, study.noise)
+    rows = tuple((f.kind, f.strength, *texts) for f, *texts in zip(faults, *kept.values(), strict=False))
     return TextTable(title, ("fault", "strength", *kept), rows, group_starts(rows), names=2)
 
 
@@ -209,12 +203,9 @@ def _said(values: Values) -> str:
 
 def _form(form: str, *names: str, factor: float = 1.0) -> Callable[[Values], str]:
     """Return a function that formats some of the values."""
-
-    def text(values: Values) -> str:
-        shown = [factor * values[name] for name in names]
-        return UNKNOWN if np.isnan(shown[0]) else form.format(*shown)
-
-    return text
+    return lambda values: (
+        UNKNOWN if np.isnan(values[names[0]]) else form.format(*(factor * values[name] for name in names))
+    )
 
 
 def _short(text: str) -> str:

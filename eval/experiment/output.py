@@ -5,7 +5,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -19,9 +18,9 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .cells import NamedLog, Outcome
 from .compare import Comparison, paired_frame, paper_frame
 from .compare import tables as comparison_tables
-from .faults import fault_table, outcomes
+from .faults import beside_clean, fault_table, outcomes
 from .frame import times_of, without_times
-from .plots import figures, find_blind_spot, plot_blind_spot, plot_faults, plot_maps
+from .plots import find_blind_spot, plot_blind_spot, plot_differences, plot_faults, plot_maps
 from .study import Study
 from .tables import as_latex, as_markdown, as_text, caption, summary_tables, track_tables
 
@@ -42,8 +41,8 @@ def write_csv(file: Path, frame: pd.DataFrame) -> None:
 
 def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write the tables and the figures of a study, and return the text of its summary."""
-    summary = write_tables(study, frame, out)
-    save_figures(out / "figures", figures(study, frame))
+    summary, differences = write_tables(study, frame, out), plot_differences(study, frame)
+    save_figures(out / "figures", {} if differences is None else {"differences": differences})
     return summary
 
 
@@ -72,19 +71,14 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
     write_results(frame, out)
     for suffix, content in (("txt", text), ("md", table.markdown()), ("tex", table.latex())):
         write_text(out / f"faults.{suffix}", content)
-    rows = [{name: _known(value) for name, value in outcome.values().items()} for outcome in faults]
     about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
-    write_json(out / "faults.json", {"format": FAULTS_FORMAT, **about, "faults": rows}, indent=1)
+    write_json(out / "faults.json", {"format": FAULTS_FORMAT, **about, "faults": faults}, indent=1)
     texts = {
-        key: [json.dumps(row[key], ensure_ascii=False) for row in rows] for key in ("calibration", "said")
+        key: [json.dumps(row[key], ensure_ascii=False) for row in faults] for key in ("calibration", "said")
     }
-    write_csv(out / "faults.csv", pd.DataFrame(rows).assign(**texts))
-    save_figures(out, {"faults": plot_faults(faults)})
+    write_csv(out / "faults.csv", pd.DataFrame(faults).assign(**texts))
+    save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})
     return text
-
-
-def _known(value: Any) -> Any:
-    return None if isinstance(value, float) and np.isnan(value) else value
 
 
 # --- comparisons -----------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Figures: differences from the baseline, accuracy against size and time, faults, and maps side by side."""
+"""Figures: differences from the baseline, faults, and maps side by side."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.eval.figures import map_plot, style
 from pathspace_graph.eval.figures.map_plot import MARGIN, WHOLE_TRACK, MapStyle
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, MARKERS, ORANGE, PALETTE, RED, WIDTH
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, ORANGE, RED, WIDTH
 from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
 from pathspace_graph.eval.metrics.metric import METRICS, PAPER
 from pathspace_graph.factors.arrays import Array
@@ -22,13 +22,9 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.labels import BOUNDARIES
 
 from .cells import Outcome
-from .faults import CLEAN, FaultOutcome
-from .frame import COMBINATION, Contrast, contrasts
+from .faults import CLEAN, fault_of
+from .frame import Contrast, contrasts
 from .study import Study
-
-ACCURACY: Final = "rmse"
-SIZE: Final = "size"
-TIME: Final = "ms_mean"
 
 _MAX_PANELS: Final = 3
 """Most metrics side by side in the figure of differences."""
@@ -36,8 +32,6 @@ _ROW_HEIGHT: Final = 0.24
 """Height of a combination in the figure of differences (in)."""
 _LABELS_HEIGHT: Final = 1.1
 """Height of titles and tick labels there (in)."""
-_SCATTER_HEIGHT: Final = 3.6
-"""Height of each noise in the figures of accuracy (in)."""
 _MEAN_SIZE, _PAIR_SIZE, _MARKER_SIZE = 4.5, 3.5, 4.0
 """Size of the markers of a mean, a single pair and a faulty run (pt)."""
 _JITTER: Final = 0.22
@@ -57,17 +51,6 @@ _TITLE_LENGTH: Final = 30
 """Number of characters at which the title of a panel is broken."""
 
 
-def figures(study: Study, frame: pd.DataFrame) -> dict[str, Figure]:
-    """Draw every figure that the study has runs for, by the name of its file."""
-    with style.figure_context():
-        drawn = {
-            "differences": plot_differences(study, frame),
-            "accuracy_size": plot_against(study, frame, SIZE),
-            "accuracy_time": plot_against(study, frame, TIME),
-        }
-    return {name: figure for name, figure in drawn.items() if figure is not None}
-
-
 # --- differences -----------------------------------------------------------------------------------------
 
 
@@ -82,16 +65,16 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
     if not panels:
         return None
     rows = [i for i in range(len(panels[0])) if any(_is_known(panel[i]) for panel in panels)]
-    figure = Figure(figsize=(WIDTH, _LABELS_HEIGHT + _ROW_HEIGHT * len(rows)), layout="constrained")
-    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, panel in zip(all_axes, panels, strict=True):
-        _draw_differences(axes, [panel[i] for i in rows])
-    names = [_name(study, panels[0][i], COMBINATION) for i in rows]
-    all_axes[0].set_yticks(range(len(rows)), names)
-    all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
-    figure.supxlabel(
-        "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
-    )
+    names = [_name(study, panels[0][i]) for i in rows]
+    with style.figure_context():
+        figure = Figure(figsize=(WIDTH, _LABELS_HEIGHT + _ROW_HEIGHT * len(rows)), layout="constrained")
+        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, panel in zip(all_axes, panels, strict=True):
+            _draw_differences(axes, [panel[i] for i in rows])
+        all_axes[0].set_yticks(range(len(rows)), names)
+        all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
+        text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
+        figure.supxlabel(text)
     return figure
 
 
@@ -112,21 +95,16 @@ def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
         axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=_PAIR_SIZE, zorder=2)
         mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
         look: dict[str, Any] = {"color": color, "markersize": _MEAN_SIZE, "elinewidth": 1.0}
-        axes.errorbar(mean, row, xerr=_bar(half), fmt="o", zorder=3, **look)
+        axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", zorder=3, **look)
     axes.set_title(metric.heading)
     axes.grid(axis="x")
 
 
-def _bar(half: float) -> float | None:
-    """Return the half width of an error bar, or None where it isn't known."""
-    return None if np.isnan(half) else half
-
-
-def _name(study: Study, contrast: Contrast, columns: Sequence[str]) -> str:
+def _name(study: Study, contrast: Contrast) -> str:
     """Return the names of a combination that others have differently, `sigma_spacing=1` for
     `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
     counts = {"noise": study.noise, "estimator": study.estimators, "variant": study.points}
-    several = [getattr(contrast, column) for column in columns if len(counts[column]) > 1]
+    several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
     name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
     last = {field: field.rpartition(".")[2] for field in study.varied}
     if len(set(last.values())) == len(last):
@@ -135,57 +113,25 @@ def _name(study: Study, contrast: Contrast, columns: Sequence[str]) -> str:
     return name
 
 
-# --- accuracy against ------------------------------------------------------------------------------------
-
-
-def plot_against(study: Study, frame: pd.DataFrame, metric: str) -> Figure | None:
-    """Draw the mean accuracy of each combination against the mean of another metric, with both intervals."""
-    if metric not in frame or ACCURACY not in frame:
-        return None
-    across, up = contrasts(study, frame, metric), contrasts(study, frame, ACCURACY)
-    figure = Figure(figsize=(WIDTH, _SCATTER_HEIGHT * len(study.noise)), layout="constrained")
-    all_axes = figure.subplots(len(study.noise), 1, squeeze=False)[:, 0]
-    for axes, noise in zip(all_axes, study.noise, strict=True):
-        pairs = [(a, b) for a, b in zip(across, up, strict=True) if a.noise == noise and a.value.count]
-        for index, (a, b) in enumerate(pairs):
-            _draw_point(axes, a, b, index, _name(study, a, COMBINATION[1:]))
-        axes.set(xlabel=METRICS[metric].heading, ylabel=METRICS[ACCURACY].heading)
-        axes.set_title(noise if len(study.noise) > 1 else "")
-        axes.grid()
-    style.shared_legend(figure, loc="outside right upper")
-    return figure
-
-
-def _draw_point(axes: Axes, across: Contrast, up: Contrast, index: int, label: str) -> None:
-    x, y = METRICS[across.metric], METRICS[up.metric]
-    axes.errorbar(
-        x.factor * across.value.mean,
-        y.factor * up.value.mean,
-        xerr=_bar(x.factor * across.value.half),
-        yerr=_bar(y.factor * up.value.half),
-        fmt=MARKERS[index % len(MARKERS)],
-        color=DARK if across.difference is None else PALETTE[index % len(PALETTE)],
-        markersize=_MEAN_SIZE,
-        elinewidth=0.6,
-        label=label,
-    )
-
-
 # --- faults ----------------------------------------------------------------------------------------------
 
 
-def plot_faults(outcomes: Sequence[FaultOutcome]) -> Figure:
-    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said."""
-    panels = [(kind, list(of)) for kind, of in groupby(outcomes, key=lambda o: o.fault.kind) if kind != CLEAN]
+def plot_faults(study: Study, runs: pd.DataFrame) -> Figure:
+    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said.
+
+    The runs are those of `beside_clean`.
+    """
+    by_kind = groupby(study.noise, key=lambda noise: fault_of(noise).kind)
+    panels = {kind: [*noises] for kind, noises in by_kind if kind != CLEAN}
     rows = max(1, -(-len(panels) // _FAULT_COLUMNS))
     with style.figure_context():
         figure = Figure(figsize=(WIDTH, _LEGEND_HEIGHT + _PANEL_HEIGHT * rows), layout="constrained")
         every = figure.subplots(rows, _FAULT_COLUMNS, sharey=True, squeeze=False).ravel()
-        for axes, (kind, of) in zip(every, panels, strict=False):
-            _draw_fault(axes, kind, of)
+        for axes, noises in zip(every, panels.values(), strict=False):
+            _draw_fault(axes, noises, runs)
         for axes in every[len(panels) :]:
             axes.set_visible(False)
-        ratios = np.concatenate([np.ones(1), *(o.runs["ratio"].dropna() for o in outcomes)])
+        ratios = np.append(runs["ratio"].dropna(), 1.0)
         every[0].set_yscale("log")
         every[0].set_ylim(ratios.min() / _ROOM, ratios.max() * _ROOM)
         style.label_logarithms(every[0])
@@ -194,20 +140,23 @@ def plot_faults(outcomes: Sequence[FaultOutcome]) -> Figure:
     return figure
 
 
-def _draw_fault(axes: Axes, kind: str, outcomes: Sequence[FaultOutcome]) -> None:
+def _draw_fault(axes: Axes, noises: Sequence[str], runs: pd.DataFrame) -> None:
     axes.axhline(1.0, color=DARK, linewidth=0.6)
-    for at, outcome in enumerate(outcomes):
-        runs = outcome.runs
-        spread = _SPREAD if len(runs) > 1 else 0.0
-        places = at + np.linspace(-spread, spread, len(runs))
-        for place, *run in zip(places, runs["ratio"], runs["lost_at_end"] == 1.0, runs["told"], strict=True):
+    means = []
+    for at, noise in enumerate(noises):
+        own = runs[runs["noise"] == noise]
+        means.append(own["ratio"].mean())
+        spread = _SPREAD if len(own) > 1 else 0.0
+        places = at + np.linspace(-spread, spread, len(own))
+        for place, *run in zip(places, own["ratio"], own["lost_at_end"] == 1.0, own["told"], strict=True):
             _draw_faulty_run(axes, float(place), *run)
-    means = [(at, o.runs["ratio"].mean()) for at, o in enumerate(outcomes) if o.runs["ratio"].notna().any()]
-    if means:
-        axes.plot(*np.array(means).T, color=BLUE, linewidth=0.9, label="mean", zorder=1)
-    axes.set_xticks(range(len(outcomes)), [f"{outcome.fault.value:g}" for outcome in outcomes])
-    axes.set_xlim(-0.5, len(outcomes) - 0.5)
-    unit = outcomes[0].fault.unit
+    known = np.flatnonzero(~np.isnan(means))
+    if len(known):
+        axes.plot(known, np.array(means)[known], color=BLUE, linewidth=0.9, label="mean", zorder=1)
+    faults = [fault_of(noise) for noise in noises]
+    axes.set_xticks(range(len(faults)), [f"{fault.value:g}" for fault in faults])
+    axes.set_xlim(-0.5, len(faults) - 0.5)
+    kind, unit = faults[0].kind, faults[0].unit
     axes.set_title(_broken(f"{kind} [{unit}]" if unit else kind))
     axes.grid(axis="y")
 

@@ -19,18 +19,19 @@ from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.overrides import flatten
 from pathspace_graph.io.parsing import read_json
 from pathspace_graph.loop.drive_record import end_with
+from pathspace_graph.sim.track import Track
 
 from .cells import (
     CELLS,
     Cell,
     Drive,
-    NamedTrack,
     Outcome,
     Record,
     load_tracks,
     read_record,
     record_cell,
     record_of,
+    track_digest,
     write_record,
 )
 from .frame import frame_of
@@ -94,7 +95,7 @@ class Plan:
     """A study with its tracks and all of its cells."""
 
     study: Study
-    tracks: tuple[NamedTrack, ...]
+    tracks: tuple[Track, ...]
     cells: tuple[Cell[Drive], ...]
     """Runs of the study, in the order of the results."""
 
@@ -105,7 +106,7 @@ class Plan:
         return {
             "format": FORMAT,
             **{name: getattr(study, name) for name in same},
-            "tracks": [{"name": track.name, "digest": track.digest} for track in self.tracks],
+            "tracks": [{"name": track.name, "digest": track_digest(track)} for track in self.tracks],
             "noise": {name: asdict(study.simulation(name)) for name in study.noise},
             "variants": {name: asdict(settings) for name, settings in study.points.items()},
             "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},

@@ -22,7 +22,7 @@ from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 from pathspace_graph.spline.knots import fit_spline
 
 from . import style
-from .curves import plot_simplification, plot_uncertainty, posterior, simplification, uncertainty
+from .curves import plot_simplification, plot_uncertainty, posterior
 from .style import BLUE, DARK, GREEN, LIGHT, MARKER_SIZE, ORANGE, PURPLE, RED, THIN_WIDTH, WIDTH
 
 # a curve ends at the origin, on a left bend that it leaves to the outside by a share of its length (m)
@@ -108,8 +108,9 @@ def _on_bend(along: Array, inside: Array) -> Array:
     return np.stack([r * np.sin(angle), _RADIUS - r * np.cos(angle)], axis=1)
 
 
-def plot_expansion(data: Expansion) -> Figure:
+def plot_expansion() -> tuple[Figure, str]:
     """Draw (a) classified detections, (b) the curve extended to the last of their chain, (c) the update."""
+    data = expansion()
     interpolated = np.arange(len(data.detections)) == data.order[-1]
     steps = (
         ("(a) detections beyond the end expand the curve, the others update it", data.before, None),
@@ -134,7 +135,12 @@ def plot_expansion(data: Expansion) -> Figure:
         panels[2].set_xlabel("x [m]")
         style.shared_legend(figure, 4)
         style.fit_height(figure)
-    return figure
+    return figure, (
+        "Expansion in its three steps. (a) Detections whose closest point is the end of the curve, beyond a "
+        "threshold from the last two control points, mark an expansion. (b) The curve is extended to the "
+        "last of their proximity chain, and is exactly as it was up to its old end; the others are "
+        "detections of it now. (c) One update uses all of those."
+    )
 
 
 def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: BoolArray) -> None:
@@ -224,8 +230,9 @@ _DETECTIONS: Final = "detections $z$ (a: 2σ)"
 _DIAMOND: Final = 0.8 * MARKER_SIZE
 
 
-def plot_fit(data: Fit) -> Figure:
+def plot_fit() -> tuple[Figure, str]:
     """Draw (a) closest points, (b) sigma points and their fits, (c) S_z, (d) the basis functions there."""
+    data = fit()
     with style.figure_context():
         figure = Figure((WIDTH, 4.0), layout="compressed")
         closest, sigma, fitted, basis = figure.subplots(2, 2).flat
@@ -246,7 +253,12 @@ def plot_fit(data: Fit) -> Figure:
         basis.set_box_aspect(height / width)
         style.shared_legend(figure, 5)
         style.fit_height(figure)
-    return figure
+    return figure, (
+        "The fit of S_z. (a) The closest points on the state's curve to the detections. (b) Sigma points of "
+        "the detections, and the curve fitted to each by ridge regression. (c) Mean and covariance of their "
+        "control points make one measurement of the curve. (d) The basis functions at the closest points: a "
+        "control point whose function is zero there (grey) stays where it was."
+    )
 
 
 def _draw_closest(axes: Axes, data: Fit) -> None:
@@ -291,57 +303,13 @@ def _draw_basis(axes: Axes, data: Fit) -> None:
 
 MARKER: Final = "captions.md"
 """File by which a folder of these figures is known."""
-_SEED: Final = 0
-
-
-def _uncertainty() -> tuple[Figure, str]:
-    data = uncertainty(np.random.default_rng(_SEED))
-    off = np.abs(data.marginals / data.joint - 1.0)
-    return plot_uncertainty(data), (
-        "Uncertainty along a spline. (a) Control points with their uncertainty make a continuous "
-        "distribution of splines, wide where nothing was seen. (b) Its standard deviation across the curve "
-        "by the joint covariance is that of splines drawn at random; the sum of squared basis functions, "
-        f"which leaves the cross terms out, is off by up to {100 * off.max():.0f} %."
-    )
-
-
-def _expansion() -> tuple[Figure, str]:
-    data = expansion()
-    return plot_expansion(data), (
-        "Expansion in its three steps. (a) Detections whose closest point is the end of the curve, beyond a "
-        "threshold from the last two control points, mark an expansion. (b) The curve is extended to the "
-        "last of their proximity chain, and is exactly as it was up to its old end; the others are "
-        "detections of it now. (c) One update uses all of those."
-    )
-
-
-def _fit() -> tuple[Figure, str]:
-    return plot_fit(fit()), (
-        "The fit of S_z. (a) The closest points on the state's curve to the detections. (b) Sigma points of "
-        "the detections, and the curve fitted to each by ridge regression. (c) Mean and covariance of their "
-        "control points make one measurement of the curve. (d) The basis functions at the closest points: a "
-        "control point whose function is zero there (grey) stays where it was."
-    )
-
-
-def _simplification() -> tuple[Figure, str]:
-    data = simplification()
-    weighted, uniform = (100.0 * simplified.rms for simplified in (data.weighted, data.uniform))
-    return plot_simplification(data), (
-        f"Simplification of a closed curve of {data.old.size} control points (a) to "
-        f"{data.weighted.curve.size} (b, the curve before dashed). (c) The distance between the two: "
-        f"{weighted:.1f} cm rms with curvature-weighted knots, {uniform:.1f} cm with uniform ones. "
-        "(d) Curvature, and the knots."
-    )
-
-
 FIGURES: Final[Mapping[str, Callable[[], tuple[Figure, str]]]] = {
-    "uncertainty": _uncertainty,
-    "expansion": _expansion,
-    "fit": _fit,
-    "simplification": _simplification,
+    "uncertainty": plot_uncertainty,
+    "expansion": plot_expansion,
+    "fit": plot_fit,
+    "simplification": plot_simplification,
 }
-"""Functions that compute and draw a figure, and return it with a caption with its numbers."""
+"""Functions that compute and draw a figure, and return it with its caption."""
 
 
 def write_figures(out: Path, on_figure: Callable[[], None] = lambda: None) -> None:

@@ -16,6 +16,7 @@ from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBounda
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.settings.checked import Positive
+from pathspace_graph.sim.curves import along_polyline, arc_lengths
 from pathspace_graph.spline.bspline import BSpline
 
 MISSED_DISTANCE = 3.0
@@ -135,7 +136,7 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     closed = len(cones) > _OVERLAP and len(truth.poses) > 0 and len(lap_end_indices(truth.poses)) > 0
     nodes = np.concatenate([cones[-_OVERLAP:], cones, cones[: _OVERLAP + 1]]) if closed else cones
     nodes = nodes[np.append(True, np.linalg.norm(np.diff(nodes, axis=0), axis=1) > 0.0)]
-    length = lengths_along(nodes)
+    length = arc_lengths(nodes)
     low, high = (length[_OVERLAP], length[-_OVERLAP - 1]) if closed else (length[0], length[-1])
     samples = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
     return np.asarray(scipy.interpolate.Akima1DInterpolator(length, nodes)(samples), dtype=float)
@@ -159,14 +160,9 @@ def _first_lap(truth: Truth) -> Array:
     """Return points (n, 2) of the true path up to the end of lap 1, at most PATH_STEP apart."""
     ends = lap_end_indices(truth.poses)
     path = truth.poses[: ends[0] + 1 if len(ends) else None, :2]
-    length = lengths_along(path)
+    length = arc_lengths(path)
     samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / PATH_STEP)) + 1)
-    return np.stack([np.interp(samples, length, coordinate) for coordinate in path.T], axis=1)
-
-
-def lengths_along(points: Array) -> Array:
-    """Return the length (n,) along a polygon from the first of its points (n, 2) to each of them (m)."""
-    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    return along_polyline(samples, length, path)
 
 
 def _perimeter(points: Array) -> float:
@@ -186,26 +182,13 @@ def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
 # --- distances -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class CurveDistance:
-    """Mean distances (m) between the mapped and the true boundaries, both boundaries together."""
+def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
+    """Return mean_p min_q |p - q| over mapped points p, mean_q min_p |q - p| over true ones q, and the mean.
 
-    mapped_to_truth: float
-    """Distance from the mapped curve to the true one; large where something false is mapped."""
-    truth_to_mapped: float
-    """Distance from the true curve to the mapped one; large where something true isn't mapped."""
-
-    @property
-    def two_way(self) -> float:
-        return 0.5 * (self.mapped_to_truth + self.truth_to_mapped)
-
-
-def curve_distance(track: Map, truth: Truth) -> CurveDistance:
-    """Return mean_p min_q |p - q| over mapped points p, and mean_q min_p |q - p| over true ones q.
-
-    Points of curves are equal lengths apart. Landmarks have nothing in between, so the second distance
-    charges them for the gaps. Infinite where a boundary isn't mapped, NaN where there is nothing to measure
-    from.
+    All are in m, over both boundaries together: `mapped_to_truth` is large where something false is mapped,
+    `truth_to_mapped` where something true isn't. Points of curves are equal lengths apart. Landmarks have
+    nothing in between, so the second distance charges them for the gaps. Infinite where a boundary isn't
+    mapped, NaN where there is nothing to measure from.
     """
     forth, back = [np.zeros(0)], [np.zeros(0)]
     for label in BOUNDARIES:
@@ -218,7 +201,9 @@ def curve_distance(track: Map, truth: Truth) -> CurveDistance:
         else:
             forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
             back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
-    return CurveDistance(mean_of(np.concatenate(forth)), mean_of(np.concatenate(back)))
+    to_truth, to_mapped = mean_of(np.concatenate(forth)), mean_of(np.concatenate(back))
+    both = 0.5 * (to_truth + to_mapped)
+    return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped, "two_way": both}
 
 
 def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
@@ -322,23 +307,12 @@ class GhostSettings(Positive):
     default exceeds the drift of a map whose loop is closed, but not the width of the narrowest lane (3 m)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ghosts:
-    """What is mapped but doesn't exist, on both boundaries together."""
+def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> dict[str, float]:
+    """Return the landmarks p and the metres of curve with min_q |p - q| > distance, q on the true curve.
 
-    landmarks: int
-    metres: float
-    """Length of mapped curves without a true boundary near (m)."""
-    share: float
-    """Share of ghosts among all landmarks and points of curves; NaN where nothing is mapped."""
-    duplicates: int
-    """Number of landmarks nearest to a true cone that already has one."""
-
-
-def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> Ghosts:
-    """Return the landmarks p and the length of curve with min_q |p - q| > distance, q on the true curve.
-
-    The true curve is that of the same boundary. A boundary without any true cone is a ghost as a whole.
+    The true curve is that of the same boundary. A boundary without any true cone is a ghost as a whole. The
+    share is of all landmarks and points of curves, NaN where nothing is mapped. Duplicates are landmarks that
+    are nearest to a true cone that already has one.
     """
     settings = settings or GhostSettings()
     landmarks = duplicates = 0
@@ -354,7 +328,9 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> G
         else:
             landmarks += int(is_ghost.sum())
             duplicates += _duplicates(boundary, truth.cones[truth.cone_labels == label], settings.distance)
-    return Ghosts(landmarks, metres, mean_of(np.concatenate(all_ghosts)), duplicates)
+    share = mean_of(np.concatenate(all_ghosts))
+    found = {"ghost_landmarks": landmarks, "ghost_metres": metres, "ghost_share": share}
+    return {**found, "duplicates": duplicates}
 
 
 def _duplicates(boundary: PointBoundary, cones: Array, distance: float) -> int:

@@ -1,8 +1,8 @@
 """What is measured of a run: one function measures all metrics, lap by lap and of the whole."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
@@ -25,23 +25,13 @@ WHOLE: Final = "whole"
 """Name of the whole cycle among its stages."""
 
 
-@dataclass(frozen=True, slots=True)
-class StageTime:
-    """Wall time (s) of one stage over many cycles; every figure is NaN without cycles."""
+def stage_times(cycles: Sequence[CycleRecord]) -> list[dict[str, Any]]:
+    """Return `mean`, `median`, `p99` (s) of the whole cycle and of each stage, and the share of the stage.
 
-    stage: str
-    """Name of the stage; the whole cycle is called `whole`."""
-    mean: float
-    median: float
-    p99: float
-    share: float
-    """Its mean as a share of the whole cycle's."""
-
-
-def stage_times(cycles: Sequence[CycleRecord]) -> list[StageTime]:
-    """Return the whole cycle and then its stages; a stage that a cycle lacks took no time in it."""
+    A stage that a cycle lacks took no time in it; without cycles there is none.
+    """
     if not cycles:
-        return [StageTime(WHOLE, *[float("nan")] * 4)]
+        return []
     names = dict.fromkeys(name for record in cycles for name in record.stages)
     columns = {WHOLE: [record.seconds for record in cycles]}
     columns |= {name: [record.stages.get(name, 0.0) for record in cycles] for name in names}
@@ -49,7 +39,8 @@ def stage_times(cycles: Sequence[CycleRecord]) -> list[StageTime]:
     times = []
     for name, seconds in columns.items():
         mean, (median, p99) = float(np.mean(seconds)), np.quantile(seconds, [0.5, 0.99]).tolist()
-        times.append(StageTime(name, mean, median, p99, mean / total if total > 0.0 else float("nan")))
+        share = mean / total if total > 0.0 else float("nan")
+        times.append({"stage": name, "mean": mean, "median": median, "p99": p99, "share": share})
     return times
 
 
@@ -123,8 +114,7 @@ def measure(
         joint = joint_cone_error(run, log.truth)
         values |= {"normalized_error_joint": joint.ratio, "normalized_error_joint_inside": joint.honest}
     if yardsticks:
-        least = limit(log, run.map)
-        values |= {"l": least.l, "f": least.f, "limit": least.total}
+        values |= limit(log, run.map)
     if seconds is not None:
         values["seconds"] = seconds
     return [*rows, Row(None, values)]
@@ -160,7 +150,8 @@ def _map_values(
     }
     if truth is None or not has_cones(truth):
         return values
-    values |= _cone_values(track, truth) | _curve_values(track, truth, ghost_settings)
+    values |= _cone_values(track, truth) | accuracy.curve_distance(track, truth)
+    values |= accuracy.ghosts(track, truth, ghost_settings)
     values |= _consistency_values(track, truth) | _centre_values(track, truth)
     turn = turn_from_truth(track, truth)
     turns = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
@@ -183,15 +174,6 @@ def _cone_values(track: Map, truth: Truth) -> dict[str, float]:
         "missed_1m": accuracy.missed_share(distances, 1.0),
         "rmse_capped": accuracy.capped_rmse(distances),
     }
-
-
-def _curve_values(track: Map, truth: Truth, ghost_settings: GhostSettings | None) -> dict[str, float]:
-    curve, ghost = (
-        accuracy.curve_distance(track, truth),
-        asdict(accuracy.ghosts(track, truth, ghost_settings)),
-    )
-    counted = {name if name == "duplicates" else f"ghost_{name}": value for name, value in ghost.items()}
-    return {**asdict(curve), "two_way": curve.two_way, **counted}
 
 
 def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
@@ -267,10 +249,8 @@ def _drive_values(run: RunResult, truth: Truth | None, begin: float, end: float)
         values["along"], values["across"] = (accuracy.root_mean_square(column) for column in errors[:, :2].T)
         if run.reach is not None:
             values |= trajectory.reach_values(run.reach[inside])
-    cycles = online_cycles(run, begin, end)
-    if cycles:
-        whole = stage_times(cycles)[0]
-        values |= {f"ms_{name}": 1e3 * getattr(whole, name) for name in ("mean", "median", "p99")}
+    for whole in stage_times(online_cycles(run, begin, end))[:1]:
+        values |= {f"ms_{name}": 1e3 * whole[name] for name in ("mean", "median", "p99")}
     return values
 
 

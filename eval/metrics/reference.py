@@ -30,24 +30,16 @@ from .consistency import near_pairs
 from .trajectory import pose_errors
 
 
-@dataclass(frozen=True, slots=True)
-class Limit:
-    """Least error that a run can be expected to reach."""
+def limit(log: Log, track: Map) -> dict[str, float]:
+    """Return the least error (m) to be expected of a simulated log and a map of it.
 
-    l: float  # noqa: E741 - the issue's and the paper's tables call it so
-    """Rmse (m) in the plane of the landmark batch with oracle association."""
-    f: float
-    """Rmse (m) of the true cones to splines of the mapped size that are fitted to them."""
-
-    @property
-    def total(self) -> float:
-        return float(np.hypot(self.l, self.f))
-
-
-def limit(log: Log, track: Map) -> Limit:
-    """Return the limit of a simulated log and a map of it; ValueError without truth or associations."""
+    `l` is the rmse in the plane of the landmark batch with oracle association, `f` that of the true cones to
+    splines of the mapped size that are fitted to them, `limit` both. ValueError without truth or
+    associations.
+    """
     truth = _truth(log)
-    return Limit(l=landmark_rmse(solve_oracle_landmarks(log)[1], truth), f=fit_rmse(track, truth))
+    landmarks, fit = landmark_rmse(solve_oracle_landmarks(log)[1], truth), fit_rmse(track, truth)
+    return {"l": landmarks, "f": fit, "limit": float(np.hypot(landmarks, fit))}
 
 
 def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:

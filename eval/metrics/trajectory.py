@@ -16,8 +16,9 @@ from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.run import ObservedCycle
+from pathspace_graph.sim.curves import arc_lengths
 
-from .accuracy import boundary_distances, lengths_along, root_mean_square
+from .accuracy import boundary_distances, root_mean_square
 
 LOST: Final = 5.0
 """Position error beyond which a vehicle is lost (m)."""
@@ -171,7 +172,7 @@ def true_road(truth: Truth) -> TrueRoad:
     complete lap, cones beside the drive's two ends and cycles less than `MOST` metres before its end don't
     count.
     """
-    driven = lengths_along(truth.poses[:, :2])
+    driven = arc_lengths(truth.poses[:, :2])
     own = np.isin(truth.cone_labels, BOUNDARIES)
     cones, ends = truth.cones[own], driven[lap_end_indices(truth.poses)]
     stations, cone = _passes(truth.poses[:, :2], driven, cones, ends)

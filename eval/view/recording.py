@@ -8,14 +8,25 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+import numpy as np
+from matplotlib.colors import to_hex, to_rgb
+
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.figures import style
+from pathspace_graph.eval.figures.map_plot import BOUNDARY_COLORS, HEALTH_COLORS, TRAJECTORY_COLOR
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, LIGHT, ORANGE, RED
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.health import CONDITIONS, LOST, Health
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import Log, Truth
-from pathspace_graph.run import Observer
+from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
+from pathspace_graph.labels import BIG_ORANGE, BOUNDARIES, NAMES
+from pathspace_graph.labels import ORANGE as ORANGE_CONE
+from pathspace_graph.run import ObservedCycle, Observer
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 
 from .animation import Animation, check_film_file, film, lap_seconds
-from .recorder import Recorder, blueprint
 
 APPLICATION: Final = "pathspace_graph"
 """Name by which the viewer keeps what a user arranges."""
@@ -66,7 +77,7 @@ def recording(
     window: bool = False,
     settings: RecordingSettings | None = None,
     truth: Truth | None = None,
-) -> Iterator[Recorder]:
+) -> "Iterator[Recorder]":
     """Yield an observer that records each cycle that it is shown, to a file, to a window, or to both.
 
     The file appears as a whole at the end, and an earlier one is kept as a numbered backup. The window stays
@@ -106,6 +117,236 @@ def _open_window(rerun: Any, stream: Any) -> None:
         socket.create_connection(("127.0.0.1", PORT), _TIMEOUT).close()
     except OSError as error:
         raise SettingsError(f"--view: expected the viewer on port {PORT}, found none: {error}") from error
+
+
+# --- what is shown --------------------------------------------------------------------------------------
+
+TIMELINE: Final = "cycle"
+"""Timeline that counts the perception cycles, from 0."""
+TIME: Final = "time"
+"""Timeline of the log's time (s)."""
+TIMELINES: Final = (TIMELINE, TIME)
+
+MAP: Final = "map"
+"""Entity above all that has a place, in the map frame (m)."""
+TRAJECTORY: Final = f"{MAP}/trajectory"
+"""Way from the pose of the cycle before."""
+VEHICLE: Final = f"{MAP}/vehicle"
+WINDOW: Final = f"{MAP}/window"
+READINGS: Final = f"{MAP}/readings"
+"""Entity above the detections of the cycle: `used`, `gated` or, where it isn't known, `detected`."""
+FEET: Final = f"{READINGS}/feet"
+"""Line from each detection in use to its foot point."""
+TRUE_CONES: Final = f"{MAP}/truth/cones"
+
+HEALTH: Final = "health"
+MESSAGES: Final = "messages"
+UPDATE: Final = "update"
+"""Entity above the time of each update (ms)."""
+SIZES: Final = "size"
+"""Entity above the numbers of control points or landmarks."""
+READING_COUNTS: Final = "readings"
+"""Entity above the numbers of detections that were offered and used."""
+
+WIDEST_BAND: Final = 5.0
+"""Largest width of a band on either side of its curve (m)."""
+OUTLINE: Final = np.array([[1.8, 0.0], [-0.9, 0.7], [-0.9, -0.7], [1.8, 0.0]])
+"""Triangle that stands for the vehicle (m, vehicle frame)."""
+LOW, MIDDLE, HIGH, TOP = 10.0, 20.0, 30.0, 40.0
+"""Order of drawing, the last one on top."""
+WHITE: Final = (255, 255, 255)
+"""Background of the map, as in all our figures, since the colours are made for it."""
+_SERIES: Final = {
+    f"{UPDATE}/milliseconds": BLUE,
+    f"{SIZES}/left": BLUE,
+    f"{SIZES}/right": ORANGE,
+    f"{READING_COUNTS}/offered": GREY,
+    f"{READING_COUNTS}/used": GREEN,
+}
+"""Colour of each curve over time."""
+
+
+def blueprint(rerun: Any) -> Any:
+    """Return the arrangement: the map on the left, and all else below each other on the right."""
+    views = rerun.blueprint
+    beside = views.Vertical(
+        views.StateTimelineView(origin=HEALTH, name="health"),
+        views.TimeSeriesView(origin=UPDATE, name="time per cycle [ms]"),
+        views.TimeSeriesView(origin=SIZES, name="size of the map"),
+        views.TimeSeriesView(origin=READING_COUNTS, name="readings per cycle"),
+        views.TextLogView(origin=MESSAGES, name="messages"),
+        row_shares=[1, 2, 2, 2, 2],
+    )
+    begin, now = rerun.TimeRangeBoundary.infinite(), rerun.TimeRangeBoundary.cursor_relative()
+    ranges = [rerun.VisibleTimeRange(name, start=begin, end=now) for name in TIMELINES]
+    look = {"background": WHITE, "overrides": {TRAJECTORY: views.VisibleTimeRanges(ranges)}}
+    track = views.Spatial2DView(origin="/", contents=f"{MAP}/**", name="map", **look)
+    return views.Blueprint(
+        views.Horizontal(track, beside, column_shares=[3, 2]),
+        views.TimePanel(timeline=TIMELINE, state="collapsed"),
+        views.BlueprintPanel(state="collapsed"),
+        views.SelectionPanel(state="collapsed"),
+    )
+
+
+class Recorder:
+    """Shows each cycle to a stream of rerun; `recording` makes one, and `run.run_online` calls it.
+
+    Colours and sizes are logged once, for all times. Each cycle logs places and numbers.
+    """
+
+    def __init__(self, rerun: Any, stream: Any, settings: RecordingSettings, truth: Truth | None) -> None:
+        self._rerun, self._stream, self._settings = rerun, stream, settings
+        self._last_pose: Array | None = None
+        self._last_health = Health()
+        self._closed = False
+        self._set_styles()
+        if truth is not None and len(truth.cones):
+            self._log_static(TRUE_CONES, rerun.Points2D(truth.cones))
+
+    def __call__(self, cycle: ObservedCycle) -> None:
+        self._stream.set_time(TIMELINE, sequence=cycle.number)
+        self._stream.set_time(TIME, duration=cycle.detections.t)
+        self._show_map(cycle.outline)
+        replaced = cycle.result.jump is not None or cycle.result.closed != self._closed
+        if cycle.number % self._settings.band_every == 0 or replaced:
+            for label, boundary in cycle.map.boundaries.items():
+                self._lines(_path(label, "band"), self._band(boundary))
+        self._show_vehicle(cycle)
+        self._show_readings(cycle)
+        self._show_figures(cycle)
+        self._show_messages(cycle)
+
+    # --- colours and sizes -------------------------------------------------------------------------------
+
+    def _set_styles(self) -> None:
+        rerun = self._rerun
+        # the y axis of a two-dimensional view points down, as that of a picture does
+        self._log_static(MAP, rerun.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
+        lines, points = rerun.LineStrips2D, rerun.Points2D
+        for label in BOUNDARIES:
+            color = BOUNDARY_COLORS[label]
+            self._style(lines, _path(label, "curve"), color, 1.5, MIDDLE)
+            self._style(lines, _path(label, "tentative"), color, 1.0, MIDDLE)
+            self._style(lines, _path(label, "band"), pale(color), 0.7, LOW)
+            self._style(points, _path(label, "points"), color, 2.0, MIDDLE)
+        for label, size in ((ORANGE_CONE, 2.0), (BIG_ORANGE, 3.0)):
+            self._style(points, _path(label, "points"), RED, size, MIDDLE)
+        self._style(lines, TRAJECTORY, TRAJECTORY_COLOR, 0.7, MIDDLE)
+        self._style(lines, WINDOW, TRAJECTORY_COLOR, 2.0, HIGH)
+        self._style(lines, VEHICLE, "#000000", 1.5, TOP)
+        self._style(lines, FEET, DARK, 0.7, HIGH)
+        for name, color in (("used", DARK), ("gated", RED), ("detected", GREY)):
+            self._style(points, f"{READINGS}/{name}", color, 3.0, TOP)
+        self._style(points, TRUE_CONES, LIGHT, 2.0, LOW)
+        for path, color in _SERIES.items():
+            name = path.rpartition("/")[2]
+            self._log_static(path, rerun.SeriesLines(colors=[_rgb(color)], names=[name], widths=[1.0]))
+        colors = [_rgb(HEALTH_COLORS.get(condition, GREEN)) for condition in CONDITIONS]
+        self._log_static(HEALTH, rerun.StateConfiguration(values=list(CONDITIONS), colors=colors))
+
+    def _style(self, kind: Any, path: str, color: str, radius: float, order: float) -> None:
+        radii = [self._rerun.Radius.ui_points(radius)]
+        self._log_static(path, kind.from_fields(colors=[_rgb(color)], radii=radii, draw_order=order))
+
+    def _log_static(self, path: str, what: Any) -> None:
+        self._stream.log(path, what, static=True)
+
+    # --- what has a place --------------------------------------------------------------------------------
+
+    def _lines(self, path: str, strips: list[Array]) -> None:
+        self._stream.log(path, self._rerun.LineStrips2D.from_fields(strips=strips))
+
+    def _points(self, path: str, points: Array) -> None:
+        self._stream.log(path, self._rerun.Points2D.from_fields(positions=points))
+
+    def _show_map(self, track: Map) -> None:
+        """Show each curve, its tentative stretch dashed, control points or landmarks, and orange cones."""
+        for label, boundary in (*track.boundaries.items(), *track.points.items()):
+            if isinstance(boundary, PointBoundary):
+                self._points(_path(label, "points"), boundary.points)
+                continue
+            u = style.curve_parameters(boundary.spline, self._settings.samples_per_span)
+            until = boundary.confirmed_until
+            confirmed, tentative = u[u <= until], u[u > until]
+            if len(tentative):
+                confirmed, tentative = np.append(confirmed, until), np.append(until, tentative)
+            self._lines(_path(label, "curve"), [boundary.spline.evaluate(confirmed)])
+            self._lines(_path(label, "tentative"), dashes(boundary.spline.evaluate(tentative)))
+            self._points(_path(label, "points"), boundary.spline.distinct_control_points)
+
+    def _band(self, boundary: MapBoundary) -> list[Array]:
+        if isinstance(boundary, SplineBoundary):
+            u = style.curve_parameters(boundary.spline, self._settings.samples_per_span)
+            return list(style.uncertainty_band(boundary, u, widest=WIDEST_BAND))
+        return list(style.ellipse_outlines(boundary.points, boundary.covariance))
+
+    def _show_vehicle(self, cycle: ObservedCycle) -> None:
+        """Show the vehicle, the way that it has come since the cycle before, and the window."""
+        pose = np.array(cycle.result.pose, float)
+        self._lines(VEHICLE, [to_map(OUTLINE, np.tile(pose, (len(OUTLINE), 1)))])
+        before = pose if self._last_pose is None else self._last_pose
+        self._lines(TRAJECTORY, [np.array([before[:2], pose[:2]])])
+        self._last_pose = pose
+        if len(cycle.window):
+            self._lines(WINDOW, [cycle.window[:, :2]])
+
+    def _show_readings(self, cycle: ObservedCycle) -> None:
+        readings = cycle.readings
+        if readings is None:
+            points = cycle.detections.points_vehicle
+            pose = np.asarray(cycle.result.pose, float)
+            self._points(f"{READINGS}/detected", to_map(points, np.tile(pose, (len(points), 1))))
+            return
+        self._points(f"{READINGS}/used", readings.points[readings.used])
+        self._points(f"{READINGS}/gated", readings.points[~readings.used])
+        self._lines(FEET, list(np.stack([readings.points, readings.feet], axis=1)[readings.used]))
+
+    # --- what has none -----------------------------------------------------------------------------------
+
+    def _show_figures(self, cycle: ObservedCycle) -> None:
+        offered, used = len(cycle.detections.labels), cycle.result.readings
+        values = (1e3 * cycle.seconds, *cycle.result.sizes, offered, used)
+        for path, value in zip(_SERIES, values, strict=True):
+            if np.isfinite(value):
+                self._stream.log(path, self._rerun.Scalars(value))
+
+    def _show_messages(self, cycle: ObservedCycle) -> None:
+        result, health, levels = cycle.result, cycle.result.health, self._rerun.TextLogLevel
+        if health.condition and health.condition != self._last_health.condition:
+            self._stream.log(HEALTH, self._rerun.StateChange(state=[health.condition]))
+        if health.condition and health != self._last_health:
+            level = levels.WARN if health.reason else levels.INFO
+            text = f"{health.condition}: {health.reason}" if health.reason else health.condition
+            self._say(text, levels.ERROR if health.condition == LOST else level)
+        if result.closed and not self._closed:
+            self._say(f"the loop is closed, on {sum(result.sizes)} points", levels.INFO)
+        if result.jump is not None:
+            self._say(f"the pose has jumped by {np.hypot(*result.jump[:2]):.2f} m", levels.INFO)
+        if result.notice:
+            self._say(result.notice, levels.INFO)
+        self._last_health, self._closed = health, result.closed
+
+    def _say(self, text: str, level: str) -> None:
+        self._stream.log(MESSAGES, self._rerun.TextLog(text, level=level))
+
+
+def dashes(points: Array) -> list[Array]:
+    """Return every other piece of the line through points (k, 2)."""
+    return [points[first : first + 2] for first in range(0, len(points) - 1, 2)]
+
+
+def _path(label: int, part: str) -> str:
+    return f"{MAP}/{NAMES[label]}/{part}"
+
+
+def pale(color: str) -> str:
+    """Return a colour "#rrggbb" mixed with as much white."""
+    return str(to_hex(0.5 + 0.5 * np.array(to_rgb(color))))
+
+
+def _rgb(color: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(color.removeprefix("#")))
 
 
 # --- all that watches a run ------------------------------------------------------------------------------

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_json, parse_toml, read_text, shown
-from pathspace_graph.settings.checked import successor
+from pathspace_graph.settings.checked import in_words, is_of, successor
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]  # new values by dotted field
@@ -78,22 +78,19 @@ def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
 
 def as_type(value: Any, hint: Any, where: str) -> Any:
     """Return a value of TOML in the type of a field: a list as a tuple, a whole number as a float."""
+    fitting = _converted(value, hint)
+    if not is_of(fitting, hint):
+        raise SettingsError(f"{where}: expected {in_words(hint)}, found {shown(value)}")
+    return fitting
+
+
+def _converted(value: Any, hint: Any) -> Any:
     arguments = get_args(hint)
-    if get_origin(hint) is Literal and value in arguments:
-        return value
     if get_origin(hint) in (Union, UnionType):
-        if value is None and NoneType in arguments:
-            return None
-        (hint,) = (entry for entry in arguments if entry is not NoneType)
-        return as_type(value, hint, where)
+        return value if value is None else _converted(value, arguments[arguments[0] is NoneType])
     if get_origin(hint) is tuple and isinstance(value, list | tuple):
-        each = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
-        if len(each) == len(value):
-            return tuple(as_type(v, h, where) for v, h in zip(value, each, strict=True))
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is float and (is_number or value in ("inf", "-inf")):  # JSON has these as texts
+        each = arguments[:1] * len(value) if arguments[-1] is ... else arguments
+        return tuple(map(_converted, value, each)) if len(each) == len(value) else value
+    if hint is float and (type(value) is int or value in ("inf", "-inf")):  # JSON has these as texts
         return float(value)
-    if isinstance(hint, type) and type(value) is hint:
-        return value
-    name = hint.__name__ if isinstance(hint, type) else str(hint)
-    raise SettingsError(f"{where}: expected a value of type {name}, found {shown(value)}")
+    return value

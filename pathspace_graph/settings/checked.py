@@ -37,8 +37,8 @@ class Positive:
         types = _types(type(self))  # type: ignore[arg-type]  # a class has a hash, whatever its heirs'
         for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
             value = getattr(self, entry.name)
-            if not _is_of(value, types[entry.name]):
-                expected = f"expected {_in_words(types[entry.name])}, found {value!r}"
+            if not is_of(value, types[entry.name]):
+                expected = f"expected {in_words(types[entry.name])}, found {value!r}"
                 raise SettingsError(f"{self.prefix}{entry.name}: {expected:.200}")
             if isinstance(value, bool) or not isinstance(value, int | float):
                 continue
@@ -58,26 +58,29 @@ def _types(settings: Any) -> dict[str, Any]:
     return get_type_hints(settings)
 
 
-def _is_of(value: Any, kind: Any) -> bool:
+def is_of(value: Any, kind: Any) -> bool:
     """Return whether a value is of the type of a field; NumPy's numbers are numbers."""
     options = get_args(kind)
     if get_origin(kind) in (Union, UnionType):
-        return any(_is_of(value, option) for option in options)
+        return any(is_of(value, option) for option in options)
     if get_origin(kind) is Literal:
         return value in options
     if get_origin(kind) is tuple:
-        return isinstance(value, tuple) and all(_is_of(own, options[0]) for own in value)
+        each = options[:1] * len(value) if isinstance(value, tuple) and options[-1] is ... else options
+        return isinstance(value, tuple) and len(value) == len(each) and all(map(is_of, value, each))
     if kind in _NUMBERS:
         return isinstance(value, _NUMBERS[kind][0]) and not isinstance(value, bool)
     return isinstance(value, kind)
 
 
-def _in_words(kind: Any) -> str:
+def in_words(kind: Any) -> str:
     options = get_args(kind)
     if get_origin(kind) in (Union, UnionType):
-        return " or ".join(map(_in_words, options))
+        return " or ".join(map(in_words, options))
     if get_origin(kind) is Literal:
         return " or ".join(map(repr, options))
+    if get_origin(kind) is tuple:
+        return f"a list, each {in_words(options[0])}"
     if kind in _NUMBERS:
         return _NUMBERS[kind][1]
     return {bool: "True or False", NoneType: "None"}.get(kind) or f"a {getattr(kind, '__name__', kind)}"

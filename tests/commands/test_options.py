@@ -111,7 +111,7 @@ BAD_FILES = {
         "motion.memory = 0.65\n",
         "motion.memory: expected a setting, found one that is gone: a constant",
     ),
-    "wrong type": ('lag = "long"\n', "lag: expected a value of type float, found 'long'"),
+    "wrong type": ('lag = "long"\n', "lag: expected a number, found 'long'"),
     "wrong word": ('spline.knots = "none"\n', "spline.knots: expected"),
     "out of range": ("gate.chi = -1\n", "gate.chi: expected a positive number, found -1"),
     "no TOML": ("lag 3\n", "row 1"),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.eval.experiment.cells import (
     Cell,
     Drive,
-    NamedTrack,
     Outcome,
     read_record,
     record_of,
@@ -91,7 +91,7 @@ def test_in_a_manifest(folder: str, read: Callable[[Path], object], written: Pat
 
 def test_in_a_cell_of_a_study(tmp_path: Path) -> None:
     """A damaged cell is run again."""
-    track = NamedTrack("round", read_track(write_round_track(tmp_path)))
+    track = replace(read_track(write_round_track(tmp_path)), name="round")
     cell = Cell(Drive(track, 0, "nominal", SimulationSettings()), "fixed-lag", MapperSettings(), "default")
     record = record_of(cell, Outcome.failed(cell, ValueError("lost"))) | {
         "laps": [{"lap": 1, "rmse": 0.123456}]

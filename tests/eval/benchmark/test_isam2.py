@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.benchmark.rivals import ToldLandmarks
+from pathspace_graph.eval.benchmark.measurement import ToldLandmarks
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from ...scenes.drives import ahead, bean_track, corridor, exact_log

@@ -59,7 +59,8 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
 
 def test_every_lane_gets_each_cycle_and_the_first_one_changes(pretend: Callable[..., list[str]]) -> None:
     calls = pretend()
-    times = run_lanes([Lane(name, empty_log(5)) for name in "abc"], MapperSettings(), budget=10.0)
+    times = [Lane(name, empty_log(5)) for name in "abc"]
+    run_lanes(times, MapperSettings(), budget=10.0)
     assert "".join(calls) == "abcbcacababcbca"
     assert all(len(t.seconds) == len(t.sizes) == 5 and not t.stopped for t in times)
     assert all(t.sizes == [7] * 5 for t in times)
@@ -67,9 +68,8 @@ def test_every_lane_gets_each_cycle_and_the_first_one_changes(pretend: Callable[
 
 def test_a_lane_ends_with_its_log(pretend: Callable[..., list[str]]) -> None:
     calls, told = pretend(), []
-    short, long = run_lanes(
-        [Lane("a", empty_log(2)), Lane("b", empty_log(4))], MapperSettings(), 10.0, lambda: told.append(1)
-    )
+    short, long = Lane("a", empty_log(2)), Lane("b", empty_log(4))
+    run_lanes([short, long], MapperSettings(), 10.0, lambda: told.append(1))
     assert (len(short.seconds), len(long.seconds), len(told)) == (2, 4, 4)
     assert "".join(calls) == "abbabb"
     assert not short.stopped
@@ -78,12 +78,13 @@ def test_a_lane_ends_with_its_log(pretend: Callable[..., list[str]]) -> None:
 def test_one_that_is_too_slow_or_fails_stops_alone(pretend: Callable[..., list[str]]) -> None:
     pretend(b=4)
     log = empty_log(20)
-    good, bad = run_lanes([Lane("a", log), Lane("b", log)], MapperSettings(), budget=10.0)
+    good, bad, slow = Lane("a", log), Lane("b", log), Lane("a", log)
+    run_lanes([good, bad], MapperSettings(), budget=10.0)
     assert len(good.seconds) == 20
     assert not good.stopped
     assert len(bad.seconds) == 4
     assert bad.stopped == "ValueError: no more"
-    (slow,) = run_lanes([Lane("a", log)], MapperSettings(), budget=1e-12)
+    run_lanes([slow], MapperSettings(), budget=1e-12)
     assert len(slow.seconds) == JUDGED
     assert "over 1e-12 s" in slow.stopped
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.benchmark.measurement import Gtsam, Measurement, measure, metrics
+from pathspace_graph.eval.benchmark.measurement import Measurement, measure, metrics
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
@@ -17,13 +17,11 @@ from ...scenes.timing import record
 
 def test_a_short_run_gives_every_figure() -> None:
     log = beginning(simulate(bean_track(), SimulationSettings(laps=1), 0), 70)
-    measurement = measure(log, MapperSettings(lag=1.0), every=10)
+    measurement = measure(log, MapperSettings(lag=1.0))
     assert len(measurement.cycles) == 70
-    assert measurement.gtsam.samples == 2
     assert measurement.closing is None
     figures = {metric.key: metric.value for metric in metrics(measurement)}
-    assert figures["gtsam"] == pytest.approx(figures["gtsam_optimize"] + figures["gtsam_marginal"])
-    assert np.isfinite(figures["mean_by_gtsam"])
+    assert np.isfinite(figures["mean_by_isam2"])
     assert len(measurement.rival) == len(measurement.isam2) == 70
     assert figures["landmark"] > 0.0 and figures["isam2"] > 0.0
     assert np.isnan(figures["closing"])
@@ -31,15 +29,12 @@ def test_a_short_run_gives_every_figure() -> None:
 
 
 def test_figures_by_hand() -> None:
-    """Three laps of 100 cycles: 2, 3 and 4 ms, one closing cycle of 40 ms; GTSAM takes 2 ms, the rival 8."""
+    """Three laps of 100 cycles: 2, 3 and 4 ms, one closing cycle of 40 ms; ISAM2 takes 2 ms, the rival 8."""
     cycles = [record(k, 0.002 + 0.001 * (k // 100), 1 + k // 100) for k in range(300)]
-    cycles[99] = record(99, 0.040, 1)
-    measurement = Measurement(
-        tuple(cycles), 3, 99, Gtsam("any", 0.0015, 0.0005, 25), (0.008,) * 300, (0.002,) * 300
-    )
+    cycles[99] = record(99, 0.040, 1, closed=True)
+    measurement = Measurement(cycles, 3, (0.008,) * 300, (0.002,) * 300)
     figures = {metric.key: metric for metric in metrics(measurement)}
     mean_later = (49 * 2.0 + 40.0 + 100 * 3.0 + 100 * 4.0) / 250
-    assert figures["mean_by_gtsam"].value == pytest.approx(mean_later / 2.0)
     assert figures["mean_by_landmark"].value == pytest.approx(mean_later / 8.0)
     assert figures["mean_by_isam2"].value == pytest.approx(mean_later / 2.0)
     assert figures["p99_by_isam2"].value == pytest.approx(2.0)
@@ -56,11 +51,12 @@ def test_figures_by_hand() -> None:
 def test_the_swap_is_compared_with_the_cycles_around_it() -> None:
     """It closes in cycle 99 and swaps in cycle 120; the 20 updates between take 3 ms, 2 before, 4 after."""
     cycles = [record(k, 0.002 if k < 99 else 0.003 if k < 120 else 0.004, 1) for k in range(200)]
+    cycles[99] = replace(cycles[99], closed=True)
+    unswapped = Measurement(tuple(cycles), 1, (0.008,) * 200, (0.002,) * 200, 1.2)
     cycles[120] = replace(record(120, 0.050, 1), jump=(0.1, 0.0, 0.0))
-    shared = (1, 99, Gtsam("any", 0.0015, 0.0005, 25), (0.008,) * 200, (0.002,) * 200)
-    figures = {metric.key: metric for metric in metrics(Measurement(tuple(cycles), *shared, 120, 1.2))}
+    figures = {metric.key: metric for metric in metrics(replace(unswapped, cycles=cycles))}
     assert (figures["swap"].value, figures["solve"].value) == (pytest.approx(50.0), 1.2)
     assert figures["meanwhile_by_before"].value == pytest.approx(1.5)
     assert figures["meanwhile_by_after"].value == pytest.approx(0.75)
     assert not figures["meanwhile_by_before"].holds and figures["swap"].holds
-    assert "swap" not in {metric.key for metric in metrics(Measurement(tuple(cycles), *shared))}
+    assert "swap" not in {metric.key for metric in metrics(unswapped)}

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.eval.benchmark.roads import ScalingSettings
-from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, Lane, LaneTimes, Scaling, binned, fit_slope
+from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, Lane, Scaling, binned, fit_slope
 from pathspace_graph.io.log import Log, Odometry
 
 NO_LOG = Log(Odometry(np.zeros(1), np.zeros((1, 3))), (), np.ones(3))
@@ -44,9 +44,9 @@ def test_two_points_have_no_slope_and_none_have_no_range() -> None:
 
 
 def test_bins_are_means_of_their_cycles() -> None:
-    times = LaneTimes(Lane("any", NO_LOG), [1.0, 2.0, 3.0, 5.0], [2, 2, 4, 6])
     at = np.array([1.0, 10.0, 12.0, 40.0, 90.0])  # the last cycle wasn't reached
-    found = binned(CONES, times, at, np.array([5.0, 20.0, 30.0, 80.0, 100.0]))
+    lane = Lane("any", NO_LOG, at, 0, [1.0, 2.0, 3.0, 5.0], [2, 2, 4, 6])
+    found = binned(CONES, lane, np.array([5.0, 20.0, 30.0, 80.0, 100.0]))
     means = found[["at", "seconds", "cycles", "size"]].values.tolist()
     assert means == [[11.0, 2.5, 2, 3.0], [40.0, 5.0, 1, 6.0]]
 

@@ -7,8 +7,13 @@ import pytest
 from scipy.spatial import KDTree
 
 from pathspace_graph.eval.benchmark.roads import (
+    DENT,
+    DENTS,
+    GAP,
     SPARE,
-    RoadSettings,
+    SWING,
+    WAVELENGTH,
+    WIDTH,
     closed_road,
     cones_seen,
     drive_log,
@@ -21,50 +26,48 @@ from pathspace_graph.io.log import Log
 
 from ...scenes.timing import SMALL
 
-ROAD = RoadSettings()
-
 
 @pytest.fixture(scope="module")
 def log() -> Log:
-    return drive_log(open_road(60, ROAD.gap, ROAD), ROAD, seed=0)
+    return drive_log(open_road(60, GAP), seed=0)
 
 
 def test_roads_have_their_gaps_and_width() -> None:
-    for track, gap in ((open_road(100, 5.0, ROAD), 5.0), (closed_road(100, ROAD), 5.0)):
+    for track, gap in ((open_road(100, 5.0), 5.0), (closed_road(100), 5.0)):
         for row in (track.left, track.right):
             np.testing.assert_allclose(np.linalg.norm(np.diff(row, axis=0), axis=1), gap, rtol=0.06)
         nearest = np.linalg.norm(track.left[:, None] - track.right[None], axis=-1).min(axis=1)
-        assert np.all(nearest >= ROAD.width - 0.2)
-        assert np.all(nearest < np.hypot(ROAD.width, gap / 2) + 0.5)
-    assert len(closed_road(100, ROAD).cones) == pytest.approx(100, abs=3)
+        assert np.all(nearest >= WIDTH - 0.2)
+        assert np.all(nearest < np.hypot(WIDTH, gap / 2) + 0.5)
+    assert len(closed_road(100).cones) == pytest.approx(100, abs=3)
 
 
 def test_an_open_road_has_cones_to_spare_and_swings_about_its_direction() -> None:
     """It heads for x, by at most 0.9 rad to either side, and has a whole swing every 300 m."""
-    track = open_road(400, ROAD.gap, ROAD)
+    track = open_road(400, GAP)
     assert len(track.cones) == pytest.approx(SPARE * 400, abs=4)
     steps = np.diff(track.left, axis=0)
     headings = np.arctan2(steps[:, 1], steps[:, 0])
-    assert np.abs(headings).max() == pytest.approx(ROAD.swing, abs=0.01)
+    assert np.abs(headings).max() == pytest.approx(SWING, abs=0.01)
     crossings = np.flatnonzero((headings[:-1] < 0.0) & (headings[1:] >= 0.0))
-    np.testing.assert_allclose(np.diff(crossings) * ROAD.gap, ROAD.wavelength, atol=ROAD.gap)
+    np.testing.assert_allclose(np.diff(crossings) * GAP, WAVELENGTH, atol=GAP)
 
 
 def test_an_open_road_never_comes_near_itself() -> None:
-    track = open_road(2000, ROAD.gap, ROAD)
+    track = open_road(2000, GAP)
     for pair in KDTree(track.left).query_pairs(20.0):
         assert abs(pair[0] - pair[1]) < 6
 
 
 def test_a_closed_road_is_a_dented_circle() -> None:
     """Its distance from the middle swings by 12 % about the mean, three times around."""
-    track = closed_road(400, ROAD)
+    track = closed_road(400)
     middle = 0.5 * (track.left + track.right[KDTree(track.right).query(track.left)[1]])
     radius = np.linalg.norm(middle, axis=1)
     assert track.closed
-    assert radius.max() / radius.min() == pytest.approx((1.0 + ROAD.dent) / (1.0 - ROAD.dent), rel=0.02)
+    assert radius.max() / radius.min() == pytest.approx((1.0 + DENT) / (1.0 - DENT), rel=0.02)
     around = np.append(radius, radius[:1]) > radius.mean()
-    assert np.sum(around[:-1] != around[1:]) == 2 * ROAD.dents
+    assert np.sum(around[:-1] != around[1:]) == 2 * DENTS
 
 
 def test_cones_seen_counts_each_once(log: Log) -> None:

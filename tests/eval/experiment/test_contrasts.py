@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.eval.experiment.frame import contrasts, last_laps
-from pathspace_graph.eval.experiment.plots import figures
+from pathspace_graph.eval.experiment.plots import plot_differences
 from pathspace_graph.eval.experiment.study import Baseline, Study
 from pathspace_graph.eval.experiment.tables import as_latex, as_markdown, as_text, caption, summary_tables
 
@@ -140,9 +140,9 @@ def test_latex_is_escaped(frame: pd.DataFrame) -> None:
 
 
 def test_figures_of_what_differs(frame: pd.DataFrame) -> None:
-    drawn = figures(STUDY, frame)
-    assert set(drawn) == {"differences", "accuracy_size", "accuracy_time"}
-    (panel,) = drawn["differences"].axes
+    drawn = plot_differences(STUDY, frame)
+    assert drawn is not None
+    (panel,) = drawn.axes
     assert panel.get_title("left") == "rmse [m]"
     assert [label.get_text() for label in panel.get_yticklabels()] == [
         "nominal, lag=1",
@@ -150,15 +150,16 @@ def test_figures_of_what_differs(frame: pd.DataFrame) -> None:
         "loud_one, lag=1",
         "loud_one, lag=2",
     ]
-    assert len(drawn["accuracy_time"].axes) == 2
-    assert "differences" not in figures(STUDY, rows({"default": 0.0}))
+    assert plot_differences(STUDY, rows({"default": 0.0})) is None
 
 
 def test_rows_of_all_panels_are_the_same_where_one_metric_lacks_some() -> None:
     frame = rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0})
     frame.loc[frame["variant"] == "lag=1", "missed"] = np.nan
     frame.loc[frame["variant"] == "lag=2", "missed"] = 0.5
-    first, second = figures(STUDY, frame)["differences"].axes
+    drawn = plot_differences(STUDY, frame)
+    assert drawn is not None
+    first, second = drawn.axes
     assert [label.get_text() for label in first.get_yticklabels()] == ["nominal, lag=1", "nominal, lag=2"]
     means = [container.lines[0].get_ydata().tolist() for container in second.containers]
     assert means == [[1]]
@@ -169,7 +170,9 @@ def test_a_figure_names_settings_without_their_group_where_that_is_enough() -> N
     named = rows(shift)
 
     def label(study: Study) -> str:
-        (panel,) = figures(study, named)["differences"].axes
+        drawn = plot_differences(study, named)
+        assert drawn is not None
+        (panel,) = drawn.axes
         return str(panel.get_yticklabels()[0].get_text())
 
     study = replace(STUDY, noise={"nominal": {}}, grids=({"spline.degree": [2], "lag": [1.0]},))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.experiment.cells import Drive, NamedTrack, load_tracks
+from pathspace_graph.eval.experiment.cells import Drive, load_tracks
 from pathspace_graph.sim.simulate import SimulationSettings
 
 from ...scenes.pretenders import write_round_track
@@ -50,7 +50,7 @@ def test_a_folder_without_tracks_and_a_missing_file_are_refused(tmp_path: Path) 
 def test_a_drive_is_the_same_by_geometry_seed_and_simulation_whatever_its_names() -> None:
     (track,) = load_tracks([0])
     drive = Drive(track, 0, "nominal", SimulationSettings(laps=2))
-    renamed = NamedTrack("another name", track.track)
+    renamed = replace(track, name="another name")
     assert replace(drive, track=renamed, noise="quiet").id == drive.id
     assert replace(drive, seed=1).id != drive.id
     assert replace(drive, simulation=SimulationSettings(laps=3)).id != drive.id

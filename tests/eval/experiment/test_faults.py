@@ -12,9 +12,7 @@ import pytest
 
 from pathspace_graph.eval.experiment.faults import (
     COLUMNS,
-    FaultOutcome,
     beside_clean,
-    fault_of,
     fault_table,
     outcomes,
 )
@@ -66,9 +64,9 @@ def frame() -> pd.DataFrame:
 
 def test_a_run_is_compared_with_the_clean_one_of_its_track_and_seed(frame: pd.DataFrame) -> None:
     clean, mild, strong = outcomes(STUDY, frame)
-    np.testing.assert_allclose(clean.runs["ratio"], [1.0, 1.0])
-    np.testing.assert_allclose(mild.runs["ratio"], [1.5, 3.5])
-    values = mild.values()
+    assert (clean["ratio_min"], clean["ratio_max"]) == pytest.approx((1.0, 1.0))
+    np.testing.assert_allclose(beside_clean(frame)["ratio"], [1.0, 1.0, 1.5, 3.5, np.nan])
+    values = mild
     assert values["ratio_mean"] == pytest.approx(2.5)
     assert (values["ratio_min"], values["ratio_max"]) == pytest.approx((1.5, 3.5))
     assert values["size_ratio"] == pytest.approx(1.25)
@@ -76,7 +74,7 @@ def test_a_run_is_compared_with_the_clean_one_of_its_track_and_seed(frame: pd.Da
     assert (values["said"], values["told"]) == ({"a notice": 1}, 1)
     assert values["calibration"] == {"scale error of the speeds": pytest.approx(-4.0)}
     assert np.isnan(values["told_lost"])
-    values = strong.values()
+    values = strong
     assert (values["runs"], values["failed"], values["with_map"]) == (1, 1, 0)
     assert np.isnan(values["ratio_mean"])
     assert (values["closed"], values["error_max"], values["calibration"]) == (0, 80.0, {})
@@ -85,8 +83,8 @@ def test_a_run_is_compared_with_the_clean_one_of_its_track_and_seed(frame: pd.Da
 def test_what_a_run_calls_itself_is_told_where_it_judges_its_health(frame: pd.DataFrame) -> None:
     frame["told_degraded"], frame["told_lost"] = 0.1, np.where(frame["noise"] == "clean", 0.0, 0.2)
     clean, mild, _ = outcomes(STUDY, frame)
-    assert mild.values()["told_lost"] == pytest.approx(0.2)
-    assert (clean.values()["told"], mild.values()["told"]) == (0, 2)
+    assert mild["told_lost"] == pytest.approx(0.2)
+    assert (clean["told"], mild["told"]) == (0, 2)
     table = fault_table(STUDY, [clean, mild])
     assert table.rows[1][table.header.index("called degraded, lost [% of cycles]")] == "10.0, 20.0"
 
@@ -113,7 +111,7 @@ def test_the_table_has_the_columns_that_something_is_known_of(frame: pd.DataFram
 
 
 def test_the_figure_has_a_panel_for_each_fault_and_a_look_for_each_fate(frame: pd.DataFrame) -> None:
-    figure = plot_faults(outcomes(STUDY, frame))
+    figure = plot_faults(STUDY, beside_clean(frame))
     visible = [axes for axes in figure.axes if axes.get_visible()]
     assert [axes.get_title(loc="left") for axes in visible] == ["latency [ms]"]
     labels = {str(line.get_label()) for line in visible[0].lines}
@@ -123,7 +121,7 @@ def test_the_figure_has_a_panel_for_each_fault_and_a_look_for_each_fate(frame: p
 
 def test_runs_without_a_map_are_crosses_on_the_upper_edge(frame: pd.DataFrame) -> None:
     frame["rmse"] = np.nan
-    figure = plot_faults(outcomes(STUDY, frame))
+    figure = plot_faults(STUDY, beside_clean(frame))
     figure.draw_without_rendering()
     (axes,) = [axes for axes in figure.axes if axes.get_visible()]
     crosses = [line for line in axes.lines if line.get_label() == "no map"]
@@ -142,7 +140,7 @@ def test_the_files_hold_every_value(frame: pd.DataFrame, tmp_path: Path) -> None
     assert [entry["strength"] for entry in found["faults"]] == [0.0, 20.0, 50.0]
     assert found["faults"][2]["ratio_mean"] is None
     flat = pd.read_csv(tmp_path / "faults.csv")
-    expected = [outcome.values() for outcome in outcomes(STUDY, frame)]
+    expected = outcomes(STUDY, frame)
     assert list(flat) == list(expected[0])
     for entry, row in zip(found["faults"], expected, strict=True):
         known = {name: value for name, value in row.items() if not pd.isna(value)}
@@ -156,6 +154,7 @@ def test_the_files_hold_every_value(frame: pd.DataFrame, tmp_path: Path) -> None
 
 
 def test_an_outcome_without_runs_has_no_figures(frame: pd.DataFrame) -> None:
-    values = FaultOutcome(fault_of("latency: 20 ms"), beside_clean(frame)[:0], 2).values()
+    failed = frame.assign(failure=np.where(frame["noise"] == "latency: 20 ms", "ValueError", ""))
+    values = outcomes(STUDY, failed)[1]
     assert (values["runs"], values["failed"], values["lost"]) == (0, 2, 0)
     assert np.isnan(values["missed"]) and np.isnan(values["error_max"])

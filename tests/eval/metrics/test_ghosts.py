@@ -24,19 +24,19 @@ def test_ghost_landmarks_and_duplicates() -> None:
         },
     )
     found = ghosts(track, true)
-    assert (found.landmarks, found.duplicates, found.metres) == (2, 1, 0.0)
-    assert found.share == pytest.approx(2 / 7)
-    assert ghosts(track, true, GhostSettings(distance=3.0)).landmarks == 1
+    assert (found["ghost_landmarks"], found["duplicates"], found["ghost_metres"]) == (2, 1, 0.0)
+    assert found["ghost_share"] == pytest.approx(2 / 7)
+    assert ghosts(track, true, GhostSettings(distance=3.0))["ghost_landmarks"] == 1
 
 
 def test_ghost_curve_is_the_length_with_no_boundary_near() -> None:
     """20 m of curve over 10 m of truth: what is more than 2 m past its end has no boundary near."""
     found = ghosts(Map(False, {LEFT: line(2.0, end=20.0)}), truth(row(2.0)))
-    assert found.metres == pytest.approx(8.0, abs=0.1)
-    assert found.share == pytest.approx(0.4, abs=0.005)
-    assert (found.landmarks, found.duplicates) == (0, 0)
+    assert found["ghost_metres"] == pytest.approx(8.0, abs=0.1)
+    assert found["ghost_share"] == pytest.approx(0.4, abs=0.005)
+    assert (found["ghost_landmarks"], found["duplicates"]) == (0, 0)
     whole = ghosts(Map(False, {LEFT: line(2.0)}), truth(np.zeros((0, 2))))
-    assert whole.metres == pytest.approx(10.0)
-    assert np.isnan(ghosts(Map(False, {}), truth(row(2.0))).share)
+    assert whole["ghost_metres"] == pytest.approx(10.0)
+    assert np.isnan(ghosts(Map(False, {}), truth(row(2.0)))["ghost_share"])
     with pytest.raises(SettingsError):
         GhostSettings(distance=0.0)

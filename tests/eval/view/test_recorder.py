@@ -10,9 +10,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 from pathspace_graph.estimators import make_online
-from pathspace_graph.eval.view import recorder as entities
-from pathspace_graph.eval.view.recorder import dashes, pale
-from pathspace_graph.eval.view.recording import recording
+from pathspace_graph.eval.view import recording as entities
+from pathspace_graph.eval.view.recording import dashes, pale, recording
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.run import run_online

@@ -13,8 +13,7 @@ from rerun.chunk import RrdReader
 from pathspace_graph.cli import main
 from pathspace_graph.errors import OutputError, SettingsError
 from pathspace_graph.eval.view import recording as module
-from pathspace_graph.eval.view.recorder import VEHICLE
-from pathspace_graph.eval.view.recording import DISPLAYS, check_recording, has_display, recording
+from pathspace_graph.eval.view.recording import DISPLAYS, VEHICLE, check_recording, has_display, recording
 from pathspace_graph.io.log import write_log
 from pathspace_graph.run import split_odometry
 
