@@ -19,7 +19,7 @@ from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, pose_keys
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.results import RunResult
+from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
@@ -70,10 +70,6 @@ class CurveMapper(OnlineEstimator, Protocol):
         """Return the curves by label, without their control points."""
 
     @property
-    def calibrations(self) -> Array:
-        """Return the calibration of the odometry (2,), or of odometry and sensor (7,)."""
-
-    @property
     def closed(self) -> bool:
         """Return whether the loop has closed."""
 
@@ -88,6 +84,9 @@ class CurveMapper(OnlineEstimator, Protocol):
     def revisits(self) -> tuple[Revisit, ...]:
         """Return the revisits of the drive, which an open map is optimized with."""
 
+    def vehicle_state(self) -> VehicleState:
+        """Return the newest pose and the calibration."""
+
 
 def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
     """Return the final map of an online run with all of its poses, and the run."""
@@ -100,7 +99,9 @@ def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
         state.add_boundary(label, boundary, mapper.control_points(label))
     corrected = mapper.corrected_poses
     poses = unwrap(np.concatenate([corrected, run.trajectory[len(corrected) :]]))
-    add_drive(state, poses, mapper.calibrations, settings.batch.association)
+    vehicle = mapper.vehicle_state()
+    calibration = np.concatenate([vehicle.calibration, vehicle.sensor])
+    add_drive(state, poses, calibration, settings.batch.association)
     return state, run
 
 
