@@ -10,7 +10,7 @@ from importlib.metadata import version
 from traceback import print_exc
 from typing import Any, Final
 
-from .errors import PathspaceError, SettingsError, SolveError
+from .errors import PathspaceError, SettingsError, SolveError, check_name
 
 PROGRAM: Final = "pathspace-graph"
 DONE: Final = 0
@@ -82,8 +82,10 @@ def _run(arguments: list[str], level: str) -> None:
             if command is not None:
                 command.run()
     else:
-        known = ", ".join(COMMANDS)
-        raise SettingsError(f"expected a command ({known}), found {repr(first) if first else 'none'}")
+        expected = f"expected a command ({', '.join(COMMANDS)})"
+        if not first:
+            raise SettingsError(f"{expected}, found none")
+        check_name(first, COMMANDS, expected)
 
 
 def overview() -> str:

@@ -295,10 +295,11 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     ("arguments", "says"),
     [
         ([], f"expected a command ({', '.join(COMMANDS)})"),
-        (["fly"], "'fly'"),
-        (["online"], "Missing"),
+        (["onlin"], "found 'onlin', the nearest is 'online'"),
+        (["online"], "graph: Missing"),
         (["online", "LOG", "--out", "MAP", "--lag", "long"], "--lag"),
         (["online", "LOG", "--out", "MAP", "--no-such-option", "1"], "--no-such-option"),
+        (["online", "LOG", "--out", "MAP", "--estimatr", "ckf"], "ckf, the nearest is --estimator (see"),
         (["online", "LOG", "--out", "MAP", "--estimator", "magic"], "fixed-lag"),
         (["online", "LOG", "--out", "MAP"], "LOG: expected a log folder"),
         (
