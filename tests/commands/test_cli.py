@@ -314,6 +314,10 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
         (["online", "LOG", "--out", "MAP", "--gauge.sigma-spacing", "inf"], "gauge.sigma_spacing: expected"),
         (["online", "LOG", "--out", "MAP", "--gate.huber", "nan"], "gate.huber: expected a positive number"),
         (["simulate", "--out", "LOG"], "--track FILE, --generate SEED or --event NAME"),
+        (
+            ["simulate", "--generate", "1", "--event", "skidpad", "--out", "LOG"],
+            "expected one of --track FILE",
+        ),
         (["simulate", "--generate", "1", "--laps", "0", "--out", "LOG"], "laps"),
         (["simulate", "--generate", "-1", "--out", "LOG"], "seed"),
         (["simulate", "--generate", "1", "--out", "LOG", "--sensor.fov", "nan"], "sensor.fov"),
