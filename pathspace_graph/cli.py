@@ -49,6 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if threading.current_thread() is threading.main_thread():
         # temporary files are removed on the way
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads stall systems as small as these
     given = list(sys.argv[1:] if arguments is None else arguments)
     level = next((LEVELS[word] for word in reversed(given) if word in LEVELS), "NORMAL")
     try:
