@@ -4,13 +4,14 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 from traceback import print_exc
 from typing import Any, Final
 
-from .errors import PathspaceError, SettingsError, SolveError
+from .errors import PathspaceError, SettingsError, SolveError, check_name
 
 PROGRAM: Final = "pathspace-graph"
 DONE: Final = 0
@@ -21,6 +22,9 @@ BROKEN_PIPE: Final = 141
 TERMINATED: Final = 143
 LEVELS: Final = {"-q": "QUIET", "--quiet": "QUIET", "-v": "VERBOSE", "--verbose": "VERBOSE"}
 """Options that every command takes, each with its level of `console.Verbosity`."""
+ENVIRONMENT: Final = {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore:resource_tracker"}
+"""Variables of a command and its workers, unless the user has set them: threads stall small systems, and
+joblib's tracker complains where a run is interrupted."""
 COMMANDS: Final = {
     "demo": ("demo", "Demo", "maps a generated track online, and shows a table, a map and its picture"),
     "simulate": ("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
@@ -49,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if threading.current_thread() is threading.main_thread():
         # temporary files are removed on the way
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     given = list(sys.argv[1:] if arguments is None else arguments)
     level = next((LEVELS[word] for word in reversed(given) if word in LEVELS), "NORMAL")
     try:
@@ -61,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _refuse(f"{error.filename or 'output'}: {error.strerror or error}", level)
     except KeyboardInterrupt:
+        warnings.simplefilter("ignore")  # joblib's, of tasks that are not waited for
         print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return INTERRUPTED
     return DONE
@@ -82,8 +89,10 @@ def _run(arguments: list[str], level: str) -> None:
             if command is not None:
                 command.run()
     else:
-        known = ", ".join(COMMANDS)
-        raise SettingsError(f"expected a command ({known}), found {repr(first) if first else 'none'}")
+        expected = f"expected a command ({', '.join(COMMANDS)})"
+        if not first:
+            raise SettingsError(f"{expected}, found none")
+        check_name(first, COMMANDS, expected)
 
 
 def overview() -> str:

@@ -90,7 +90,8 @@ def check_type(name: str, value: object, kind: type[Any]) -> None:
     """Raise a SettingsError that names an argument, unless its value is of the type."""
     if not isinstance(value, kind):
         found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
-        raise SettingsError(f"{name}: expected a {kind.__name__}, found {found}")
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise SettingsError(f"{name}: expected {article} {kind.__name__}, found {found}")
 
 
 NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {

@@ -19,7 +19,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .errors import SettingsError
+from .errors import SettingsError, check_type
 from .run import BatchEstimator, OnlineEstimator
 
 MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
@@ -90,9 +90,11 @@ def for_map(name: str, kind: MapKind) -> str:
 
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
     check_online(name)
+    check_type("log", log, Log)
     return ONLINE[name](settings, log.noise)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
     check_batch(name)
+    check_type("log", log, Log)
     return BATCH[name](settings, log.noise)

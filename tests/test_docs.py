@@ -335,7 +335,7 @@ def log_folder(installed: Path, log: Log) -> Path:
 def run_command(folder: Path, command: str) -> str:
     """What a command prints; the folder is both where it runs and where the estimator is installed."""
     paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "MPLBACKEND": "Agg"}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     arguments = [sys.executable, "-m", PACKAGE, *command.split()]
     done = subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

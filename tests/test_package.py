@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 import pathspace_graph
 from pathspace_graph.cli import main
@@ -196,3 +198,14 @@ def test_what_the_readme_shows_is_there() -> None:
     for target in re.findall(r"\]\(([^)#:]+)\)", README):
         assert (ROOT / target).exists(), target
     assert (ROOT / "docs" / "track.png").stat().st_size < 300_000
+
+
+def test_blas_has_one_thread_in_tests_and_in_commands() -> None:
+    assert {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"} == {1}
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    script = "from pathspace_graph.cli import main; main(['--help']); import numpy, threadpoolctl as t;"
+    script += "print({pool['num_threads'] for pool in t.threadpool_info() if pool['user_api'] == 'blas'})"
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "{1}"

@@ -58,10 +58,11 @@ def test_the_tutorial(tmp_path: Path) -> None:
     online, reference = (read_map(tmp_path / name) for name in ("map", "reference"))
     assert online.closed
     assert reference.closed
-    truth = read_map(tmp_path / "map-with-truth")
+    with_truth = tmp_path / "comparison" / "fixed-lag"
+    truth = read_map(with_truth)
     assert abs(online.size - truth.size) < 10  # the bag lost nothing that matters
-    poses = [read_trajectory(tmp_path / name / "trajectory.tum")[1] for name in ("map", "map-with-truth")]
-    left = [size_left(tmp_path / name / "cycles.csv") for name in ("map", "map-with-truth")]
+    poses = [read_trajectory(at / "trajectory.tum")[1] for at in (tmp_path / "map", with_truth)]
+    left = [size_left(at / "cycles.csv") for at in (tmp_path / "map", with_truth)]
     alike = np.abs(left[0] - left[1]) < 0.25 * online.size  # a curve becomes smaller where the loop closes
     assert (~alike).sum() <= 2
     assert np.hypot(*(poses[0] - poses[1])[alike, :2].T).max() < 1.5

@@ -19,7 +19,7 @@ from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, pose_keys
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.results import RunResult
+from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
@@ -61,12 +61,11 @@ class CurveMapper(OnlineEstimator, Protocol):
     @property
     def boundaries(self) -> dict[int, Boundary]: ...
     @property
-    def calibrations(self) -> Array: ...
-    @property
     def corrected_poses(self) -> Array: ...
     @property
     def revisits(self) -> tuple[Revisit, ...]: ...
     def control_points(self, label: int) -> Array: ...
+    def vehicle_state(self) -> VehicleState: ...
 
 
 def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
@@ -80,7 +79,9 @@ def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
         state.add_boundary(label, boundary, mapper.control_points(label))
     corrected = mapper.corrected_poses
     poses = unwrap(np.concatenate([corrected, run.trajectory[len(corrected) :]]))
-    add_drive(state, poses, mapper.calibrations, settings.batch.association)
+    vehicle = mapper.vehicle_state()
+    calibration = np.concatenate([vehicle.calibration, vehicle.sensor])
+    add_drive(state, poses, calibration, settings.batch.association)
     return state, run
 
 

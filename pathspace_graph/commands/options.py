@@ -46,6 +46,7 @@ MOST_COLUMNS: Final = 120
 _ANSI: Final = re.compile(r"\x1b\[[0-9;]*m")
 _FRAME: Final = " │\t"
 _RULE: Final = "─╭╮╰╯"
+_SIMILAR: Final = re.compile(r"(?:Perhaps you meant|Arguments similar to).*\n\W*(--\S+)")
 
 
 def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
@@ -73,7 +74,9 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
             if _estimates(command):
                 sys.stdout.write(f"\n{SETTINGS} FILE\n    {SETTINGS_TEXT}\n")
             return None
-    raise SettingsError(f"{one_line(complaint.getvalue())} (see {program} --help)")
+    near = _SIMILAR.findall(_ANSI.sub("", complaint.getvalue()))
+    nearest = f", the nearest is {', '.join(near)}" if near else ""
+    raise SettingsError(f"{one_line(complaint.getvalue())}{nearest} (see {program} --help)")
 
 
 def _estimates(command: type[Any]) -> bool:
@@ -251,13 +254,8 @@ def _set_help(settings: type[Any]) -> None:
 
 
 def one_line(box: str) -> str:
-    """Return the first part of tyro's framed message as one line."""
-    words: list[str] = []
-    for line in _ANSI.sub("", box).splitlines():
-        text = line.strip(_FRAME)
-        if not text.strip(_RULE + " ") or text[0] in _RULE:
-            if words:
-                break
-            continue
-        words.extend(text.split())
-    return " ".join(words)
+    """Return the first part of tyro's framed message as one line; without UTF-8 the frame is of hyphens."""
+    lines = [line.strip(_FRAME) for line in _ANSI.sub("", box).splitlines()]
+    rules = [k for k, line in enumerate(lines) if line[:1] in (*_RULE,) or (line and not line.strip("-"))]
+    begin, end = [*rules, len(lines)][:2] if rules else (-1, len(lines))
+    return " ".join(" ".join(lines[begin + 1 : end]).split())

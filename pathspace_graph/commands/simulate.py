@@ -31,9 +31,9 @@ class Simulate:
     track: Path | None = None
     """Track file: PacSim or fssim YAML, EUFS or TUM CSV."""
     generate: int | None = None
-    """Seed of a generated Formula Student track, where no track file is given."""
+    """Seed of a generated Formula Student track, in place of a track file."""
     event: Literal["skidpad", "acceleration"] | None = None
-    """Event that is driven instead, on the track that the rules describe."""
+    """Event that is driven instead of either, on the track that the rules describe."""
     seed: int = 0
     """Seed of the drive's wander and of all noise."""
     sensor: Literal["plain", "camera"] = "plain"
@@ -62,13 +62,13 @@ class Simulate:
         say(f"{self.out}: {describe(log)}")
 
     def _track(self) -> Track:
+        if [self.track, self.generate, self.event].count(None) != 2:
+            raise SettingsError("simulate: expected one of --track FILE, --generate SEED or --event NAME")
         if self.track is not None:
             return read_track(self.track)
         if self.generate is not None:
             return generated_track(self.generate, self.generator)
-        if self.event is not None:
-            return EVENTS[self.event]()
-        raise SettingsError("simulate: expected a track: --track FILE, --generate SEED or --event NAME")
+        return EVENTS[str(self.event)]()
 
 
 def generated_track(seed: int, settings: TrackGeneratorSettings | None = None) -> Track:

@@ -203,7 +203,7 @@ def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Ba
         reader.open()
     except Exception as error:
         expected = "expected a ROS bag: a file .bag, .mcap or .db3, or a folder with metadata.yaml"
-        raise InputError(path, f"{expected} ({error})") from None
+        raise InputError(path, f"{expected} ({error}); --from says what else it is") from None
     try:
         yield Bag(path, reader, definitions, options.received, notes)
     finally:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from numbers import Real
 from typing import Any, Final
 
 import numpy as np
@@ -27,7 +28,8 @@ POINT_MARKERS: Final = (1, 2, 3, 10)  # types of markers that are one point: cub
 LIST_MARKERS: Final = (6, 7, 8)  # types of markers that are lists of points: cubes, spheres, points
 ADDED: Final = 0  # action of a marker that is added; others are taken away
 POSITIONS: Final = ("point", "position", "location", "center", "pose", "bbox")  # of a cone without x and y
-SPEEDS: Final = ("speed", "data")  # fields of a speed alone
+SPEEDS: Final = ("speed", "data", "vx")  # fields of a speed alone
+YAW_RATES: Final = ("wz", "yaw_rate")  # fields of a yaw rate beside it
 
 
 class MessageError(PathspaceError):
@@ -82,12 +84,14 @@ def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
     if hasattr(twist, "linear") and hasattr(twist, "angular"):
         return np.array([twist.linear.x, twist.linear.y, twist.angular.z], dtype=float)
     drive = getattr(message, "drive", message)
-    speed = next((getattr(drive, name) for name in SPEEDS if hasattr(drive, name)), None)
-    if speed is not None:
-        steering, rate = getattr(drive, "steering_angle", None), np.nan
-        if steering is not None and wheelbase is not None:
-            rate = float(speed) * np.tan(float(steering)) / wheelbase
-        return np.array([float(speed), 0.0, rate])
+    speed, rate = (
+        next((getattr(drive, name) for name in names if hasattr(drive, name)), None)
+        for names in (SPEEDS, YAW_RATES)
+    )
+    if isinstance(speed, Real):
+        if hasattr(drive, "steering_angle") and wheelbase is not None:
+            rate = speed * np.tan(drive.steering_angle) / wheelbase
+        return np.array([speed, getattr(drive, "vy", 0.0), np.nan if rate is None else rate], dtype=float)
     if pose_of(message) is None:
         raise MessageError(f"expected a message with a twist, a speed or a pose, found {_names(message)}")
     return None
@@ -274,7 +278,7 @@ def _label_value(holder: Any, names: Sequence[str]) -> Any:
 
 def _names(message: Any) -> Sequence[str]:
     if is_dataclass(message):
-        return [field.name for field in fields(message)]
+        return [field.name for field in fields(message) if not field.name.startswith("_")]
     if hasattr(message, "get_fields_and_field_types"):
         return list(message.get_fields_and_field_types())
     return list(vars(message))

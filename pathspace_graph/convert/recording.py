@@ -113,7 +113,7 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     good = np.isfinite(t) & np.isfinite(twists).all(axis=1)
     notes["odometry samples that are not finite were left out"] += int((~good).sum())
     t, twists = t[good], twists[good]
-    _check_stamps(t, "odometry", file)
+    _check_stamps(t, "odometry", file, notes)
     for values, most, expected in (
         (twists[:, :2], MAX_SPEED, f"speeds of at most {MAX_SPEED:g} m/s"),
         (twists[:, 2], MAX_YAW_RATE, f"yaw rates of at most {MAX_YAW_RATE:g} rad/s"),
@@ -130,9 +130,10 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     return Odometry(t[last], twists)
 
 
-def _check_stamps(t: Array, what: str, file: Path) -> None:
+def _check_stamps(t: Array, what: str, file: Path, notes: Counter[str]) -> None:
     if len(t) == 0:
-        raise InputError(file, f"expected {what} with stamps, found none")
+        why = [f"{number} {text}" for text, number in notes.items() if number and what in text]
+        raise InputError(file, "; ".join([f"expected {what} with stamps, found none", *why]))
     worst = float(np.abs(t).max())
     if worst > MAX_STAMP:
         raise InputError(file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}")
@@ -142,7 +143,7 @@ def _cycles(
     record: Recording, odometry: Odometry, frames: Frames, noise: NoiseSettings, file: Path
 ) -> tuple[Detections, ...]:
     t, notes = record.scan_t, record.notes
-    _check_stamps(t, "detections", file)
+    _check_stamps(t, "detections", file, notes)
     notes["messages with detections were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
     begin, end = float(odometry.t[0]), float(odometry.t[-1]) + logs.MAX_HOLD
     found: dict[float, list[Points]] = {}

@@ -165,6 +165,8 @@ def _check_parents(target: Path) -> None:
     nearest = next((parent for parent in target.parents if parent.exists()), target)
     if not nearest.is_dir():
         raise OutputError(f"{nearest}: expected a folder, found a file")
+    if not os.access(nearest, os.W_OK):
+        raise OutputError(f"{nearest}: expected a folder that can be written")
 
 
 # --- the way to the place ----------------------------------------------------------------------------------

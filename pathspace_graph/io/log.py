@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
-from pathspace_graph.errors import InputError
+from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, label_from_name
@@ -242,6 +242,7 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
     It appears as a whole or not at all; an earlier log is kept as a numbered backup. With `check`, a log that
     cannot be read is an InputError, and is not written.
     """
+    check_type("log", log, Log)
     with atomic_folder(folder, LOG_FILE) as target:
         (target / LOG_FILE).write_text(to_toml(_sections(log)), encoding="utf-8", newline="\n")
         for name, values in _columns(log).items():

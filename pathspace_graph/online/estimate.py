@@ -281,16 +281,6 @@ class MapperEstimate:
         """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.poses.copy()
 
-    @property
-    def calibration(self) -> Array:
-        """Return a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
-        return self.smoother.variables.calibration
-
-    @property
-    def calibrations(self) -> Array:
-        """Return a view of the calibrations of the odometry and, where it is estimated, of the sensor."""
-        return self.smoother.variables.calibrations
-
 
 # --- the window as nonlinear factors ---------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from pathspace_graph.errors import InputError
+from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry, covariances_of, cycles_of
@@ -85,6 +85,7 @@ MIRRORED: Final = 0.0, True  # frame in which y points to the right and x ahead
 
 def hints(log: Log) -> list[Hint]:
     """Return the likely mistakes in a log by its readings; there are none where evidence is weak."""
+    check_type("log", log, Log)
     if len(log.odometry.t) < LEAST_TWISTS:
         return []
     scale = scale_of(log)

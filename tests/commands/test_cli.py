@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from dataclasses import fields, replace
@@ -295,10 +297,11 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     ("arguments", "says"),
     [
         ([], f"expected a command ({', '.join(COMMANDS)})"),
-        (["fly"], "'fly'"),
-        (["online"], "Missing"),
+        (["onlin"], "found 'onlin', the nearest is 'online'"),
+        (["online"], "graph: Missing"),
         (["online", "LOG", "--out", "MAP", "--lag", "long"], "--lag"),
         (["online", "LOG", "--out", "MAP", "--no-such-option", "1"], "--no-such-option"),
+        (["online", "LOG", "--out", "MAP", "--estimatr", "ckf"], "ckf, the nearest is --estimator (see"),
         (["online", "LOG", "--out", "MAP", "--estimator", "magic"], "fixed-lag"),
         (["online", "LOG", "--out", "MAP"], "LOG: expected a log folder"),
         (
@@ -313,6 +316,10 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
         (["online", "LOG", "--out", "MAP", "--gauge.sigma-spacing", "inf"], "gauge.sigma_spacing: expected"),
         (["online", "LOG", "--out", "MAP", "--gate.huber", "nan"], "gate.huber: expected a positive number"),
         (["simulate", "--out", "LOG"], "--track FILE, --generate SEED or --event NAME"),
+        (
+            ["simulate", "--generate", "1", "--event", "skidpad", "--out", "LOG"],
+            "expected one of --track FILE",
+        ),
         (["simulate", "--generate", "1", "--laps", "0", "--out", "LOG"], "laps"),
         (["simulate", "--generate", "-1", "--out", "LOG"], "seed"),
         (["simulate", "--generate", "1", "--out", "LOG", "--sensor.fov", "nan"], "sensor.fov"),
@@ -363,6 +370,36 @@ def test_an_interrupt_leaves_nothing_half_written(
     assert names(tmp_path) == set()
 
 
+WORKERS = """
+import sys, time
+from joblib import Parallel, delayed
+from pathspace_graph import cli
+
+def work(*_):
+    times = (1.0, 1.0, 60.0, 60.0)  # both workers have begun after the first two
+    for _ in Parallel(n_jobs=2, return_as="generator")(delayed(time.sleep)(at) for at in times):
+        print("ready", flush=True)
+
+cli._run = work
+sys.exit(cli.main())
+"""
+
+
+def test_an_interrupt_of_workers_is_one_line() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", WORKERS],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        assert [process.stdout.readline() for _ in range(2)] == ["ready\n"] * 2
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.communicate(timeout=60.0)[1] == "pathspace-graph: interrupted\n"
+    assert process.returncode == 130
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
@@ -388,6 +425,8 @@ def test_help_shows_each_text_as_one_paragraph(capsys: pytest.CaptureFixture[str
 def test_a_box_becomes_its_first_part_on_one_line() -> None:
     box = "╭─ Value error ──╮\n│ \x1b[1mError\x1b[0m parsing │\n│ --lag │\n│ ────── │\n│ help │\n╰──╯\n"
     assert one_line(box) == "Error parsing --lag"
+    ascii_box = " Value error \n ------ \n  Error parsing  \n  --lag  \n  ------\n  help  \n\n"
+    assert one_line(ascii_box) == "Error parsing --lag"
 
 
 def test_it_runs_as_a_program_and_lists_its_commands() -> None:

@@ -22,7 +22,7 @@ def evo_ape(reference: Path, estimate: Path, home: Path) -> str:
     """Prints of `evo_ape tum` as a user calls it, with its settings in a home of its own."""
     home.mkdir()
     command = [str(Path(sys.executable).parent / "evo_ape"), "tum", str(reference), str(estimate)]
-    environment = os.environ | {"HOME": str(home), "MPLBACKEND": "Agg"}
+    environment = os.environ | {"HOME": str(home)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -535,6 +535,10 @@ def test_a_wrong_topic_lists_all_with_types_counts_and_rates(
         ([*TOPICS, "--definition", "cone.txt"], "cone.txt"),
         ([*TOPICS, "--sigma-range", "0"], "sigma_range: expected a positive number"),
         ([*TOPICS, "--sigma-odometry", "1", "0", "1"], "--sigma-odometry: expected three positive numbers"),
+        (
+            [*TOPICS, "--start", "9"],
+            "found none; 11 odometry samples outside --start and --end were left out",
+        ),
     ],
 )
 def test_bad_options_are_refused_in_one_line(

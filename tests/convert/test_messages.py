@@ -166,6 +166,14 @@ def test_what_has_no_cones_is_refused(message: Any, said: str) -> None:
 def test_a_message_without_a_twist_is_refused(messages: Messages) -> None:
     with pytest.raises(MessageError, match="with a twist"):
         twist_of(messages.vector())
+    with pytest.raises(MessageError, match=r"found \['data'\]"):
+        twist_of(SimpleNamespace(data=[3.0, 0.1, 0.5]))
+
+
+def test_speeds_and_a_yaw_rate_of_their_own_are_a_twist() -> None:
+    np.testing.assert_array_equal(twist_of(SimpleNamespace(vx=3, vy=0.1, yaw_rate=0.5)), [3.0, 0.1, 0.5])
+    np.testing.assert_array_equal(twist_of(SimpleNamespace(speed=3.0, wz=0.5)), [3.0, 0.0, 0.5])
+    np.testing.assert_array_equal(twist_of(SimpleNamespace(vx=3.0)), [3.0, 0.0, np.nan])
 
 
 def test_arrays_of_numbers_are_points() -> None:

@@ -230,6 +230,14 @@ def test_nothing_hidden_stays_where_a_command_is_terminated(tmp_path: Path) -> N
 # --- JSON ------------------------------------------------------------------------------------------------
 
 
+def test_a_folder_that_cannot_be_written_is_refused_beforehand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(OutputError, match="expected a folder that can be written"):
+        check_target(tmp_path / "new" / "map", "map.json")
+
+
 def test_arrays_scalars_tuples_and_paths_become_plain_values(tmp_path: Path) -> None:
     content = {
         "array": np.array([[1.5, 2.0]]),

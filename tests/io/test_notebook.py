@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,11 @@ from pathspace_graph import (
     Map,
     RunResult,
     SettingsError,
+    hints,
+    make_online,
     run_online,
     split_odometry,
+    write_log,
 )
 from pathspace_graph.io.brief import brief
 
@@ -86,6 +89,15 @@ def test_a_length_of_a_wrong_type_is_named() -> None:
         result.map.centre_line("far")  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match=r"distance: expected a number \(m\), found None"):
         FixedLagMapper(None, log.odometry_sigma).ahead(None)  # type: ignore[arg-type]
+
+
+def test_what_is_no_log_is_named(tmp_path: Path) -> None:
+    for ask in (hints, partial(make_online, "ckf", None), lambda log: write_log(log, tmp_path / "log")):
+        with pytest.raises(SettingsError, match=r"log: expected a Log, found str"):
+            ask("drive")  # type: ignore[operator]
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(SettingsError, match=r"estimator: expected an OnlineEstimator, found str"):
+        run_online(drive()[0], "ckf")  # type: ignore[arg-type]
 
 
 def test_records_are_drawn() -> None:

@@ -30,6 +30,6 @@ def test_a_bias_is_estimated_as_bayes_says(sign: float) -> None:
     share = variance / MapperSettings().odometry.sigma_bias ** 2
     expected = sign * BIAS * (1.0 - share)
     assert share < 0.9
-    assert mapper.calibration[1] == pytest.approx(expected, rel=0.2)
+    assert mapper.vehicle_state().calibration[1] == pytest.approx(expected, rel=0.2)
     first = mapper.control_points(0)[1]
     np.testing.assert_allclose(first[1], 2.0, atol=0.3)
