@@ -291,9 +291,7 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
     cycle before, and the second result (m, 2) as they are now.
     """
     first = int(np.searchsorted(boundary.cone_parameters, boundary.confirmed_end - RECALL))
-    beside = np.full(
-        (len(boundary.observed), 2), np.nan
-    )  # nothing is known of others
+    beside = np.full((len(boundary.observed), 2), np.nan)  # nothing is known of others
     beside[: len(known)] = known[: len(beside)]
     newest = np.array(boundary.observed[first:]).reshape(-1, 2)
     now = np.column_stack(path_ahead.since(path_ahead.driven - RECALL).locate(newest))
