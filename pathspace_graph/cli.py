@@ -4,7 +4,6 @@ import os
 import signal
 import sys
 import threading
-import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
@@ -22,9 +21,6 @@ BROKEN_PIPE: Final = 141
 TERMINATED: Final = 143
 LEVELS: Final = {"-q": "QUIET", "--quiet": "QUIET", "-v": "VERBOSE", "--verbose": "VERBOSE"}
 """Options that every command takes, each with its level of `console.Verbosity`."""
-ENVIRONMENT: Final = {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore:resource_tracker"}
-"""Variables of a command and its workers, unless the user has set them: threads stall small systems, and
-joblib's tracker complains where a run is interrupted."""
 COMMANDS: Final = {
     "demo": ("demo", "Demo", "maps a generated track online, and shows a table, a map and its picture"),
     "simulate": ("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
@@ -53,8 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if threading.current_thread() is threading.main_thread():
         # temporary files are removed on the way
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
-    for name, value in ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads stall systems as small as these
     given = list(sys.argv[1:] if arguments is None else arguments)
     level = next((LEVELS[word] for word in reversed(given) if word in LEVELS), "NORMAL")
     try:
@@ -67,7 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _refuse(f"{error.filename or 'output'}: {error.strerror or error}", level)
     except KeyboardInterrupt:
-        warnings.simplefilter("ignore")  # joblib's, of tasks that are not waited for
         print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return INTERRUPTED
     return DONE

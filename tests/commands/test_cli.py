@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
 from dataclasses import fields, replace
@@ -370,36 +368,6 @@ def test_an_interrupt_leaves_nothing_half_written(
     assert names(tmp_path) == set()
 
 
-WORKERS = """
-import sys, time
-from joblib import Parallel, delayed
-from pathspace_graph import cli
-
-def work(*_):
-    times = (1.0, 1.0, 60.0, 60.0)  # both workers have begun after the first two
-    for _ in Parallel(n_jobs=2, return_as="generator")(delayed(time.sleep)(at) for at in times):
-        print("ready", flush=True)
-
-cli._run = work
-sys.exit(cli.main())
-"""
-
-
-def test_an_interrupt_of_workers_is_one_line() -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", WORKERS],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    ) as process:
-        assert process.stdout is not None
-        assert [process.stdout.readline() for _ in range(2)] == ["ready\n"] * 2
-        os.killpg(process.pid, signal.SIGINT)
-        assert process.communicate(timeout=60.0)[1] == "pathspace-graph: interrupted\n"
-    assert process.returncode == 130
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
@@ -425,8 +393,6 @@ def test_help_shows_each_text_as_one_paragraph(capsys: pytest.CaptureFixture[str
 def test_a_box_becomes_its_first_part_on_one_line() -> None:
     box = "╭─ Value error ──╮\n│ \x1b[1mError\x1b[0m parsing │\n│ --lag │\n│ ────── │\n│ help │\n╰──╯\n"
     assert one_line(box) == "Error parsing --lag"
-    ascii_box = " Value error \n ------ \n  Error parsing  \n  --lag  \n  ------\n  help  \n\n"
-    assert one_line(ascii_box) == "Error parsing --lag"
 
 
 def test_it_runs_as_a_program_and_lists_its_commands() -> None:
