@@ -281,6 +281,11 @@ class MapperEstimate:
         """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.poses.copy()
 
+    @property
+    def calibration(self) -> Array:
+        """Return a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
+        return self.smoother.variables.calibration
+
 
 # --- the window as nonlinear factors ---------------------------------------------------------------------
 

@@ -23,7 +23,6 @@ from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.paths import TRACKS
 from ..scenes.pretenders import contents
 
 SHORT_TRACK = [
@@ -108,15 +107,6 @@ def test_settings_of_the_simulator_are_options(tmp_path: Path) -> None:
     assert log.sensor.range_max == 9.0
     assert log.odometry_sigma.tolist() == [0.1, 0.2, 0.3]
     assert max(np.linalg.norm(cycle.points_vehicle, axis=1).max() for cycle in log.cycles) < 10.5
-
-
-def test_a_track_file_wins_over_a_generated_one(tmp_path: Path) -> None:
-    track = TRACKS / "fssim" / "FSG.yaml"
-    if not track.exists():
-        pytest.skip(f"the real tracks are not at {track.parents[1]}")
-    options = ["--track", str(track), "--generate", "1", "--laps", "1", "--out", str(tmp_path / "log")]
-    assert main(["simulate", *options]) == 0
-    assert read_log(tmp_path / "log").source["track"] == "FSG"
 
 
 # --- online ----------------------------------------------------------------------------------------------

@@ -222,7 +222,7 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}]
     monkeypatch.setattr(f"{study}.cells.Drive.load", lambda _: recorded.log)
     monkeypatch.setattr(f"{study}.cells.lap_rows", lambda *_, **__: rows)
-    monkeypatch.setattr(f"{study}.output.figures", lambda *_: {"rmse": Figure()})
+    monkeypatch.setattr(f"{study}.output.plot_differences", lambda *_: Figure())
     monkeypatch.setattr(f"{study}.output.plot_faults", lambda *_: Figure())
     track = write_round_track(tmp_path)
     (tmp_path / "small.toml").write_text(STUDY.format(track=track))
