@@ -42,6 +42,7 @@ ESSENTIAL: Final = (
 COLUMN: Final = 38
 """Column of the short help in which the texts begin."""
 MOST_COLUMNS: Final = 120
+REQUIRED: Final = " (required)"
 
 _ANSI: Final = re.compile(r"\x1b\[[0-9;]*m")
 _FRAME: Final = " │\t"
@@ -74,9 +75,14 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
             if _estimates(command):
                 sys.stdout.write(f"\n{SETTINGS} FILE\n    {SETTINGS_TEXT}\n")
             return None
-    near = _SIMILAR.findall(_ANSI.sub("", complaint.getvalue()))
+    near, wrong = _SIMILAR.findall(_ANSI.sub("", complaint.getvalue())), one_line(complaint.getvalue())
+    if wrong.startswith("Missing"):
+        required = [option for option in _options(command) if option.default is NO_DEFAULT]
+        missing = [one for one in required if (one.text if one.is_place else f"{one.flag} ") in wrong]
+        names = " and ".join(one.shown.removesuffix(REQUIRED) for one in missing)
+        wrong = f"{program.rsplit(maxsplit=1)[-1]}: expected {names}, found none"
     nearest = f", the nearest is {', '.join(near)}" if near else ""
-    raise SettingsError(f"{one_line(complaint.getvalue())}{nearest} (see {program} --help)")
+    raise SettingsError(f"{wrong}{nearest} (see {program} --help)")
 
 
 def _estimates(command: type[Any]) -> bool:
@@ -173,7 +179,7 @@ class Option(NamedTuple):
         if value not in (None, NO_DEFAULT, ()):
             return f"{self.flag} {value}"
         takes = "PATH" if Path in inner else "TEXT" if str in inner else "NUMBER"
-        return f"{self.flag} {takes}{' (required)' if value is NO_DEFAULT else ''}"
+        return f"{self.flag} {takes}{REQUIRED if value is NO_DEFAULT else ''}"
 
 
 def _options(

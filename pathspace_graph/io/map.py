@@ -349,7 +349,7 @@ def _is_covariance(P: Array) -> bool:
 
 
 def read_map(folder: Path | str) -> Map:
-    """Return the map of a folder that follows FORMATS, as those of `write_result` do."""
-    file = Path(folder) / MAP_FILE
-    with verified(Path(folder), MAP_FILE):
+    """Return the map of a folder that follows FORMATS, as those of `write_result` do, or of its map file."""
+    file = Path(folder) if Path(folder).is_file() else Path(folder) / MAP_FILE
+    with verified(file.parent, file.name):
         return map_from_json(read_json(file, "a map"), file)

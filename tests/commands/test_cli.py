@@ -286,7 +286,11 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     [
         ([], f"expected a command ({', '.join(COMMANDS)})"),
         (["onlin"], "found 'onlin', the nearest is 'online'"),
-        (["online"], "graph: Missing"),
+        (
+            ["online"],
+            "graph: online: expected LOG and --out PATH, found none (see pathspace-graph online --help)",
+        ),
+        (["export", "MAP", "--out", "F"], "export: expected --as centerline|tum|"),
         (["online", "LOG", "--out", "MAP", "--lag", "long"], "--lag"),
         (["online", "LOG", "--out", "MAP", "--no-such-option", "1"], "--no-such-option"),
         (["online", "LOG", "--out", "MAP", "--estimatr", "ckf"], "ckf, the nearest is --estimator (see"),

@@ -96,10 +96,11 @@ def test_a_periodic_boundary_repeats_its_first_control_points_and_counts_them_on
     assert np.shape(content["covariance"]) == (18, 18)
 
 
-def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
+@pytest.mark.parametrize("named", ["", MAP_FILE])
+def test_what_is_written_is_read_back_exactly(tmp_path: Path, named: str) -> None:
     original = spline_map()
     write_json(tmp_path / MAP_FILE, map_to_json(original))
-    track = read_map(tmp_path)
+    track = read_map(tmp_path / named)
     assert track.closed and track.size == 16 and sorted(track.boundaries) == [LEFT, RIGHT]
     for label, boundary in original.boundaries.items():
         read = track.boundaries[label]
