@@ -76,7 +76,7 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
                 sys.stdout.write(f"\n{SETTINGS} FILE\n    {SETTINGS_TEXT}\n")
             return None
     near, wrong = _SIMILAR.findall(_ANSI.sub("", complaint.getvalue())), one_line(complaint.getvalue())
-    if wrong.startswith("Missing"):
+    if wrong.startswith("Missing from"):
         required = [option for option in _options(command) if option.default is NO_DEFAULT]
         missing = [one for one in required if (one.text if one.is_place else f"{one.flag} ") in wrong]
         names = " and ".join(one.shown.removesuffix(REQUIRED) for one in missing)

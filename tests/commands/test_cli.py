@@ -291,6 +291,7 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
             "graph: online: expected LOG and --out PATH, found none (see pathspace-graph online --help)",
         ),
         (["export", "MAP", "--out", "F"], "export: expected --as centerline|tum|"),
+        (["online", "LOG", "--out", "--lag", "2"], "--out"),
         (["online", "LOG", "--out", "MAP", "--lag", "long"], "--lag"),
         (["online", "LOG", "--out", "MAP", "--no-such-option", "1"], "--no-such-option"),
         (["online", "LOG", "--out", "MAP", "--estimatr", "ckf"], "ckf, the nearest is --estimator (see"),
