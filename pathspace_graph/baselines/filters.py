@@ -227,7 +227,7 @@ def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
         boundary = state.boundary(label)
         points, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
         foot = boundary.find(state.control_points(label), points, zero, zero + boundary.confirmed_end)
-        boundary.cone_parameters = np.sort(foot.u).tolist()
+        boundary.cone_parameters = np.sort(foot.u)
         periodic = make_periodic(
             boundary, state.control_points(label), state.settings, state.settings.ckf.knots
         )

@@ -84,7 +84,7 @@ class Rows:
     @cached_property
     def widths(self) -> tuple[int, ...]:
         """Return the widths (k,) of each row's variables."""
-        return tuple([_width(letter) for letter in (self.keys[0] >> INDEX_BITS).tolist()])
+        return _widths(tuple((self.keys[0] >> INDEX_BITS).tolist()))
 
     def places(self, layout: Layout) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
         """Return what tells the column of each derivative: the arguments of `_columns_of`."""
@@ -96,9 +96,9 @@ class Rows:
 
 
 @cache
-def _width(letter: int) -> int:
-    """Return the width of the variables whose keys begin with a letter."""
-    return int(sizes(np.array([letter << INDEX_BITS]))[0])
+def _widths(letters: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the widths (k,) of variables whose keys begin with these letters (k,)."""
+    return tuple(sizes(np.array(letters) << INDEX_BITS).tolist())
 
 
 @compiled

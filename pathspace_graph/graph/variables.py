@@ -71,7 +71,6 @@ _FIRST_CONTROL: Final = tuple(letter_keys(letter)[0] for letter in CONTROL_LETTE
 
 _LETTERS: Final = (CALIBRATION_LETTER, SENSOR_LETTER, *CONTROL_LETTERS, LANDMARK_LETTER, POSE_LETTER)
 _LETTER_ENDS: Final = np.array([letter_keys(letter) for letter in _LETTERS], np.intp).ravel()
-_LETTER_PLACES: Final = {letter: 2 * k for k, letter in enumerate(_LETTERS)}
 
 
 def pose_key(cycle: int) -> int:
@@ -149,7 +148,6 @@ class Layout:
         self.keys = keys
         self.widths, self.starts, self.size = _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES)
         """Each key has this number of columns (K,), and begins at this one (K,)."""
-        self._begins: list[int] | None = None
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
@@ -195,11 +193,12 @@ class Layout:
 
     def block(self, letter: str) -> slice:
         """Return the columns of all keys of a letter."""
-        k = _LETTER_PLACES[letter]
-        if self._begins is None:
-            places = np.concatenate([self.starts, [self.size]])
-            self._begins = places[self.keys.searchsorted(_LETTER_ENDS)].tolist()
-        return slice(self._begins[k], self._begins[k + 1])
+        return self._blocks[letter]
+
+    @cached_property
+    def _blocks(self) -> dict[str, slice]:
+        begins = np.append(self.starts, self.size)[self.keys.searchsorted(_LETTER_ENDS)].tolist()
+        return dict(zip(_LETTERS, map(slice, begins[::2], begins[1::2]), strict=True))
 
     def begin(self, key: int) -> int:
         """Return the first column of a key, or where it would be if the layout held the key."""

@@ -298,6 +298,8 @@ def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables
     A factor may hold any variable, poses of the window, and that of the next cycle, which is linearized where
     the newest one is. It must give finite numbers.
     """
+    if not factors:
+        return
     first, following = pose_key(variables.first_cycle), pose_key(next_cycle)
     keys_known = np.append(variables.keys[~are_poses(variables.keys)], np.arange(first, following + 1))
     expected = (

@@ -96,7 +96,7 @@ def newest_stretch(state: State) -> dict[int, tuple[Array, Array]]:
     """Return the confirmed cones (k, 2) on the last `STRETCH` metres of each curve, and the normals there."""
     found = {}
     for label, boundary in state.boundaries.items():
-        u, points = np.array(boundary.cone_parameters), state.control_points(label)
+        u, points = boundary.cone_parameters, state.control_points(label)
         chosen = u[(u > boundary.confirmed_end - STRETCH) & (u <= boundary.confirmed_end)]
         tangents = boundary.evaluate(points, chosen, 1)
         tangents /= np.hypot(tangents[:, :1], tangents[:, 1:])

@@ -1,7 +1,7 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -19,15 +19,12 @@ from pathspace_graph.factors.residuals import ProjectionRows, detection_rows, pa
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import SensorRows, corrected
 from pathspace_graph.graph.rows import Parts, Rows, among, stacked_rows
-from pathspace_graph.graph.variables import CONTROL_LETTERS, FIRST_POSE, SENSOR_KEY, control_keys, pose_keys
+from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys, pose_keys
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Gauge
 
 from .detections import DetectionTable
-from .state import State
-
-POINTS_PER_FACTOR: Final = 6
-"""Consecutive control points whose weak priors are one factor: there are few factors, and each is small."""
+from .state import State, factor_numbers
 
 
 class CurveMap:
@@ -150,17 +147,11 @@ class CurveMap:
         """
         if not self.state.boundaries or self.held_by_prior:
             return []
-        spacing = []
-        for label, gauge in self._gauges(whole):
-            points, sigma = (
-                self.state.control_points(label),
-                self.settings.gauge.sigma_spacing * gauge.nominal,
-            )
-            first, second = points[gauge.pairs[:, 0]], points[gauge.pairs[:, 1]]
-            off, direction = pair_residuals(first, second, gauge.nominal)
-            jacobian = np.concatenate([-direction, direction], axis=1) / sigma[:, None]
-            spacing.append(self._rows(label, gauge.pairs, jacobian, off / sigma))
-        return [stacked_rows(spacing)]
+        pairs, nominal, keys, owner = (self.state.whole_curves if whole else self.state.curves).pairs
+        points, sigma = self.state.map_points, self.settings.gauge.sigma_spacing * nominal
+        off, direction = pair_residuals(points[pairs[:, 0]], points[pairs[:, 1]], nominal)
+        jacobian = np.concatenate([-direction, direction], axis=1) / sigma[:, None]
+        return [Rows(keys, jacobian, off / sigma, owner)]
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
         """Return the linear priors: smoothness `D c / (sigma_smoothness spacing)`, and anchors.
@@ -186,10 +177,8 @@ class CurveMap:
     def _rows(self, label: int, points: IntArray, jacobian: Array, residual: Array) -> Rows:
         """Return rows, equally many for each row of `points` (m, k); neighbouring points share an owner."""
         repeated = np.repeat(points, len(residual) // max(len(points), 1), axis=0)
-        owner = len(CONTROL_LETTERS) * (repeated[:, 0] // POINTS_PER_FACTOR) + label
-        return Rows(
-            control_keys(label, self.state.boundaries[label].first + repeated), jacobian, residual, owner
-        )
+        keys = control_keys(label, self.state.boundaries[label].first + repeated)
+        return Rows(keys, jacobian, residual, factor_numbers(repeated[:, 0], label))
 
 
 @compiled

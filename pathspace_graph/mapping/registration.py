@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import hypot, sqrt
 from typing import Final, Self
 
 import numpy as np
@@ -280,7 +281,8 @@ def by_motion(normals: Array, arms: Array) -> Array:
 
 def worst_sigma(covariance: Array) -> float:
     """Return the standard deviation (m) of a position in its worst direction, by covariance (3, 3)."""
-    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+    (a, b), (_, d) = covariance[:2, :2].tolist()
+    return sqrt(0.5 * (a + d) + hypot(0.5 * (a - d), b))
 
 
 def sigma_of_information(information: Array) -> float:

@@ -76,7 +76,7 @@ def _breaks(
 
     The place of a cone is its parameter on the present curve.
     """
-    u = np.array(boundary.cone_parameters)
+    u = boundary.cone_parameters
     u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
     if knots == "curvature" or size >= len(u):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, Self
 
 import numpy as np
@@ -13,6 +14,8 @@ from pathspace_graph.graph.variables import CONTROL_LETTERS, Variables, control_
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
+POINTS_PER_FACTOR: Final = 6
+"""Consecutive control points whose weak priors are one factor: there are few factors, and each is small."""
 SAMPLE: Final = 0.25
 """Step at which curves are sampled where they are compared with each other and with cones (m)."""
 
@@ -57,6 +60,33 @@ class Curves:
             active_from=np.array(begins),
             keys=np.concatenate([control_keys(label, b.numbers) for label, b in boundaries.items()]),
         )
+
+    def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
+        """Return whether boundaries, whose active control points are all unless given, are these curves."""
+        if len(boundaries) != len(self.boundaries):
+            return False
+        laid_out = zip(self.tables, self.active, strict=True)
+        for (label, boundary), (tables, indices) in zip(boundaries.items(), laid_out, strict=True):
+            if boundary.tables is not tables or active.get(label, boundary.everything) is not indices:
+                return False
+        return True
+
+    @cached_property
+    def pairs(self) -> tuple[IntArray, Array, IntArray, IntArray]:
+        """Return the pairs of neighbouring active control points.
+
+        The result has the rows (r, 2) of both in `State.map_points`, their nominal distances (r,) in m, their
+        keys (r, 2), and the numbers (r,) of the factors that hold the spacing.
+        """
+        before, rows, owners, nominal = 0, [], [], []
+        for label, boundary, active in zip(self.labels.tolist(), self.boundaries, self.active, strict=True):
+            gauge = boundary.gauge_on(active)
+            rows.append(before + gauge.pairs)
+            owners.append(factor_numbers(gauge.pairs[:, 0], label))
+            nominal.append(gauge.nominal)
+            before += boundary.size
+        pairs = np.concatenate(rows)
+        return pairs, np.concatenate(nominal), self.keys[pairs], np.concatenate(owners)
 
     @property
     def trusted(self) -> Array:
@@ -144,11 +174,9 @@ class State:
     @property
     def curves(self) -> Curves:
         """Return the boundaries, at least one, side by side; the result is cached."""
-        known, active = self._curves, {label: self.active(label) for label in self.boundaries}
-        tables = [boundary.tables for boundary in self.boundaries.values()]
-        if known is None or [*map(id, (*known.tables, *known.active))] != [
-            *map(id, (*tables, *active.values()))
-        ]:
+        known = self._curves
+        if known is None or not known.is_of(self.boundaries, self.active_stretch):
+            active = {label: self.active(label) for label in self.boundaries}
             known = self._curves = Curves.of(self.boundaries, active)
         return known
 
@@ -218,3 +246,8 @@ class State:
     def drop_oldest_pose_u(self) -> None:
         """Remove the parameters of the oldest pose, which has left the window."""
         self.pose_u = {label: u[1:] for label, u in self.pose_u.items()}
+
+
+def factor_numbers(points: IntArray, label: int) -> IntArray:
+    """Return the number of the factor that has the weak priors of control points (k,), by index."""
+    return np.asarray(len(CONTROL_LETTERS) * (points // POINTS_PER_FACTOR) + label)

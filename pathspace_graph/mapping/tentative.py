@@ -67,7 +67,8 @@ class TentativeTracks:
 
     def sigmas(self, indices: IntArray) -> Array:
         """Return the standard deviation (k,) of tracks in their worst direction (m)."""
-        return np.asarray(np.linalg.eigvalsh(self.information[indices])[:, 0] ** -0.5)
+        a, b, d = self.information[indices].reshape(-1, 4)[:, [0, 1, 3]].T
+        return np.asarray((0.5 * (a + d) - np.hypot(0.5 * (a - d), b)) ** -0.5)
 
     def remove(self, indices: IntArray) -> None:
         """Remove tracks by index."""

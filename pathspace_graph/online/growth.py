@@ -147,7 +147,7 @@ class Growth:
     def _take_back(self, label: int, kept: int) -> None:
         """Shorten a curve to its first `kept` cones; the other cones are tentative tracks again."""
         boundary, detections = self._state.boundaries[label], self._map.detections
-        self.tentative[label].restore(np.array(boundary.observed[kept:]), self._smoother.times[-1])
+        self.tentative[label].restore(boundary.observed[kept:], self._smoother.times[-1])
         boundary.take_back(kept)
         self._smoother.remove_information(self._state.keys(label)[boundary.settled(boundary.size) :])
         rows = detections.used_on(label)
@@ -188,15 +188,17 @@ class Growth:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
         path = path_ahead if end is None else _newest(path_ahead, end)
         stations, lateral = path.locate(points)
-        found = Candidates(points, indices, stations, SIDES[label] * lateral)
-        found = found.where((stations <= path_ahead.stations[-1]) & (found.sides > 0.0))
+        sides = SIDES[label] * lateral
+        possible = (stations <= path_ahead.stations[-1]) & (sides > 0.0)
         if end is None:
-            found = found.where(found.sides < settings.max_lateral)
+            possible &= sides < settings.max_lateral
         else:
-            beyond = np.hypot(*(found.points - end.position).T) > settings.threshold
-            found = found.where(beyond & (found.stations > end.station + STATION_MARGIN))
-        if len(found.points):
-            found = found.where(undisputed(self._map, label, found.points, settings.merge_radius))
+            beyond = np.hypot(*(points - end.position).T) > settings.threshold
+            possible &= beyond & (stations > end.station + STATION_MARGIN)
+        found = Candidates(points, indices, stations, sides).where(possible)
+        if len(found.points) == 0:
+            return found
+        found = found.where(undisputed(self._map, label, found.points, settings.merge_radius))
         found = found.where(np.argsort(found.stations))
         found = found.where(chain(found, end))
         found = found.where(self._certain(label, path_ahead, found))
@@ -223,8 +225,8 @@ class Growth:
         lines = [path.points[path.stations <= path.driven]]
         for other, boundary in self._state.boundaries.items():
             begin = boundary.confirmed_end - RECALL
-            first = int(np.searchsorted(boundary.cone_parameters, begin))
-            lines.append(np.array(boundary.observed[first : -1 if other == label else None]))
+            first = int(boundary.cone_parameters.searchsorted(begin))
+            lines.append(boundary.observed[first : -1 if other == label else None])
         before = end.position
         for k, point in enumerate(found.points):
             if any(len(line) > 1 and crosses(before, point[None], line)[0] for line in lines):
@@ -244,7 +246,7 @@ class Growth:
         station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position)
         side = SIDES[label] * float(lateral[0])
         if len(boundary.observed) >= NEWEST:
-            _, beside = path_ahead.locate(np.array(boundary.observed[-NEWEST:]))
+            _, beside = path_ahead.locate(boundary.observed[-NEWEST:])
             side = median([*(SIDES[label] * beside).tolist(), side])
         return End(position[0], float(station[0]), side)
 
@@ -290,11 +292,11 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
     `known` (n, 2) are the station and the distance of the first n cones beside the path, as they were in the
     cycle before, and the second result (m, 2) as they are now.
     """
-    first = int(np.searchsorted(boundary.cone_parameters, boundary.confirmed_end - RECALL))
+    first = int(boundary.cone_parameters.searchsorted(boundary.confirmed_end - RECALL))
     beside = np.full((len(boundary.observed), 2), np.nan)  # nothing is known of others
     beside[: len(known)] = known[: len(beside)]
-    newest = np.array(boundary.observed[first:]).reshape(-1, 2)
-    now = np.column_stack(path_ahead.since(path_ahead.driven - RECALL).locate(newest))
+    newest = path_ahead.since(path_ahead.driven - RECALL).locate(boundary.observed[first:])
+    now = np.stack(newest, axis=1)
     before, passed = beside[first:], beside[first:, 0] <= path_ahead.driven
     stays = passed & (np.abs(now[:, 1]) > np.abs(before[:, 1]) - NEARER)
     now[stays] = before[stays]

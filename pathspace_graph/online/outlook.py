@@ -295,7 +295,7 @@ def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> I
     believed = (tracks.counts >= settings.sightings) | (tracks.last_t > t - MEMORY)
     indices = np.flatnonzero(near & believed)
     if label in state.boundaries:
-        mapped = np.array(state.boundaries[label].observed).reshape(-1, POINT)
+        mapped = state.boundaries[label].observed
         offset = tracks.points[indices, None] - mapped
         distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
         indices = indices[(distance > settings.threshold).all(axis=1)]

@@ -68,8 +68,8 @@ class Boundary:
         self.degree = settings.degree
         self.periodic = periodic
         self.confirmed_end = 0.0  # parameter up to which cones support the curve, not extrapolated (m)
-        self.observed: list[Array] = []  # (2,) cones that the curve was extended through, map frame (m)
-        self.cone_parameters: list[float] = []  # parameter of each of the `observed` cones on the curve (m)
+        self.observed: Array = np.zeros((0, 2))  # cones that the curve was extended through, map frame (m)
+        self.cone_parameters: Array = np.zeros(0)  # (n,) parameter of each of them on the curve (m)
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
     def _set_tables(self, tables: SpanPolynomials) -> None:
@@ -164,7 +164,7 @@ class Boundary:
     @property
     def unseen(self) -> float:
         """Return the length (m) of the curve's end, up to where it is confirmed, without any cone."""
-        return self.confirmed_end - (self.cone_parameters[-1] if self.cone_parameters else 0.0)
+        return self.confirmed_end - float(self.cone_parameters[-1:].sum())
 
     def believed(self, high: Array) -> Array:
         """Return upper limits (m,) of stretches, clipped so that they exclude the extrapolated end."""
@@ -186,8 +186,8 @@ class Boundary:
         Knots are appended until the domain holds the last parameter, the new `confirmed_end`. Control points
         that act only beyond the last cone before are placed again: the direction at the end was a guess.
         """
-        before = int(np.searchsorted(self.cone_parameters, self.confirmed_end - ROUND_OFF))
-        from_u = self.cone_parameters[before - 1] if before else self.confirmed_end
+        before = int(self.cone_parameters.searchsorted(self.confirmed_end - ROUND_OFF))
+        from_u = float(self.cone_parameters[before - 1]) if before else self.confirmed_end
         return self.extend(len(control_points), targets_u, from_u).place(control_points, targets)
 
     def extend(self, old: int, targets_u: Array, from_u: float | None = None) -> Placement:
@@ -211,17 +211,16 @@ class Boundary:
         return max(int(np.searchsorted(self.knots[:size], u - ROUND_OFF)) - 1, 0)
 
     def move(self, motion: Array) -> None:
-        if self.observed:
-            self.observed = [*move_points(motion, np.array(self.observed))]
+        self.observed = move_points(motion, self.observed)
 
     def add_cones(self, points: Array, u: Array) -> None:
-        self.observed.extend(points)
-        self.cone_parameters.extend(u.tolist())
+        self.observed = np.concatenate([self.observed, points])
+        self.cone_parameters = np.append(self.cone_parameters, u)
 
     def take_back(self, kept: int) -> None:
         """Remove all observed cones but the first `kept`; the curve is confirmed up to the last of these."""
-        self.confirmed_end = self.cone_parameters[kept - 1]
-        del self.observed[kept:], self.cone_parameters[kept:]
+        self.confirmed_end = float(self.cone_parameters[kept - 1])
+        self.observed, self.cone_parameters = self.observed[:kept], self.cone_parameters[:kept]
 
     def _placement(self, old: int, targets_u: Array, from_u: float) -> Placement:
         """Fit the control points that act beyond `from_u` to targets at parameters (k,) and to the curve."""

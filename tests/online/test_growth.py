@@ -255,8 +255,7 @@ def test_a_curve_that_is_taken_back_goes_through_its_cones_in_the_right_order(al
     track(alone, (12.0, 2.0))
     assert grow(alone, along_x(6.0)) == [(0.0, 2.0), (4.0, 2.0), (12.0, 2.0)]
     boundary = alone.boundaries[LEFT]
-    boundary.observed.append(np.array([8.0, 2.0]))
-    boundary.cone_parameters.append(boundary.confirmed_end + 4.0)
+    boundary.add_cones(np.array([[8.0, 2.0]]), np.array([boundary.confirmed_end + 4.0]))
     boundary.confirmed_end += 4.0
     assert grow(alone, along_x(13.0)) == [(0.0, 2.0), (4.0, 2.0), (8.0, 2.0), (12.0, 2.0)]
     assert boundary.confirmed_end == pytest.approx(12.0, abs=0.05)
@@ -444,7 +443,7 @@ def test_a_cone_across_the_other_boundary_is_not_reached(between: FixedLagMapper
 
 def test_a_cone_across_the_curve_itself_is_not_reached(between: FixedLagMapper) -> None:
     boundary = between.boundaries[LEFT]
-    boundary.observed[:] = [np.array(p) for p in ((0.0, 2.0), (4.0, 5.0), (7.0, 2.0), (4.0, 2.0))]
+    boundary.observed = np.array([(0.0, 2.0), (4.0, 5.0), (7.0, 2.0), (4.0, 2.0)])
     assert uncrossed(between, along_x(-6.0), (6.0, 6.0)) == []
     assert uncrossed(between, along_x(-6.0), (3.0, 1.0)) == [0]
 
@@ -453,9 +452,9 @@ def test_a_curve_that_runs_along_its_own_beginning_again_goes_on(between: FixedL
     """On the second lap the loop is still open, and the same cones are seen a few centimetres beside."""
     boundary = between.boundaries[LEFT]
     lap = [(0.0, 2.05), (4.0, 1.95), (8.0, 2.05), (12.0, 2.0), (20.0, 20.0), (-20.0, 20.0), (0.0, 1.95)]
-    boundary.observed[:] = [np.array(p) for p in (*lap, (4.0, 2.0))]
-    lengths = np.hypot(*np.diff(np.array(boundary.observed), axis=0).T)
-    boundary.cone_parameters[:] = np.append(0.0, np.cumsum(lengths)).tolist()
+    boundary.observed = np.array([*lap, (4.0, 2.0)])
+    lengths = np.hypot(*np.diff(boundary.observed, axis=0).T)
+    boundary.cone_parameters = np.append(0.0, np.cumsum(lengths))
     boundary.confirmed_end = boundary.cone_parameters[-1]
     assert uncrossed(between, along_x(-6.0), (8.0, 1.98), (12.0, 2.03)) == [0, 1]
 
@@ -487,5 +486,5 @@ def test_an_end_that_was_carried_on_around_a_bend_has_the_side_that_it_has(alone
     path = PathAhead(points, stations, float(stations[-1]))
     boundary, control_points = boundary_through(inner)
     alone.smoother.map.state.add_boundary(LEFT, boundary, control_points)
-    boundary.observed[:] = [np.array([x, 2.0]) for x in (0.0, 4.0, 8.0, 12.0)]
+    boundary.observed = np.array([[x, 2.0] for x in (0.0, 4.0, 8.0, 12.0)])
     assert alone.growth.end(LEFT, path, END_BEHIND).side == pytest.approx(2.0, abs=0.1)

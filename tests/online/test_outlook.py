@@ -94,7 +94,7 @@ def test_a_cone_that_the_curve_has_already_is_not_led_through_again(log: Log) ->
     """The cone at (48, 2) is one of an earlier stretch, as in a hairpin whose rows are close."""
     mapper, _ = map_log(log)
     assert outlook(mapper).tracks[-1, 0] == pytest.approx(48.0, abs=0.1)
-    mapper.boundaries[LEFT].observed.append(np.array([48.1, 2.1]))
+    mapper.boundaries[LEFT].add_cones(np.array([[48.1, 2.1]]), np.array([48.1]))
     assert outlook(mapper).tracks[:, 0].max(initial=0.0) < 45.0
 
 

@@ -72,7 +72,7 @@ def test_growing_is_linear_in_the_known_points_and_in_the_targets() -> None:
 def test_a_curve_that_grows_is_placed_anew_from_its_last_cone_but_one() -> None:
     """A straight row turns off behind a gap: the last stretch bends, the one before and the cones stay."""
     boundary, known = line(20.0)
-    boundary.cone_parameters = [0.0, 4.0, 8.0, 12.0, 20.0]
+    boundary.cone_parameters = np.array([0.0, 4.0, 8.0, 12.0, 20.0])
     before, last = boundary.evaluate(known, np.array([4.0, 8.0, 11.9])), np.array([15.0, 16.0, 17.0])
     straight = boundary.evaluate(known, last)
     points = boundary.grow(known.copy(), np.array([29.0]), np.array([[28.0, 4.0]]))
@@ -113,8 +113,8 @@ def test_taking_back_leaves_the_first_cones() -> None:
     boundary, _ = line(24.0)
     boundary.take_back(4)
     assert boundary.confirmed_end == 12.0
-    assert boundary.cone_parameters == [0.0, 4.0, 8.0, 12.0]
-    np.testing.assert_array_equal(np.array(boundary.observed)[:, 0], [0.0, 4.0, 8.0, 12.0])
+    np.testing.assert_array_equal(boundary.cone_parameters, [0.0, 4.0, 8.0, 12.0])
+    np.testing.assert_array_equal(boundary.observed[:, 0], [0.0, 4.0, 8.0, 12.0])
 
 
 @pytest.mark.parametrize("confirmed", [0.5, 2.9, 3.1, 12.0, 20.0])
