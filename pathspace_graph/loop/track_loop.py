@@ -33,6 +33,7 @@ OWN_PRIOR: Final = "the map goes on from the window's own prior"  # begins the n
 LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cycle before it was
 REST: Final = 10.0  # distance for which the loop is left as it is after a failure (m)
 RECOGNITION_INTERVAL: Final = 10.0  # least distance of two attempts to recognize the place (m along the path)
+RECURRENCE_INTERVAL: Final = 5.0  # the same for attempts to find a lap in the odometry alone
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
 """Notice of the first cycle with a revisit."""
 NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
@@ -317,7 +318,7 @@ class TrackLoop:
         boundaries, length = self._smoother.map.state.boundaries, self._path.length
         if length < self._loop_tried or set(boundaries) != set(BOUNDARIES):
             return
-        self._loop_tried = length + self.settings.closing.check_interval
+        self._loop_tried = length + RECURRENCE_INTERVAL
         if self.record.unsolvable is not None:
             return
         recurrence = self.record.recurrence()
