@@ -139,13 +139,14 @@ def _misfit(
 
     The distance is infinite where the detection can't belong to the curve. `whole` searches the whole curve.
     """
-    boundary, poses = state.boundaries[label], state.variables.poses_at(detections.cycle[rows])
+    boundary, control_points = state.boundaries[label], state.control_points(label)
+    poses = state.variables.poses_at(detections.cycle[rows])
     points = to_map(detections.point[rows], poses)
     if whole:
-        foot = boundary.find_anywhere(state.control_points(label), points)
+        foot = boundary.find_anywhere(control_points, points)
     else:
         begin = _nearest_in_view(state, detections.cycle[rows], points, label, settings)
-        foot = boundary.refine(state.control_points(label), points, begin)
+        foot = boundary.refine(control_points, points, begin)
     projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
@@ -158,9 +159,8 @@ def _nearest_in_view(
     boundary, gate, step = state.boundaries[label], settings.gate, settings.batch.association.step
     ahead = np.arange(-gate.view_behind, gate.view_ahead + step, step)
     u = state.pose_u[label][:, None] + ahead
-    seen = boundary.evaluate(state.control_points(label), u.ravel()).reshape(*u.shape, 2)
-    square = (seen[cycles, :, 0] - points[:, :1]) ** 2
-    square += (seen[cycles, :, 1] - points[:, 1:]) ** 2
+    seen = boundary.evaluate(state.control_points(label), u.ravel()).reshape(*u.shape, 2)[cycles]
+    square = (seen[:, :, 0] - points[:, :1]) ** 2 + (seen[:, :, 1] - points[:, 1:]) ** 2
     return np.asarray(u[cycles, square.argmin(axis=1)])
 
 
@@ -181,9 +181,9 @@ class Cones:
 
     def merged(self, other: "Cones") -> "Cones":
         """Return the cones of both, ordered by parameter."""
-        pairs = zip((self.points, self.u, self.count), (other.points, other.u, other.count), strict=True)
-        both = Cones(*(np.concatenate(pair) for pair in pairs))
-        return both.where(np.argsort(both.u, kind="stable"))
+        u = np.append(self.u, other.u)
+        both = Cones(np.concatenate([self.points, other.points]), u, np.append(self.count, other.count))
+        return both.where(np.argsort(u, kind="stable"))
 
 
 def cones_of_curve(state: State, detections: DetectionTable, label: int, settings: MapperSettings) -> Cones:
@@ -311,7 +311,7 @@ def cluster(
     inverse = np.linalg.inv(covariances[inside])
     np.add.at(information, member, inverse)
     np.add.at(vector, member, np.einsum("mij,mj->mi", inverse, points[inside]))
-    means = np.asarray(np.linalg.solve(information[enough], vector[enough][:, :, None]), np.float64)[:, :, 0]
+    means = np.asarray(np.linalg.solve(information[enough], vector[enough][:, :, None]))[:, :, 0]
     return without_folds(Cones(means, peaks[enough], count[enough]), periodic)
 
 
@@ -319,7 +319,7 @@ def _peaks(u: Array, weight: Array, length: float, periodic: bool, apart: float)
     """Return the parameters (k,) of the smoothed density's maxima, which are `apart` (m) at least."""
     bins = max(int(np.ceil(length / DENSITY_STEP)), 1)
     step = length / bins
-    density = np.bincount(np.minimum((u / step).astype(np.intp), bins - 1).clip(0), weight, bins)
+    density = np.bincount((u / step).astype(np.intp).clip(0, bins - 1), weight, bins)
     reach = round(apart / step)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * step / (BANDWIDTH * apart)) ** 2)
     padded = np.pad(density, reach, "wrap" if periodic else "constant")

@@ -9,7 +9,6 @@ import numpy as np
 
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.graph.elimination import Damping, Elimination
 from pathspace_graph.graph.gaussian import graph_of
 from pathspace_graph.graph.rows import Rows
@@ -74,18 +73,15 @@ class Optimizer:
         on_round: Callable[[], None] | None = None,
         damping: Damping | None = None,
     ) -> None:
-        self.system = system
-        self.settings = system.settings.batch
+        self.system, self.settings = system, system.settings.batch
         self.effort = effort or Effort()
         self.steps = 0  # steps that were tried
-        self._on_round = on_round
-        self._damping = damping or Damping()
+        self._on_round, self._damping = on_round, damping or Damping()
         self._last_step: Array | None = None  # of the map and the calibration
 
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
         """Return the optimum on curves with about one knot for each cone, which meet the cones."""
-        system, effort = self.system, self.effort
-        detections, settings = system.detections, system.settings
+        detections, settings, effort = self.system.detections, self.system.settings, self.effort
         state = self.align_poses(state, POSE_STEPS, LOOSE_GATE)
         state = reknot(state, detections, settings, dense=True)
         at, _ = self.run(state, LOOSE_GATE, effort.rough_rounds, ROUGH_TOLERANCE)
@@ -113,48 +109,48 @@ class Optimizer:
         weights), and only then may it end. After `SEARCH` rounds, or half of them, associations and sigmas
         stay: where two rows are near, some would change for ever.
         """
-        system = self.system
         locate_poses(state, self.settings.association)
-        system.begin(state)
-        self._last_step = None
-        at: Evaluation | None = None
-        cost, searched = np.inf, 0
-        search = max(min(SEARCH, rounds // 2), 1)
-        for number in range(1, rounds + 1):
-            gate = max(gate, self.settings.gate)
+        self.system.begin(state)
+        self._last_step, tolerance = None, tolerance * self.effort.tolerance
+        cost, done, searched, search = np.inf, 0, 0, max(min(SEARCH, rounds // 2), 1)
+        while done < rounds:
+            done, gate = done + 1, max(gate, self.settings.gate)
             strict = gate <= self.settings.gate
-            system.kernel = Biweight(gate)
+            self.system.kernel = Biweight(gate)
             held, searched = searched >= search, searched + strict
             before = self._refreshed(state, gate, strict, held)
             at = self._step(before)
             state, gain, cost = at.state, abs(cost - at.cost), at.cost
             if self._on_round is not None:
                 self._on_round()
-            if strict and self._is_still(before, at, gain, tolerance):
+            still = strict and gain <= tolerance * TOLERANCE_COST * cost
+            if still and self._movement(before.state, state) <= tolerance * TOLERANCE_CURVE:
                 at = self._refreshed(state, gate, strict, held)
                 decrease = self.predicted_decrease(at)
-                if decrease <= tolerance * (self.effort.tolerance * TOLERANCE_DECREASE):
-                    return at, self._report(at, number, decrease, True)
+                if decrease <= tolerance * TOLERANCE_DECREASE:
+                    converged, reason = True, "nothing changes any more"
+                    break
             gate *= GATE_FACTOR
-        assert at is not None
-        return at, self._report(at, rounds, self.predicted_decrease(at), False)
+        else:
+            converged, reason, decrease = False, "no round left", self.predicted_decrease(at)
+        norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
+        return at, Convergence(converged, reason, done, self.steps, at.cost, norm)
 
     def _refreshed(self, state: State, gate: float, strict: bool, held: bool = False) -> Evaluation:
-        """Return the problem of a new round, with the associations and sigmas of the last one if `held`."""
+        """Return the problem of a new round, with the associations and sigmas of the last one if `held`.
+
+        Its foot points have arrived: else the cost would change without a step.
+        """
         system = self.system
         if not strict:
             locate_poses(state, self.settings.association)
         system.detections.correct(state.variables.sensor)
         if not held:
             associate(state, system.detections, system.settings, gate, strict)
-        return self._settled(state, held)
-
-    def _settled(self, state: State, held: bool) -> Evaluation:
-        """Return the problem with foot points that have arrived: else the cost changes without a step."""
-        at = self.system.evaluate(state, hold=not held)
+        at = system.evaluate(state, hold=not held)
         for _ in range(SETTLE):
             self._keep_foot_points(at)
-            before, at = at, self.system.evaluate(state, hold=not held)
+            before, at = at, system.evaluate(state, hold=not held)
             if abs(before.cost - at.cost) <= self.effort.tolerance * TOLERANCE_COST * at.cost:
                 break
         return at
@@ -164,22 +160,14 @@ class Optimizer:
         for projected in at.projected.values():
             self.system.detections.refine(projected.rows, projected.foot.u)
 
-    def _is_still(self, before: Evaluation, after: Evaluation, gain: float, tolerance: float) -> bool:
-        """Return whether a round has changed neither the curves, as their poses see them, nor the cost."""
-        curve, cost = (self.effort.tolerance * t for t in (TOLERANCE_CURVE, TOLERANCE_COST))
-        still = self._movement(before.state, after.state) <= tolerance * curve
-        return still and gain <= tolerance * cost * after.cost
-
     def _movement(self, before: State, after: State) -> float:
         """Return how far a curve has moved across itself (m), as the poses beside it see it."""
         farthest = 0.0
         for label, gauge in self.system.gauges.items():
             boundary, points = before.boundaries[label], before.control_points(label)
             offset = gauge.carried(points, before.poses, after.poses) - after.control_points(label)
-            count = max(CURVE_SAMPLES * boundary.size, 2)
-            u = np.linspace(boundary.tables.low, boundary.tables.high, count)
-            normal = left_of(boundary.evaluate(after.control_points(label), u, 1))
-            normal /= np.maximum(np.hypot(*normal.T), np.finfo(float).tiny)[:, None]
+            u = np.linspace(boundary.tables.low, boundary.tables.high, CURVE_SAMPLES * boundary.size)
+            normal = after.spline(label).normal_unit(u)
             across = (boundary.evaluate(offset, u) * normal).sum(axis=1)
             farthest = max(farthest, float(np.abs(across).max()))
         return farthest
@@ -193,45 +181,38 @@ class Optimizer:
         step = problem.step(np.zeros(problem.map.size))
         return -0.5 * float(gradient(self.system.rows(at), layout) @ step)
 
-    def _report(self, at: Evaluation, rounds: int, decrease: float, converged: bool) -> Convergence:
-        norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
-        reason = "nothing changes any more" if converged else "no round left"
-        return Convergence(converged, reason, rounds, self.steps, at.cost, norm)
-
     def _step(self, at: Evaluation) -> Evaluation:
         """Return the problem after the least damped step that makes the cost smaller, or the same one."""
-        damping = self._damping
         self._keep_foot_points(at)
         graph = self.system.linear_graph(at)
-        while not damping.exhausted:
+        while not self._damping.exhausted:
             self.steps += 1
-            trial = self._trial(at, graph, damping.weight)
+            trial = self._trial(at, graph, self._damping.weight)
             if trial is not None:
-                damping.lower()
+                self._damping.lower()
                 self._keep_foot_points(trial)
                 return trial
-            damping.grow()
-        damping.reset()
+            self._damping.grow()
+        self._damping.reset()
         return at
 
     def _trial(self, at: Evaluation, graph: gtsam.GaussianFactorGraph, damping: float) -> Evaluation | None:
         """Return the problem after a damped step (1/m^2), or None if the cost has grown."""
-        state = at.state
-        damped = graph_of(graph, self.system.damping(state, damping))
+        state, system = at.state, self.system
         try:
-            problem = Elimination(damped, state.variables.layout)
+            problem = Elimination(graph_of(graph, system.damping(state, damping)), state.variables.layout)
             step = problem.step(np.zeros(problem.map.size))
         except SingularSystemError:
             return None
-        trial = self.system.evaluate(self.system.retract(state, step))
+        trial = system.evaluate(system.retract(state, step))
         if trial.cost > at.cost:
             return None
         before, self._last_step = self._last_step, step[: problem.map.size]
         factor = 1.0 if before is None else extrapolation_factor(self._last_step, before)
-        if factor != 1.0:
-            other = self.system.evaluate(self.system.retract(state, factor * step))
-            trial = min(trial, other, key=lambda evaluation: evaluation.cost)
-        return trial
+        if factor == 1.0:
+            return trial
+        other = system.evaluate(system.retract(state, factor * step))
+        return min(trial, other, key=lambda evaluation: evaluation.cost)
 
 
 def extrapolation_factor(step: Array, before: Array) -> float:

@@ -40,12 +40,12 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
         points = cones_of_curve(state, detections, label, settings).points
         if len(points) < MIN_CONES:
             continue
+        share, least_share = settings.batch.size_share, MIN_SIZE_SHARE
         if dense:
-            beyond = 0.0 if boundary.periodic else settings.growth.merge_radius
-            points, share_of = extended(points, beyond), (settings.batch.dense_share, 1.0)
-        else:
-            share_of = settings.batch.size_share, MIN_SIZE_SHARE
-        spline = fit_through(points, boundary.periodic, settings, *share_of)
+            share, least_share = settings.batch.dense_share, 1.0
+            if not boundary.periodic:
+                points = extended(points, settings.growth.merge_radius)
+        spline = fit_through(points, boundary.periodic, settings, share, least_share)
         state.replace_boundary(label, *boundary_of(spline, settings))
     return state
 
@@ -58,11 +58,10 @@ def fit_through(
     It has at least `least_share` of these. A closed one begins at the cone nearest to the start, so that
     similar cones give similar knots.
     """
-    smallest = settings.spline.min_size
+    smallest, degree = settings.spline.min_size, settings.spline.degree
     most = max(smallest, int(share * len(points)))
     if periodic:
         points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
-    degree = settings.spline.degree
     chosen = chosen_breaks(points, periodic, degree, max(smallest, int(least_share * most)), most)
     return fit_spline(points, chosen.size, periodic, degree, chosen.breaks)
 
@@ -73,8 +72,6 @@ def extended(points: Array, beyond: float) -> Array:
     Half of the detections of the last one lie beyond it, and any motion of an end there would put some of
     them into use and others out of it.
     """
-    if beyond == 0.0:
-        return points
     ends, inner = points[[0, -1]], points[[1, -2]]
     ahead = (ends - inner) / np.maximum(np.hypot(*(ends - inner).T), np.finfo(float).tiny)[:, None]
     first, last = ends + beyond * ahead
@@ -107,34 +104,21 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
 # --- simplification --------------------------------------------------------------------------------------
 
 
-def simplify(
-    state: State, covariance: Array, detections: DetectionTable, settings: MapperSettings
-) -> tuple[State, Array]:
-    """Return the same poses beside curves on few knots, and the covariance (n, n) of their control points.
+def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> tuple[State, Array]:
+    """Return the same poses beside curves on few knots, and the change F (k, n) of the control points.
 
     The paper's Simplification: `C_new = F C_old`, so the covariance is `F Sigma F'`. The optimum isn't solved
     for on few knots: such a curve passes its cones by a decimetre, on the same side in every lap, which turns
-    vehicle and map by up to a degree in the first seconds.
+    vehicle and map by up to a degree in the first seconds. The detections are associated with the new curves.
     """
-    few, change = simplified(state, detections, settings)
-    associate_again(few, detections, settings)
-    return few, change @ covariance @ change.T
-
-
-def associate_again(few: State, detections: DetectionTable, settings: MapperSettings) -> None:
-    """Place the poses beside simplified curves, and associate the detections with these."""
-    locate_poses(few, settings.batch.association)
-    associate(few, detections, settings, settings.batch.gate, strict=True)
-
-
-def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> tuple[State, Array]:
-    """Return the same poses beside curves on few knots, and the change F (k, n) of the control points."""
     few = reknot(state, detections, settings)
     change = np.zeros((few.map_points.size, state.map_points.size))
     for label, boundary in state.boundaries.items():
         new, new_points = few.boundaries[label], few.control_points(label)
         F = new_from_old(boundary, state.control_points(label), new, new_points)
         change[map_block(few, label), map_block(state, label)] = np.kron(F, np.eye(POINT))
+    locate_poses(few, settings.batch.association)
+    associate(few, detections, settings, settings.batch.gate, strict=True)
     return few, change
 
 
@@ -201,8 +185,7 @@ class Scatter:
 
 def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperSettings) -> Scatter:
     """Return the scatter of the detected cones about the curves of the state."""
-    seen, unseen = [np.zeros(0)], [np.zeros(0)]
-    places, lengths = {}, {}
+    seen, unseen, places, lengths = [np.zeros(0)], [np.zeros(0)], {}, {}
     for label, boundary in state.boundaries.items():
         cones = cones_of_curve(state, detections, label, settings)
         u, share = first_parameter(state, label) + cones.u, boundary.size / max(len(cones.u), 1)

@@ -10,7 +10,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import ProjectionRows, project, smoothness_matrix
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotations, to_map
 from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
@@ -64,13 +64,12 @@ class CurveGauge:
         Also return their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
         map frame they would turn with the map, and Gauss-Newton would take that turn for a change of shape.
         """
-        neighbours, theta = self.neighbours, poses[self.middle_cycle, 2]
-        c, s = np.cos(theta), np.sin(theta)
-        turned = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
+        neighbours = self.neighbours
+        back = rotations(-poses[self.middle_cycle, 2])
         weights = np.take_along_axis(self.smoothness, neighbours, axis=1) / self.sigma_smoothness
         in_map = (weights[:, :, None] * control_points[neighbours]).sum(axis=1)
-        residual = (turned @ in_map[:, :, None])[:, :, 0]
-        by_control = weights[:, None, :, None] * turned[:, :, None, :]
+        residual = (back @ in_map[:, :, None])[:, :, 0]
+        by_control = weights[:, None, :, None] * back[:, :, None, :]
         by_pose = np.zeros((len(residual), POINT, POSE))
         by_pose[:, 0, 2], by_pose[:, 1, 2] = residual[:, 1], -residual[:, 0]
         return residual, by_control.reshape(len(residual), POINT, -1), by_pose
@@ -125,8 +124,7 @@ class CurveGauge:
     def carried(self, control_points: Array, poses: Array, poses_after: Array) -> Array:
         """Return control points (m, 2) moved rigidly with the poses beside them, from and to (P, 3)."""
         before, after = poses[self.cycle], poses_after[self.cycle]
-        turned = np.column_stack([np.zeros((len(before), 2)), after[:, 2] - before[:, 2]])
-        return after[:, :2] + to_map(control_points - before[:, :2], turned)
+        return after[:, :2] + turned(control_points - before[:, :2], after[:, 2] - before[:, 2])
 
     def cost(self, control_points: Array, poses: Array) -> float:
         """Return half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""
@@ -188,11 +186,6 @@ class Biweight:
         """Return the robust weights `rho'(z) / z = (1 - z^2 / g^2)^2` (m,)."""
         return np.asarray(self._inner(whitened) ** 2)
 
-    @property
-    def ceiling(self) -> float:
-        """Return the loss of a detection that isn't used, which is that at the gate."""
-        return self.gate**2 / 6.0
-
     def _inner(self, whitened: Array) -> Array:
         return np.maximum(1.0 - (whitened / self.gate) ** 2, 0.0)
 
@@ -234,10 +227,8 @@ class BatchSystem:
     def __init__(
         self, detections: DetectionTable, chain: LogOdometry, settings: MapperSettings, kernel: Biweight
     ) -> None:
-        self.detections = detections
-        self.chain = chain
-        self.settings = settings
-        self.kernel = kernel
+        self.detections, self.chain = detections, chain
+        self.settings, self.kernel = settings, kernel
         self.gauges: dict[int, CurveGauge] = {}  # weak priors of each boundary
         self.revisits: tuple[Revisit, ...] = ()
         """Poses measured in the frame of earlier ones, where an open road was driven twice."""
@@ -260,11 +251,10 @@ class BatchSystem:
         drive += [one.rows(state.poses) for one in self.revisits]
         used = sum(int(p.inside.sum()) for p in projected.values())
         losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
-        cost = losses + self.kernel.ceiling * (len(self.detections) - used) + half_square(drive)
-        cost += sum(
-            self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
-        )
-        return Evaluation(state, projected, drive, cost)
+        at_gate = self.kernel.gate**2 / 6.0  # the loss of a detection that isn't used
+        cost = losses + at_gate * (len(self.detections) - used) + half_square(drive)
+        gauges = (self.gauges[b].cost(state.control_points(b), state.poses) for b in state.boundaries)
+        return Evaluation(state, projected, drive, cost + sum(gauges))
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
         detections, sensor = self.detections, state.variables.sensor
@@ -313,9 +303,8 @@ class BatchSystem:
 
     def scale(self, projected: Projected) -> Array:
         """Return the factor (m,) that whitens and weights each row (1/m), zero for those not inside."""
-        return np.asarray(
-            np.sqrt(self.kernel.weights(projected.whitened)) * projected.inside / projected.sigma
-        )
+        root = np.sqrt(self.kernel.weights(projected.whitened))
+        return np.asarray(root * projected.inside / projected.sigma)
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return all rows as a linear graph, whose solution is the change from the state."""
