@@ -10,7 +10,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import ProjectionRows, project, smoothness_matrix
-from pathspace_graph.factors.se2 import rotations, to_map
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
@@ -64,8 +64,9 @@ class CurveGauge:
         Also return their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
         map frame they would turn with the map, and Gauss-Newton would take that turn for a change of shape.
         """
-        neighbours = self.neighbours
-        back = rotations(-poses[self.middle_cycle, 2])
+        neighbours, theta = self.neighbours, poses[self.middle_cycle, 2]
+        c, s = np.cos(theta), np.sin(theta)
+        back = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
         weights = np.take_along_axis(self.smoothness, neighbours, axis=1) / self.sigma_smoothness
         in_map = (weights[:, :, None] * control_points[neighbours]).sum(axis=1)
         residual = (back @ in_map[:, :, None])[:, :, 0]
