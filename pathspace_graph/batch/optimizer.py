@@ -109,14 +109,15 @@ class Optimizer:
         weights), and only then may it end. After `SEARCH` rounds, or half of them, associations and sigmas
         stay: where two rows are near, some would change for ever.
         """
+        system = self.system
         locate_poses(state, self.settings.association)
-        self.system.begin(state)
+        system.begin(state)
         self._last_step, tolerance = None, tolerance * self.effort.tolerance
         cost, done, searched, search = np.inf, 0, 0, max(min(SEARCH, rounds // 2), 1)
         while done < rounds:
             done, gate = done + 1, max(gate, self.settings.gate)
             strict = gate <= self.settings.gate
-            self.system.kernel = Biweight(gate)
+            system.kernel = Biweight(gate)
             held, searched = searched >= search, searched + strict
             before = self._refreshed(state, gate, strict, held)
             at = self._step(before)
