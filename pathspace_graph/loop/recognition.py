@@ -87,8 +87,10 @@ def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) ->
     found: list[RecognizedPlace] = []
     for vector, low in _starts(state, prior, settings):
         place = _register(state, newest, Motion(centre, vector), low, prior, settings)
-        if place is not None and not any(_same(place, other, settings) for other in found):
-            found.append(place)
+        if place is not None:
+            apart = [place.motion.vector[:2] - other.motion.vector[:2] for other in found]
+            if all(np.hypot(*away) >= settings.overlap for away in apart):
+                found.append(place)
     return found[0] if len(found) == 1 else None
 
 
@@ -102,10 +104,6 @@ def newest_stretch(state: State) -> dict[int, tuple[Array, Array]]:
         tangents /= np.hypot(tangents[:, :1], tangents[:, 1:])
         found[label] = boundary.evaluate(points, chosen), left_of(tangents)
     return found
-
-
-def _same(a: RecognizedPlace, b: RecognizedPlace, settings: ClosingSettings) -> bool:
-    return bool(np.hypot(*(a.motion.vector - b.motion.vector)[:2]) < settings.overlap)
 
 
 def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple[Array, float]]:

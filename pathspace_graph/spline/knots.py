@@ -257,7 +257,8 @@ def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, leas
     decreases by `w' G^-1 a / (a' G^-1 a) a'c`. So it suffices to update `W c` and `W G^-1 A'` by a rank of
     one, where the rows of W are the jumps A at all knots and the basis at the points.
     """
-    breaks = _breaks(u, high)
+    inner = np.unique(u[(u > COINCIDENT) & (u < high - COINCIDENT)])
+    breaks = np.concatenate([[0.0], inner[np.diff(inner, prepend=0.0) > COINCIDENT], [high]])
     while periodic and len(breaks) <= degree + 1:
         breaks = np.sort(np.append(breaks, 0.5 * (breaks[1:] + breaks[:-1])))
     frame = _frame(breaks, periodic, degree)
@@ -281,12 +282,6 @@ def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, leas
             values = values - share[:, None] * values[k]
             spread = dger(-1.0, share, spread[k], a=spread, overwrite_a=1)
             remaining = np.concatenate([remaining[:removed], remaining[removed + 1 :]])
-
-
-def _breaks(u: Array, high: float) -> Array:
-    inner = np.unique(u[(u > COINCIDENT) & (u < high - COINCIDENT)])
-    inner = inner[np.diff(inner, prepend=0.0) > COINCIDENT]
-    return np.concatenate([[0.0], inner, [high]])
 
 
 def _frame(breaks: Array, periodic: bool, degree: int) -> BSpline:

@@ -178,7 +178,7 @@ def centre_line(
     arc_length = np.linspace(0.0, length, count + 1)
     u, own = centre.parameters_at(arc_length), slice(count if closed else None)
     points, tangent, crossings = centre.evaluate(u)[own], centre.tangent_unit(u), line.crossings(u)
-    sigmas = _sigmas(line, u, crossings, covariance)
+    across, turn, bend, along, to_left, to_right = _sigmas(line, u, crossings, covariance)
     offsets = [np.abs(one.offset[own]) for one in crossings]
     widths = _uncrossed(points, left_of(tangent)[own], offsets, closed)
     return CentreLine(
@@ -190,13 +190,13 @@ def centre_line(
         width_right=widths[1],
         closed=closed,
         length=length,
-        points_sigma=sigmas[0][own],
-        heading_sigma=sigmas[1][own],
-        curvature_sigma=sigmas[2][own],
-        arc_length_sigma=sigmas[3][own],
-        width_left_sigma=sigmas[4][own],
-        width_right_sigma=sigmas[5][own],
-        length_sigma=float(sigmas[3][-1]),
+        points_sigma=across[own],
+        heading_sigma=turn[own],
+        curvature_sigma=bend[own],
+        arc_length_sigma=along[own],
+        width_left_sigma=to_left[own],
+        width_right_sigma=to_right[own],
+        length_sigma=float(along[-1]),
     )
 
 
@@ -247,16 +247,14 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
     by_parameter = cross(first, third) / cube[:, 0]
     by_parameter -= 3.0 * curvature[:, 0] * np.einsum("kd,kd->k", first, second) / speed**2
     bent = bent - (by_parameter / speed)[:, None] * along
-    intervals = centre.arc_length(u)
     shorter = -curvature * across
-    pieces = 0.5 * np.diff(intervals)[:, None] * (shorter[1:] + shorter[:-1])
+    pieces = 0.5 * np.diff(centre.arc_length(u))[:, None] * (shorter[1:] + shorter[:-1])
     lengths = np.concatenate([np.zeros((1, pieces.shape[1])), np.cumsum(pieces, axis=0)])
     rows = [across, heading, bent, lengths]
     for one, begin in zip(crossings, (0, line.sides[0].size), strict=True):
         turn = one.offset * np.einsum("kd,kd->k", one.own_normal, tangent)
         rows.append(one.along_normal(begin, line.size) + turn[:, None] * heading - across)
-    root = np.asarray(covariance)
-    return [np.sqrt(np.maximum(np.einsum("km,km->k", row @ root, row), 0.0)) for row in rows]
+    return [np.sqrt(np.maximum(np.einsum("km,km->k", row @ covariance, row), 0.0)) for row in rows]
 
 
 def _dot(a: Array, moved: Array) -> Array:
