@@ -67,16 +67,11 @@ class Optimizer:
     """Levenberg-Marquardt from a state to the minimum; `on_round` is called after each round."""
 
     def __init__(
-        self,
-        system: BatchSystem,
-        effort: Effort | None = None,
-        on_round: Callable[[], None] | None = None,
-        damping: Damping | None = None,
+        self, system: BatchSystem, effort: Effort | None = None, on_round: Callable[[], None] | None = None
     ) -> None:
         self.system, self.settings = system, system.settings.batch
-        self.effort = effort or Effort()
+        self.effort, self.damping, self._on_round = effort or Effort(), Damping(), on_round
         self.steps = 0  # steps that were tried
-        self._on_round, self._damping = on_round, damping or Damping()
         self._last_step: Array | None = None  # of the map and the calibration
 
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
@@ -186,22 +181,23 @@ class Optimizer:
         """Return the problem after the least damped step that makes the cost smaller, or the same one."""
         self._keep_foot_points(at)
         graph = self.system.linear_graph(at)
-        while not self._damping.exhausted:
+        while not self.damping.exhausted:
             self.steps += 1
-            trial = self._trial(at, graph, self._damping.weight)
+            trial = self._trial(at, graph)
             if trial is not None:
-                self._damping.lower()
+                self.damping.lower()
                 self._keep_foot_points(trial)
                 return trial
-            self._damping.grow()
-        self._damping.reset()
+            self.damping.grow()
+        self.damping.reset()
         return at
 
-    def _trial(self, at: Evaluation, graph: gtsam.GaussianFactorGraph, damping: float) -> Evaluation | None:
-        """Return the problem after a damped step (1/m^2), or None if the cost has grown."""
+    def _trial(self, at: Evaluation, graph: gtsam.GaussianFactorGraph) -> Evaluation | None:
+        """Return the problem after a damped step, or None if the cost has grown."""
         state, system = at.state, self.system
+        damped = graph_of(graph, system.damping(state, self.damping.weight))
         try:
-            problem = Elimination(graph_of(graph, system.damping(state, damping)), state.variables.layout)
+            problem = Elimination(damped, state.variables.layout)
             step = problem.step(np.zeros(problem.map.size))
         except SingularSystemError:
             return None

@@ -27,9 +27,6 @@ FOLDS: Final = 4  # groups of the cross-validation, dealt in turn, so that the n
 FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched (m along the curve)
 
 
-# --- knots -----------------------------------------------------------------------------------------------
-
-
 def reknot(state: State, detections: DetectionTable, settings: MapperSettings, dense: bool = False) -> State:
     """Return the state with every curve fitted anew through the cones along it.
 
@@ -185,7 +182,7 @@ class Scatter:
 
 def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperSettings) -> Scatter:
     """Return the scatter of the detected cones about the curves of the state."""
-    seen, unseen, places, lengths = [np.zeros(0)], [np.zeros(0)], {}, {}
+    seen, unseen, places, lengths = [], [], {}, {}
     for label, boundary in state.boundaries.items():
         cones = cones_of_curve(state, detections, label, settings)
         u, share = first_parameter(state, label) + cones.u, boundary.size / max(len(cones.u), 1)
@@ -194,7 +191,7 @@ def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperS
         unseen.append(cross_validated(cones.points, boundary.periodic, settings, share))
         places[label] = foot.u
         lengths[label] = boundary.length if boundary.periodic else np.inf
-    return Scatter(_rms(np.concatenate(seen)), _rms(np.concatenate(unseen)), places, lengths)
+    return Scatter(_rms(seen), _rms(unseen), places, lengths)
 
 
 def cross_validated(points: Array, periodic: bool, settings: MapperSettings, share: float) -> Array:
@@ -214,5 +211,6 @@ def cross_validated(points: Array, periodic: bool, settings: MapperSettings, sha
     return np.concatenate(distances)
 
 
-def _rms(values: Array) -> float:
+def _rms(parts: list[Array]) -> float:
+    values = np.concatenate([np.zeros(0), *parts])
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

@@ -49,9 +49,6 @@ ALIGN_TOLERANCE: Final = 1e-6  # largest move of a step at which they are togeth
 MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
 
 
-# --- from an online run ----------------------------------------------------------------------------------
-
-
 class CurveMapper(OnlineEstimator, Protocol):
     """An online estimator with curves, with whose map the batch can begin."""
 
@@ -237,20 +234,19 @@ def _begin_boundary(
     detections: DetectionTable,
     settings: MapperSettings,
 ) -> None:
-    """Add a curve through the cones of a boundary that were seen in the first lap, if there are enough.
+    """Add a curve through the cones of a boundary that were seen beside the first lap, if there are enough.
 
-    They lie beside its path. A detection whose station isn't about that of its cycle belongs to a stretch
-    that is driven later.
+    A detection whose station isn't about that of its cycle belongs to a stretch that is driven later.
     """
     first_lap, gate = recurrence.driven < recurrence.lap, settings.gate
     rows = np.flatnonzero((detections.label == label) & first_lap[detections.cycle])
     if len(rows) == 0 or first_lap.sum() < 2:
         return
-    cycles = detections.cycle[rows]
-    path, stations = poses[first_lap, :2], recurrence.driven[first_lap]
+    cycles, path, stations = detections.cycle[rows], poses[first_lap, :2], recurrence.driven[first_lap]
+    length = float(stations[-1]) + settings.growth.reach
     if recurrence.recurs:
-        path, stations = np.concatenate([path, path[:1]]), np.append(stations, recurrence.lap)
-    length = recurrence.lap if recurrence.recurs else float(stations[-1]) + settings.growth.reach
+        length, path = recurrence.lap, np.concatenate([path, path[:1]])
+        stations = np.append(stations, length)
     points = to_map(detections.point[rows], poses[cycles])
     station, lateral = along_and_across(points, path, stations)
     side, ahead = SIDES[label] * lateral, station - recurrence.driven[cycles]
