@@ -26,27 +26,21 @@ SETTLE: Final = 8  # most refinements of the foot points before a step
 POSE_STEPS: Final = 3  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
 ROUGH_TOLERANCE: Final = 8.0  # factor of the tolerances in the first optimization
 TOLERANCE_COST: Final = 1e-5  # most |cost_before - cost_after| over a round at convergence, over the cost
-TOLERANCE_CURVE: Final = 2e-3
-"""Largest move of a point of a curve across it in a round then, as seen from its poses (m)."""
+TOLERANCE_CURVE: Final = 2e-3  # largest move of a curve across itself in a round then, as seen from poses (m)
 TOLERANCE_DECREASE: Final = 5e-3  # most decrease of the cost by an undamped step then; one sigma has 1/2
 CURVE_SAMPLES: Final = 2  # points in each knot interval at which the movement of a curve is measured
-SHARES: Final = (0.3, 0.97)
-"""Sizes of a step's share of the one before between which it becomes the sum of all that would follow."""
+SHARES: Final = (0.3, 0.97)  # of a step in the one before, between which it is extrapolated
 
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
     """End of an optimization."""
 
-    converged: bool
-    """Whether nothing changed any more."""
+    converged: bool  # whether nothing changed any more
     reason: str
-    rounds: int
-    """Times that foot points, gates and weights were refreshed."""
-    steps: int
-    """Levenberg-Marquardt steps, including rejected ones."""
-    cost: float
-    """Half the sum of squares with robust losses at the end."""
+    rounds: int  # times that foot points, gates and weights were refreshed
+    steps: int  # Levenberg-Marquardt steps, including rejected ones
+    cost: float  # half the sum of squares with robust losses at the end
     gradient: float
     """Norm `sqrt(g' H^-1 g)` of the gradient g at the end, with H the information of all variables: the
     distance of the linear problem's optimum in joint sigmas. A slow common motion of the whole map counts as

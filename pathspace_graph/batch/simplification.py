@@ -21,8 +21,7 @@ from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 from .association import MIN_CONES, associate, cones_of_curve, first_parameter, locate_poses
 
 MIN_SIZE_SHARE: Final = 0.6  # least share of the largest number of control points that is tried
-ALIKE: Final = (3.0, 0.01)
-"""Parameters of two curves through the same cones differ by less than `a + b L` (m), with L their length."""
+ALIKE: Final = (3.0, 0.01)  # parameters on curves of length L through the same cones differ by < a + b L (m)
 FOLDS: Final = 4  # groups of the cross-validation, dealt in turn, so that the neighbours of a cone are there
 FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched (m along the curve)
 
@@ -66,8 +65,7 @@ def fit_through(
 def extended(points: Array, beyond: float) -> Array:
     """Return cones (k, 2) with a point before the first and one after the last, `beyond` (m) straight on.
 
-    Half of the detections of the last one lie beyond it, and any motion of an end there would put some of
-    them into use and others out of it.
+    Half of the last one's detections lie beyond it: a motion of an end there would put some out of use.
     """
     ends, inner = points[[0, -1]], points[[1, -2]]
     ahead = (ends - inner) / np.maximum(np.hypot(*(ends - inner).T), np.finfo(float).tiny)[:, None]

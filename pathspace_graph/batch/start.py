@@ -38,8 +38,7 @@ ComplexArray = NDArray[np.complex128]
 
 PROFILE_STEP: Final = 0.5  # step at which the path driven is sampled (m)
 SMOOTHING: Final = 3.0  # length over which the curvature is averaged (m)
-CORRELATION_SHARE: Final = 0.8
-"""Least correlation of a lap's lag as a share of the largest one; a lap is about the shortest such lag."""
+CORRELATION_SHARE: Final = 0.8  # least correlation of a lap's lag over the largest; it is the shortest such
 RECURS: Final = 0.7  # least correlation a lap later; 0.56 at most after one of two loops, if one is wider
 MIN_OVERLAP: Final = 20.0  # least length of the path after a lap (m): over less, straights agree
 REFERENCE_STEP: Final = 8.0  # distance of the reference poses that every lap passes (m)
@@ -135,8 +134,8 @@ def correlations(place: ComplexArray, heading: Array, lags: IntArray, settings: 
     """Return how well the curvature of a path agrees with itself each of the lags (l,) later, in samples.
 
     `1 - mean((a - b)^2) / (mean(a^2) + mean(b^2))`, and -inf where the path isn't back at about the same
-    place and heading, by the limits of a loop closure. The path is sampled at steps of `PROFILE_STEP`: places
-    x + i y (n,) and headings (n,), which aren't wrapped. The sums come from a Fourier transform.
+    place and heading, by the limits of a loop closure. The places x + i y (n,) and headings (n,), which
+    aren't wrapped, are `PROFILE_STEP` apart. The sums come from a Fourier transform.
     """
     half, number = max(int(0.5 * SMOOTHING / PROFILE_STEP), 1), np.arange(len(heading))
     later, before = np.minimum(number + half, len(heading) - 1), np.maximum(number - half, 0)

@@ -110,8 +110,7 @@ class CurveGauge:
     def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
         """Return rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
 
-        They damp how it moves as seen from the pose beside it, in 1/m^2, and not a map that swings with its
-        poses.
+        They damp (1/m^2) how it moves as seen from the pose beside it, not a map that swings with its poses.
         """
         arm = control_points - poses[self.cycle, :2]
         by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
@@ -154,8 +153,7 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
 def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
     """Return (m,) the pose nearest to where each control point acts, of those with the curve's direction.
 
-    On an open curve, which may have drifted over itself, it is within `room` (m) of the nearest along the
-    curve.
+    On an open curve, which may have drifted over itself, it is within `room` (m) of the nearest along it.
     """
     boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
     u = boundary.abscissae
@@ -195,8 +193,7 @@ class Biweight:
 class Projected:
     """The m detections that are used on one boundary, projected on its curve at a state.
 
-    A round holds `sigma` and `inside`, so that the cost does not jump where an end of an open curve slides
-    past a detection.
+    A round holds `sigma` and `inside`: the cost does not jump where an open end slides past a detection.
     """
 
     rows: IntArray  # rows (m,) of the detections in their table
@@ -231,8 +228,7 @@ class BatchSystem:
         self.detections, self.chain = detections, chain
         self.settings, self.kernel = settings, kernel
         self.gauges: dict[int, CurveGauge] = {}  # weak priors of each boundary
-        self.revisits: tuple[Revisit, ...] = ()
-        """Poses measured in the frame of earlier ones, where an open road was driven twice."""
+        self.revisits: tuple[Revisit, ...] = ()  # where an open road was driven twice
         count = len(detections)
         self._sigma, self._inside, self._rates = np.ones(count), np.ones(count, bool), np.zeros((count, 2))
 
@@ -324,8 +320,8 @@ class BatchSystem:
     def retract(self, state: State, step: Array) -> State:
         """Return the state after a step (n,), taken in relative coordinates.
 
-        Each pose changes as seen from the pose before, and each control point as seen from the pose beside
-        it. So a map that swings by a large angle keeps its shape.
+        Poses change as seen from the pose before, and control points as seen from the pose beside them. So a
+        map that swings by a large angle keeps its shape.
         """
         linear = moved(state, step)
         after, poses, goal = linear.copy(), state.poses, linear.poses

@@ -58,8 +58,7 @@ def bend(poses: Array, known: Mapping[int, Array]) -> Array:
 WORKER_IDLE: Final = 600  # time with nothing to do after which the process that solves laps ends (s)
 WATCH_SECONDS: Final = 1.0  # at which a worker checks whether the process that started it is still there
 LATE: Final = "the batch of the lap was late"  # why a batch was given up in the end
-SOLVED: Final = 3.0
-"""Distance from its optimum at which a batch counts as solved (joint sigmas): its marginal has the rest."""
+SOLVED: Final = 3.0  # distance from the optimum of a solved batch (joint sigmas): its marginal has the rest
 
 
 class DriveRecord:
@@ -69,8 +68,7 @@ class DriveRecord:
         self.settings = settings
         self._noise = noise
         self.unsolvable: str | None = None  # why the drive cannot be solved as a batch; None if it can be
-        self.poses: list[Array] = []
-        """Pose (3,) of each cycle, map frame, as it was estimated then or by the newest batch."""
+        self.poses: list[Array] = []  # (3,) of each cycle, map frame, as of then or the newest batch
         self.stamps: list[float] = []  # stamp of each cycle (s)
         self._readings: list[Reading] = []  # whose detections have their stated covariances
         self._beside: dict[int, list[float]] = {}  # parameter on each curve by cycle, NaN before it
@@ -160,10 +158,7 @@ class DriveRecord:
         return ClosedMap(state.splines, poses, state.variables.calibrations.copy())
 
     def lap(self, first_kept: int, start: ClosedMap | Recurrence, settings: MapperSettings) -> OpenLap:
-        """Return the lap, whose search begins at a map that has just been closed, or at odometry.
-
-        The priors of the calibrations are those of the settings, which may have become wide.
-        """
+        """Return the lap; the priors of its calibrations are those of the settings, which may be wide."""
         measured = [one.motion for one in self._readings], [one.detections for one in self._readings]
         motions, detections = self._noise.for_lap(*measured)
         chain = chained(self.stamps, motions, settings.odometry)

@@ -27,8 +27,7 @@ from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.spline.boundary import Boundary
 
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors that choose a pose's position
-FOUND: Final = "the vehicle was lost, and is found again"
-"""Beginning of the notice of a cycle in which the window starts anew at the place that was found."""
+FOUND: Final = "the vehicle was lost, and is found again"  # notice of the cycle in which it is found
 BESIDE: Final = 1.0  # distance from the closed curve within which an unused detection is explained (m)
 GAP: Final = 3.0  # least distance of neighbouring cones with a gap between them, over the median
 INTERVAL: Final = 0.5  # least time between two attempts (s)
@@ -162,10 +161,9 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
     """Return what the tested detections say about the newest pose, before the update.
 
     On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
-    for on the whole of their curve: they may be of a stretch across the infield. Three kinds of them say
-    nothing about the vehicle. Those that are not `seen_again` (m,), of all detections of the cycle, may be of
-    nothing at all. Those on the curve of the other colour have a wrong colour. And those beside a gap of the
-    map cannot lie on it.
+    for on the whole of their curve: they may be of a stretch across the infield. Three kinds say nothing
+    about the vehicle: those that are not `seen_again` (m,), of all detections of the cycle, those on the
+    curve of the other colour, and those beside a gap of the map.
     """
     detections, settings = smoother.map.detections, smoother.map.settings.health
     closed, used = smoother.map.state.closed, detections.used[tested.rows]
@@ -202,14 +200,11 @@ def _by_boundary(labels: IntArray) -> tuple[int, int]:
 
 
 def _sigma_of_position(smoother: CurveSmoother) -> float:
-    """Return the standard deviation (m) of the last solved position in its worst direction.
-
-    The newest pose has the last columns of the system, so that the last block of its factor tells it.
-    """
+    """Return the standard deviation (m) of the last solved position in its worst direction."""
     last = smoother.last_step
     if last is None:
         return np.nan
-    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())
+    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose has the last columns
     return worst_sigma(half.T @ half)
 
 
@@ -253,15 +248,11 @@ class Search:
         return self._missed >= CONFIRMATIONS
 
     def _best(self) -> RefinedMotion | None:
-        """Return the motion onto the place that is clearly better than all others, if there is one.
-
-        The loop is laid out each time: the map goes on to relax from the detections that were taken out of
-        use.
-        """
+        """Return the motion onto the place that is clearly better than all others, if there is one."""
         seen = self._sightings()
         if len(seen.rows) < MIN_DETECTIONS:
             return None
-        self._smoother.refresh()
+        self._smoother.refresh()  # the map goes on to relax from the detections that were taken out of use
         state = self._smoother.map.state
         self.loop = lay_out_loop(state)
         centre = self._poses[-1][:2]

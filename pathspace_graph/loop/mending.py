@@ -30,8 +30,7 @@ from pathspace_graph.spline.bspline import BSpline
 
 from .finding import KnownLoop, Loop
 
-MENDED: Final = "the map was mended"
-"""Beginning of the notice of a cycle in which mended curves take the place of the old ones."""
+MENDED: Final = "the map was mended"  # beginning of the notice of the cycle in which it was
 SIGHTINGS: Final = 6  # detections of a cone that contradicts the map; clutter has one, a cone passed twenty
 MEMORY: Final = 30.0  # time after its last detection at which a contradiction is forgotten (s)
 CONES: Final = 3  # least number of contradictions in a row that is mended
@@ -81,10 +80,9 @@ class Contradictions:
             tracks.clear()
 
     def stretches(self, loop: Loop, t: float) -> list[Stretch]:
-        """Return the stretches whose cones contradict the curves of the loop, or stand in a gap.
+        """Return the stretches whose cones contradict the curves of the loop, or stand in a gap, at t (s).
 
-        There are none until the vehicle has passed all of them at t (s), and has not seen their cones for a
-        while. It does not pass a very long one as a whole.
+        There are none until the vehicle has passed all of them, or `MOST` cones of a very long one.
         """
         found = list[Stretch]()
         for label, tracks in self._tracks.items():
@@ -213,10 +211,9 @@ def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Ar
 
 
 def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
-    """Return the positions (n, 2) on the newest lap of poses (P, 3), the first one again at the end.
+    """Return the positions (n, 2) and stations (n,) on the newest lap, the first position again at the end.
 
-    It begins at the place nearest to the newest pose about a lap of this length (m) before. The stations (n,)
-    of the positions along it are returned, too.
+    It begins at the one of the poses (P, 3) nearest to the newest, about a lap of this length (m) before.
     """
     first = lap_begin(poses, length)
     lap = np.concatenate([poses[first:, :2], poses[first : first + 1, :2]])
