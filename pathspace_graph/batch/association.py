@@ -53,14 +53,13 @@ def locate_poses(state: State, settings: AssociationSettings) -> None:
     over.
     """
     poses = state.poses
-    heading = headings(poses)
     for label, boundary in state.boundaries.items():
         count = int(np.ceil(boundary.length / settings.step))
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
         position, tangent = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
         tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
         square = (poses[:, :1] - position[:, 0]) ** 2 + (poses[:, 1:2] - position[:, 1]) ** 2
-        square[heading @ tangent.T < SAME_DIRECTION] += settings.direction_penalty**2
+        square[headings(poses) @ tangent.T < SAME_DIRECTION] += settings.direction_penalty**2
         if boundary.periodic:
             state.pose_u[label] = np.unwrap(u[square.argmin(axis=1)], period=boundary.length)
         else:
@@ -103,11 +102,10 @@ def associate(
 ) -> None:
     """Associate every detection anew: it is used where it lies within `gate` sigmas of its curve.
 
-    A detection is searched for on the stretch of the curve that its pose sees. `strict` means that the curves
-    are about where they belong: one that fits nowhere there is then searched for on the whole of a closed
-    curve, since the sensor sees across the infield, but not of an open one, which may have drifted against
-    itself by more than the gate. One of unknown colour goes to the curve that it fits better, and only then,
-    since cones of no boundary stand beside the track.
+    It is searched for on the stretch of the curve that its pose sees. Only if the curves are about where they
+    belong (`strict`), one that fits nowhere there is searched for on the whole of a closed curve, since the
+    sensor sees across the infield, and one of unknown colour goes to the curve that it fits better. An open
+    curve may have drifted against itself by more than the gate.
     """
     boundary_of, u = np.full(len(detections), UNKNOWN), detections.u.copy()
     for whole in (False, True) if strict else (False,):
@@ -120,8 +118,8 @@ def associate(
             rows = np.flatnonzero(unexplained & possible)
             misfit, foot_u = _misfit(state, detections, settings, label, rows, whole)
             nearer = misfit < best[rows]
-            chosen = rows[nearer]
-            best[chosen], boundary_of[chosen], u[chosen] = misfit[nearer], label, foot_u[nearer]
+            rows = rows[nearer]
+            best[rows], boundary_of[rows], u[rows] = misfit[nearer], label, foot_u[nearer]
     detections.release(np.arange(len(detections)))
     used = np.flatnonzero(boundary_of != UNKNOWN)
     detections.take(used, boundary_of[used], u[used])
@@ -139,13 +137,14 @@ def _misfit(
 
     The distance is infinite where the detection can't belong to the curve. `whole` searches the whole curve.
     """
-    boundary, poses = state.boundaries[label], state.variables.poses_at(detections.cycle[rows])
+    boundary, control_points = state.boundaries[label], state.control_points(label)
+    poses = state.variables.poses_at(detections.cycle[rows])
     points = to_map(detections.point[rows], poses)
     if whole:
-        foot = boundary.find_anywhere(state.control_points(label), points)
+        foot = boundary.find_anywhere(control_points, points)
     else:
         begin = _nearest_in_view(state, detections.cycle[rows], points, label, settings)
-        foot = boundary.refine(state.control_points(label), points, begin)
+        foot = boundary.refine(control_points, points, begin)
     projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
@@ -158,9 +157,8 @@ def _nearest_in_view(
     boundary, gate, step = state.boundaries[label], settings.gate, settings.batch.association.step
     ahead = np.arange(-gate.view_behind, gate.view_ahead + step, step)
     u = state.pose_u[label][:, None] + ahead
-    seen = boundary.evaluate(state.control_points(label), u.ravel()).reshape(*u.shape, 2)
-    square = (seen[cycles, :, 0] - points[:, :1]) ** 2
-    square += (seen[cycles, :, 1] - points[:, 1:]) ** 2
+    seen = boundary.evaluate(state.control_points(label), u.ravel()).reshape(*u.shape, 2)[cycles]
+    square = (seen[:, :, 0] - points[:, :1]) ** 2 + (seen[:, :, 1] - points[:, 1:]) ** 2
     return np.asarray(u[cycles, square.argmin(axis=1)])
 
 
@@ -181,9 +179,9 @@ class Cones:
 
     def merged(self, other: "Cones") -> "Cones":
         """Return the cones of both, ordered by parameter."""
-        pairs = zip((self.points, self.u, self.count), (other.points, other.u, other.count), strict=True)
-        both = Cones(*(np.concatenate(pair) for pair in pairs))
-        return both.where(np.argsort(both.u, kind="stable"))
+        u = np.append(self.u, other.u)
+        both = Cones(np.concatenate([self.points, other.points]), u, np.append(self.count, other.count))
+        return both.where(np.argsort(u, kind="stable"))
 
 
 def cones_of_curve(state: State, detections: DetectionTable, label: int, settings: MapperSettings) -> Cones:
@@ -197,14 +195,13 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
     if (sigma < SHARP).sum() >= SHARP_SHARE * len(rows):  # far detections are smeared
         rows = rows[sigma < SHARP]
-    points = to_map(detections.point[rows], state.variables.poses_at(detections.cycle[rows]))
+    cycles, covariances = detections.cycle[rows], covariances_map(detections, rows, state.poses)
+    points = to_map(detections.point[rows], state.variables.poses_at(cycles))
     used = detections.used[rows] & (detections.boundary[rows] == label)
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
-    beside[~used], on_curve[~used], u[~used] = _beside(
-        state, points[~used], detections.cycle[rows[~used]], label, settings
-    )
+    others = points[~used], cycles[~used]
+    beside[~used], on_curve[~used], u[~used] = _beside(state, *others, label, settings)
     u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
-    covariances = covariances_map(detections, rows, state.poses)
 
     def clustered(chosen: BoolArray) -> Cones:
         along = points[chosen], u[chosen], covariances[chosen]
@@ -214,8 +211,8 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     if len(cones.u) == 0:
         return cones
     near = nearest_within(points, cones.points, settings.growth.merge_radius)[1]
-    others = clustered(beside & ~on_curve & ~near)
-    cones = cones.merged(others.where(others.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
+    off_curve = clustered(beside & ~on_curve & ~near)
+    cones = cones.merged(off_curve.where(off_curve.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
         pose_u = state.pose_u[label]
         cones = along_drive(cones, state.poses[pose_u > pose_u[-1] - boundary.length], label)  # the last lap
@@ -223,7 +220,6 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
 
 
 def cone_counts(state: State, detections: DetectionTable, settings: MapperSettings) -> list[int]:
-    """Return the number of cones of each boundary."""
     return [len(cones_of_curve(state, detections, label, settings).u) for label in state.boundaries]
 
 
@@ -311,7 +307,7 @@ def cluster(
     inverse = np.linalg.inv(covariances[inside])
     np.add.at(information, member, inverse)
     np.add.at(vector, member, np.einsum("mij,mj->mi", inverse, points[inside]))
-    means = np.asarray(np.linalg.solve(information[enough], vector[enough][:, :, None]), np.float64)[:, :, 0]
+    means = np.asarray(np.linalg.solve(information[enough], vector[enough][:, :, None]))[:, :, 0]
     return without_folds(Cones(means, peaks[enough], count[enough]), periodic)
 
 
@@ -319,7 +315,7 @@ def _peaks(u: Array, weight: Array, length: float, periodic: bool, apart: float)
     """Return the parameters (k,) of the smoothed density's maxima, which are `apart` (m) at least."""
     bins = max(int(np.ceil(length / DENSITY_STEP)), 1)
     step = length / bins
-    density = np.bincount(np.minimum((u / step).astype(np.intp), bins - 1).clip(0), weight, bins)
+    density = np.bincount((u / step).astype(np.intp).clip(0, bins - 1), weight, bins)
     reach = round(apart / step)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * step / (BANDWIDTH * apart)) ** 2)
     padded = np.pad(density, reach, "wrap" if periodic else "constant")

@@ -1,13 +1,12 @@
 """The batch of the open lap: what an online mapper goes on from after its loop has closed.
 
-Where no registration closes the loop, though the drive's own recurrence says that a lap is over, the batch
-begins at odometry and closes it. Its result is believed by what the detections of the second lap say, never
-by patience.
-
 Online, every measurement of the first lap is linearized while the map is still open, and the curves are
 sparse. Both turn the map by several tenths of a degree. Here the same measurements are solved again as a
 batch, on curves that meet the cones. The result is a marginal: what the poses that have left the window know
 about the simplified map, the calibration and the oldest pose of the window.
+
+Where no registration closes the loop, though the drive's own recurrence says that a lap is over, the batch
+begins at odometry. Its result is believed by what the detections of the second lap say.
 """
 
 import time
@@ -37,7 +36,7 @@ from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive
 from .optimizer import LOOSE_GATE, Convergence, Effort, Optimizer
-from .simplification import associate_again, boundary_of, own_settings, scatter_of_cones, simplified
+from .simplification import boundary_of, own_settings, scatter_of_cones, simplified
 from .start import Recurrence, start_odometry
 from .system import BatchSystem, Biweight, Evaluation, curve_gauge
 
@@ -49,12 +48,8 @@ SIGMA: Final = 0.3
 """Largest standard deviation by which later laps' detections hold their drive beside the curves (m)."""
 WIDER: Final = 2.5  # most ratio of a boundary point's distance from the drive to the drive's beside it
 MOSTLY: Final = 95.0  # percentile of the poses' distances: the drive may begin or end off the track
-FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)
-"""A lap that begins at the online map, so that its batch is in time."""
-FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)  # a lap that begins at odometry
-
-
-# --- the lap ---------------------------------------------------------------------------------------------
+FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)  # so that it is in time
+FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +106,6 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
             return None
         few, change = simplified(at.state, detections, settings)
         information, mean = marginal_of(system, at, few, change, lap.first_kept)
-        associate_again(few, detections, settings)
         scatter = scatter_of_cones(few, detections, settings)
         return LapMarginal(
             convergence=convergence,
@@ -152,30 +146,28 @@ def marginal_of(
     others. `change` F maps the dense control points to the few. So the covariance is `T Sigma T'` with
     `T = diag(I, F, I)`, where Sigma is the inverse of the dense marginal's information.
     """
-    state = at.state
-    calibrations = state.variables.calibrations
+    state, variables = at.state, at.state.variables
     oldest = pose_keys(np.array([first_kept]))
-    kept = np.concatenate([state.variables.calibration_keys, state.map_keys, oldest])
-    graph = linear_graph(rows_before(system, at, first_kept), state.variables)
-    information, vector = eliminated_system(graph, Layout(kept))
+    kept = Layout(np.concatenate([variables.calibration_keys, state.map_keys, oldest]))
+    graph = linear_graph(rows_before(system, at, first_kept), variables)
+    information, vector = eliminated_system(graph, kept)
     covariance = np.linalg.inv(information)
-    shift = covariance @ vector
-    T = block_diag(np.eye(len(calibrations)), change, np.eye(POSE))
+    T = block_diag(np.eye(len(variables.calibrations)), change, np.eye(POSE))
+    here = np.concatenate([variables.calibrations, few.map_points.ravel(), state.poses[first_kept]])
+    mean = here + T @ (covariance @ vector)
     covariance = T @ covariance @ T.T
-    here = np.concatenate([calibrations, few.map_points.ravel(), state.poses[first_kept]])
-    return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), here + T @ shift
+    return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), mean
 
 
 def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:
     """Return the rows of the batch that hold a pose before `first_kept` or no pose at all."""
-    state, sigma = at.state, system.settings.batch.sigma_slide
+    state, sigma, before = at.state, system.settings.batch.sigma_slide, []
     gauges = {label: curve_gauge(state, label, sigma, first_kept) for label in state.boundaries}
-    groups = system.rows(at, gauges)
-    before = []
-    for rows in (rows for rows in groups if len(rows)):
-        poses = are_poses(rows.keys)
-        first = np.where(poses, indices(rows.keys), np.iinfo(np.intp).max).min(axis=1)
-        before.append(rows.where((first < first_kept) | ~poses.any(axis=1)))
+    for rows in system.rows(at, gauges):
+        if len(rows):
+            poses = are_poses(rows.keys)
+            kept = (poses & (indices(rows.keys) < first_kept)).any(axis=1) | ~poses.any(axis=1)
+            before.append(rows.where(np.flatnonzero(kept)))
     return before
 
 
@@ -206,27 +198,26 @@ class Evidence:
 
 def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSettings) -> Evidence:
     """Return the evidence for or against an optimum whose curves are closed."""
-    state = at.state
-    coloured = np.isin(detections.label, list(state.boundaries))
+    state, boundaries = at.state, at.state.boundaries
+    coloured = np.isin(detections.label, list(boundaries))
     second = np.ones(len(state.poses), bool)  # beside a stretch of every boundary that was driven before
-    for label, boundary in state.boundaries.items():
-        second &= state.pose_u[label] - state.pose_u[label][0] >= boundary.length
+    gaps, overlaps = [], []
+    for label, boundary in boundaries.items():
+        driven, length = state.pose_u[label] - state.pose_u[label][0], boundary.length
+        second &= driven >= length
+        overlaps.append(float(np.clip(driven[-1] - length, 0.0, length)))
+        gaps.append(_longest_gap(at.projected[label].foot.u, length))
     again = second[detections.cycle] & coloured
-    chosen = {label: again[projected.rows] for label, projected in at.projected.items()}
-    feet = [p.foot.where(chosen[label]) for label, p in at.projected.items()]
-    whitened = [p.whitened[chosen[label]] for label, p in at.projected.items()]
-    lengths = {label: boundary.length for label, boundary in state.boundaries.items()}
-    driven = {label: u[-1] - u[0] for label, u in state.pose_u.items()}
-    overlaps = [float(np.clip(driven[b] - length, 0.0, length)) for b, length in lengths.items()]
-    gaps = [_longest_gap(p.foot.u, lengths[label]) for label, p in at.projected.items()]
+    parts = [(p, again[p.rows]) for p in at.projected.values()]
+    whitened = np.concatenate([np.zeros(0), *(p.whitened[chosen] for p, chosen in parts)])
     return Evidence(
-        closed=set(lengths) == set(BOUNDARIES) and all(b.periodic for b in state.boundaries.values()),
+        closed=set(boundaries) == set(BOUNDARIES) and all(b.periodic for b in boundaries.values()),
         used=_share(detections.used, coloured & ~again),
         used_again=_share(detections.used, again),
-        misfit=_rms(np.concatenate([np.zeros(0), *whitened])),
+        misfit=float(np.sqrt(np.mean(whitened**2))) if len(whitened) else np.inf,
         gap=max(gaps, default=np.inf),
         overlap=min(overlaps, default=0.0),
-        sigma=_sigma_of_motion(feet, settings.closing.sigma_reading),
+        sigma=_sigma_of_motion([p.foot.where(chosen) for p, chosen in parts], settings.closing.sigma_reading),
     )
 
 
@@ -283,16 +274,10 @@ def _share(used: BoolArray, among: BoolArray) -> float:
     return float(used[among].mean()) if among.any() else 0.0
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else np.inf
-
-
 def _sigma_of_motion(feet: Sequence[FootPoints], sigma_reading: float) -> float:
     """Return the largest standard deviation (m) of a rigid motion that detections hold across curves."""
-    normal, point = (
-        np.concatenate([np.zeros((0, 2)), *(getattr(foot, name) for foot in feet)])
-        for name in ("normal_unit", "position")
-    )
+    normal = np.concatenate([np.zeros((0, 2)), *(foot.normal_unit for foot in feet)])
+    point = np.concatenate([np.zeros((0, 2)), *(foot.position for foot in feet)])
     if len(point) == 0:
         return np.inf
     jacobian = by_motion(normal, point - point.mean(axis=0)) / sigma_reading

@@ -49,7 +49,7 @@ from pathspace_graph.spline.boundary import Boundary
 from .association import path_lengths
 from .lap import evidence, is_true_closure
 from .optimizer import LOOSE_GATE, Convergence, Optimizer
-from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplify
+from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplified
 from .start import CurveMapper, find_recurrence, start_odometry, start_online
 from .system import BatchSystem, Biweight, CurveGauge, Evaluation
 
@@ -70,12 +70,12 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     roots of their robust weights. Each control point is anchored where it is. At an optimum its linearization
     is that of the optimization; its error isn't the robust cost.
     """
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in drive_factors(system, at):
-        graph.add(factor)
+    factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
     for label, gauge in system.gauges.items():
-        for factor in (*_gauge(gauge, at.state.control_points(label)), *_projections(system, at, label)):
-            graph.add(factor)
+        factors += _gauge(gauge, at.state.control_points(label))
+        factors += _projections(system, at, label)
+    for factor in factors:
+        graph.add(factor)
     return graph
 
 
@@ -87,26 +87,22 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
         root = one.root.copy()  # GTSAM's tangents are in the frame of the later pose
         root[:, :2] = root[:, :2] @ rotation(one.local[2])
         noise = gtsam.noiseModel.Gaussian.Information(root.T @ root)
-        between = gtsam.Pose2(*one.local)
-        yield gtsam.BetweenFactorPose2(pose_key(one.earlier), pose_key(one.later), between, noise)
-    yield from _priors(system.chain, at.state.poses[0, 2])
-    sensor_key = at.state.variables.sensor_key
-    if sensor_key is not None:
-        sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array(system.settings.calibration.sigmas))
-        yield gtsam.PriorFactorVector(sensor_key, np.array(system.settings.calibration.means), sigmas)
-
-
-def _priors(chain: LogOdometry, heading: float) -> Iterator[gtsam.NonlinearFactor]:
+        ends = pose_key(one.earlier), pose_key(one.later)
+        yield gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*one.local), noise)
+    chain, calibration, noises = system.chain, system.settings.calibration, gtsam.noiseModel
     map_from_pose = np.eye(POSE)  # GTSAM's tangents of a pose are in its own frame
-    map_from_pose[:2, :2] = rotation(heading)
-    information = map_from_pose.T @ chain.first_information @ map_from_pose
-    noise = gtsam.noiseModel.Gaussian.Information(information)
+    map_from_pose[:2, :2] = rotation(at.state.poses[0, 2])
+    noise = noises.Gaussian.Information(map_from_pose.T @ chain.first_information @ map_from_pose)
     yield gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*chain.first), noise)
-    sigmas = gtsam.noiseModel.Diagonal.Sigmas(chain.calibration_sigma)
+    sigmas = noises.Diagonal.Sigmas(chain.calibration_sigma)
     yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, chain.calibration_mean, sigmas)
     if chain.bias is not None:
-        noise = gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, chain.bias.sigma**-2]))
+        noise = noises.Diagonal.Precisions(np.array([0.0, chain.bias.sigma**-2]))
         yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.array([0.0, chain.bias.value]), noise)
+    sensor_key = at.state.variables.sensor_key
+    if sensor_key is not None:
+        sigmas = noises.Diagonal.Sigmas(np.array(calibration.sigmas))
+        yield gtsam.PriorFactorVector(sensor_key, np.array(calibration.means), sigmas)
 
 
 def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.NonlinearFactor]:
@@ -286,7 +282,8 @@ class BatchMapper:
         joint, vehicle = system.eliminated(at).joint(at.state.map_keys), _vehicle(system, at)
         watch.lap("covariance")
         detections = deepcopy(detections)  # the result's problem keeps its own associations
-        state, joint = simplify(at.state, joint, detections, settings)
+        state, change = simplified(at.state, detections, settings)
+        joint = change @ joint @ change.T
         scatter = scatter_of_cones(state, detections, settings)
         watch.lap("simplify")
         records, laps = _records(state, detections, chain, sum(watch.laps.values()))
@@ -335,10 +332,8 @@ def _vehicle(system: BatchSystem, at: Evaluation) -> VehicleState:
     variables, last = at.state.variables, pose_key(len(at.state.poses) - 1)
     keys = variables.layout.keys
     kept = Layout(keys[~are_poses(keys) | (keys == last)])
-    information, _ = eliminated_system(system.linear_graph(at), kept)
-    covariance = FactoredSystem(kept, cholesky(information)).covariance(
-        np.append(last, variables.calibration_keys)
-    )
+    factored = FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
+    covariance = factored.covariance(np.append(last, variables.calibration_keys))
     return VehicleState.split(at.state.poses[-1], variables.calibrations, covariance)
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.graph.elimination import Damping, Elimination
 from pathspace_graph.graph.gaussian import graph_of
 from pathspace_graph.graph.rows import Rows
@@ -27,27 +26,21 @@ SETTLE: Final = 8  # most refinements of the foot points before a step
 POSE_STEPS: Final = 3  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
 ROUGH_TOLERANCE: Final = 8.0  # factor of the tolerances in the first optimization
 TOLERANCE_COST: Final = 1e-5  # most |cost_before - cost_after| over a round at convergence, over the cost
-TOLERANCE_CURVE: Final = 2e-3
-"""Largest move of a point of a curve across it in a round then, as seen from its poses (m)."""
+TOLERANCE_CURVE: Final = 2e-3  # largest move of a curve across itself in a round then, as seen from poses (m)
 TOLERANCE_DECREASE: Final = 5e-3  # most decrease of the cost by an undamped step then; one sigma has 1/2
 CURVE_SAMPLES: Final = 2  # points in each knot interval at which the movement of a curve is measured
-SHARES: Final = (0.3, 0.97)
-"""Sizes of a step's share of the one before between which it becomes the sum of all that would follow."""
+SHARES: Final = (0.3, 0.97)  # of a step in the one before, between which it is extrapolated
 
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
     """End of an optimization."""
 
-    converged: bool
-    """Whether nothing changed any more."""
+    converged: bool  # whether nothing changed any more
     reason: str
-    rounds: int
-    """Times that foot points, gates and weights were refreshed."""
-    steps: int
-    """Levenberg-Marquardt steps, including rejected ones."""
-    cost: float
-    """Half the sum of squares with robust losses at the end."""
+    rounds: int  # times that foot points, gates and weights were refreshed
+    steps: int  # Levenberg-Marquardt steps, including rejected ones
+    cost: float  # half the sum of squares with robust losses at the end
     gradient: float
     """Norm `sqrt(g' H^-1 g)` of the gradient g at the end, with H the information of all variables: the
     distance of the linear problem's optimum in joint sigmas. A slow common motion of the whole map counts as
@@ -68,24 +61,16 @@ class Optimizer:
     """Levenberg-Marquardt from a state to the minimum; `on_round` is called after each round."""
 
     def __init__(
-        self,
-        system: BatchSystem,
-        effort: Effort | None = None,
-        on_round: Callable[[], None] | None = None,
-        damping: Damping | None = None,
+        self, system: BatchSystem, effort: Effort | None = None, on_round: Callable[[], None] | None = None
     ) -> None:
-        self.system = system
-        self.settings = system.settings.batch
-        self.effort = effort or Effort()
+        self.system, self.settings = system, system.settings.batch
+        self.effort, self.damping, self._on_round = effort or Effort(), Damping(), on_round
         self.steps = 0  # steps that were tried
-        self._on_round = on_round
-        self._damping = damping or Damping()
         self._last_step: Array | None = None  # of the map and the calibration
 
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
         """Return the optimum on curves with about one knot for each cone, which meet the cones."""
-        system, effort = self.system, self.effort
-        detections, settings = system.detections, system.settings
+        detections, settings, effort = self.system.detections, self.system.settings, self.effort
         state = self.align_poses(state, POSE_STEPS, LOOSE_GATE)
         state = reknot(state, detections, settings, dense=True)
         at, _ = self.run(state, LOOSE_GATE, effort.rough_rounds, ROUGH_TOLERANCE)
@@ -116,12 +101,10 @@ class Optimizer:
         system = self.system
         locate_poses(state, self.settings.association)
         system.begin(state)
-        self._last_step = None
-        at: Evaluation | None = None
-        cost, searched = np.inf, 0
-        search = max(min(SEARCH, rounds // 2), 1)
-        for number in range(1, rounds + 1):
-            gate = max(gate, self.settings.gate)
+        self._last_step, tolerance = None, tolerance * self.effort.tolerance
+        cost, done, searched, search = np.inf, 0, 0, max(min(SEARCH, rounds // 2), 1)
+        while done < rounds:
+            done, gate = done + 1, max(gate, self.settings.gate)
             strict = gate <= self.settings.gate
             system.kernel = Biweight(gate)
             held, searched = searched >= search, searched + strict
@@ -130,31 +113,34 @@ class Optimizer:
             state, gain, cost = at.state, abs(cost - at.cost), at.cost
             if self._on_round is not None:
                 self._on_round()
-            if strict and self._is_still(before, at, gain, tolerance):
+            still = strict and gain <= tolerance * TOLERANCE_COST * cost
+            if still and self._movement(before.state, state) <= tolerance * TOLERANCE_CURVE:
                 at = self._refreshed(state, gate, strict, held)
                 decrease = self.predicted_decrease(at)
-                if decrease <= tolerance * (self.effort.tolerance * TOLERANCE_DECREASE):
-                    return at, self._report(at, number, decrease, True)
+                if decrease <= tolerance * TOLERANCE_DECREASE:
+                    converged, reason = True, "nothing changes any more"
+                    break
             gate *= GATE_FACTOR
-        assert at is not None
-        return at, self._report(at, rounds, self.predicted_decrease(at), False)
+        else:
+            converged, reason, decrease = False, "no round left", self.predicted_decrease(at)
+        norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
+        return at, Convergence(converged, reason, done, self.steps, at.cost, norm)
 
     def _refreshed(self, state: State, gate: float, strict: bool, held: bool = False) -> Evaluation:
-        """Return the problem of a new round, with the associations and sigmas of the last one if `held`."""
+        """Return the problem of a new round, with the associations and sigmas of the last one if `held`.
+
+        Its foot points have arrived: else the cost would change without a step.
+        """
         system = self.system
         if not strict:
             locate_poses(state, self.settings.association)
         system.detections.correct(state.variables.sensor)
         if not held:
             associate(state, system.detections, system.settings, gate, strict)
-        return self._settled(state, held)
-
-    def _settled(self, state: State, held: bool) -> Evaluation:
-        """Return the problem with foot points that have arrived: else the cost changes without a step."""
-        at = self.system.evaluate(state, hold=not held)
+        at = system.evaluate(state, hold=not held)
         for _ in range(SETTLE):
             self._keep_foot_points(at)
-            before, at = at, self.system.evaluate(state, hold=not held)
+            before, at = at, system.evaluate(state, hold=not held)
             if abs(before.cost - at.cost) <= self.effort.tolerance * TOLERANCE_COST * at.cost:
                 break
         return at
@@ -164,22 +150,14 @@ class Optimizer:
         for projected in at.projected.values():
             self.system.detections.refine(projected.rows, projected.foot.u)
 
-    def _is_still(self, before: Evaluation, after: Evaluation, gain: float, tolerance: float) -> bool:
-        """Return whether a round has changed neither the curves, as their poses see them, nor the cost."""
-        curve, cost = (self.effort.tolerance * t for t in (TOLERANCE_CURVE, TOLERANCE_COST))
-        still = self._movement(before.state, after.state) <= tolerance * curve
-        return still and gain <= tolerance * cost * after.cost
-
     def _movement(self, before: State, after: State) -> float:
         """Return how far a curve has moved across itself (m), as the poses beside it see it."""
         farthest = 0.0
         for label, gauge in self.system.gauges.items():
             boundary, points = before.boundaries[label], before.control_points(label)
             offset = gauge.carried(points, before.poses, after.poses) - after.control_points(label)
-            count = max(CURVE_SAMPLES * boundary.size, 2)
-            u = np.linspace(boundary.tables.low, boundary.tables.high, count)
-            normal = left_of(boundary.evaluate(after.control_points(label), u, 1))
-            normal /= np.maximum(np.hypot(*normal.T), np.finfo(float).tiny)[:, None]
+            u = np.linspace(boundary.tables.low, boundary.tables.high, CURVE_SAMPLES * boundary.size)
+            normal = after.spline(label).normal_unit(u)
             across = (boundary.evaluate(offset, u) * normal).sum(axis=1)
             farthest = max(farthest, float(np.abs(across).max()))
         return farthest
@@ -193,45 +171,39 @@ class Optimizer:
         step = problem.step(np.zeros(problem.map.size))
         return -0.5 * float(gradient(self.system.rows(at), layout) @ step)
 
-    def _report(self, at: Evaluation, rounds: int, decrease: float, converged: bool) -> Convergence:
-        norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
-        reason = "nothing changes any more" if converged else "no round left"
-        return Convergence(converged, reason, rounds, self.steps, at.cost, norm)
-
     def _step(self, at: Evaluation) -> Evaluation:
         """Return the problem after the least damped step that makes the cost smaller, or the same one."""
-        damping = self._damping
         self._keep_foot_points(at)
         graph = self.system.linear_graph(at)
-        while not damping.exhausted:
+        while not self.damping.exhausted:
             self.steps += 1
-            trial = self._trial(at, graph, damping.weight)
+            trial = self._trial(at, graph)
             if trial is not None:
-                damping.lower()
+                self.damping.lower()
                 self._keep_foot_points(trial)
                 return trial
-            damping.grow()
-        damping.reset()
+            self.damping.grow()
+        self.damping.reset()
         return at
 
-    def _trial(self, at: Evaluation, graph: gtsam.GaussianFactorGraph, damping: float) -> Evaluation | None:
-        """Return the problem after a damped step (1/m^2), or None if the cost has grown."""
-        state = at.state
-        damped = graph_of(graph, self.system.damping(state, damping))
+    def _trial(self, at: Evaluation, graph: gtsam.GaussianFactorGraph) -> Evaluation | None:
+        """Return the problem after a damped step, or None if the cost has grown."""
+        state, system = at.state, self.system
+        damped = graph_of(graph, system.damping(state, self.damping.weight))
         try:
             problem = Elimination(damped, state.variables.layout)
             step = problem.step(np.zeros(problem.map.size))
         except SingularSystemError:
             return None
-        trial = self.system.evaluate(self.system.retract(state, step))
+        trial = system.evaluate(system.retract(state, step))
         if trial.cost > at.cost:
             return None
         before, self._last_step = self._last_step, step[: problem.map.size]
         factor = 1.0 if before is None else extrapolation_factor(self._last_step, before)
-        if factor != 1.0:
-            other = self.system.evaluate(self.system.retract(state, factor * step))
-            trial = min(trial, other, key=lambda evaluation: evaluation.cost)
-        return trial
+        if factor == 1.0:
+            return trial
+        other = system.evaluate(system.retract(state, factor * step))
+        return min(trial, other, key=lambda evaluation: evaluation.cost)
 
 
 def extrapolation_factor(step: Array, before: Array) -> float:

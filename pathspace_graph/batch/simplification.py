@@ -21,13 +21,9 @@ from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 from .association import MIN_CONES, associate, cones_of_curve, first_parameter, locate_poses
 
 MIN_SIZE_SHARE: Final = 0.6  # least share of the largest number of control points that is tried
-ALIKE: Final = (3.0, 0.01)
-"""Parameters of two curves through the same cones differ by less than `a + b L` (m), with L their length."""
+ALIKE: Final = (3.0, 0.01)  # parameters on curves of length L through the same cones differ by < a + b L (m)
 FOLDS: Final = 4  # groups of the cross-validation, dealt in turn, so that the neighbours of a cone are there
 FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched (m along the curve)
-
-
-# --- knots -----------------------------------------------------------------------------------------------
 
 
 def reknot(state: State, detections: DetectionTable, settings: MapperSettings, dense: bool = False) -> State:
@@ -40,12 +36,12 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
         points = cones_of_curve(state, detections, label, settings).points
         if len(points) < MIN_CONES:
             continue
+        share, least_share = settings.batch.size_share, MIN_SIZE_SHARE
         if dense:
-            beyond = 0.0 if boundary.periodic else settings.growth.merge_radius
-            points, share_of = extended(points, beyond), (settings.batch.dense_share, 1.0)
-        else:
-            share_of = settings.batch.size_share, MIN_SIZE_SHARE
-        spline = fit_through(points, boundary.periodic, settings, *share_of)
+            share, least_share = settings.batch.dense_share, 1.0
+            if not boundary.periodic:
+                points = extended(points, settings.growth.merge_radius)
+        spline = fit_through(points, boundary.periodic, settings, share, least_share)
         state.replace_boundary(label, *boundary_of(spline, settings))
     return state
 
@@ -58,11 +54,10 @@ def fit_through(
     It has at least `least_share` of these. A closed one begins at the cone nearest to the start, so that
     similar cones give similar knots.
     """
-    smallest = settings.spline.min_size
+    smallest, degree = settings.spline.min_size, settings.spline.degree
     most = max(smallest, int(share * len(points)))
     if periodic:
         points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
-    degree = settings.spline.degree
     chosen = chosen_breaks(points, periodic, degree, max(smallest, int(least_share * most)), most)
     return fit_spline(points, chosen.size, periodic, degree, chosen.breaks)
 
@@ -70,11 +65,8 @@ def fit_through(
 def extended(points: Array, beyond: float) -> Array:
     """Return cones (k, 2) with a point before the first and one after the last, `beyond` (m) straight on.
 
-    Half of the detections of the last one lie beyond it, and any motion of an end there would put some of
-    them into use and others out of it.
+    Half of the last one's detections lie beyond it: a motion of an end there would put some out of use.
     """
-    if beyond == 0.0:
-        return points
     ends, inner = points[[0, -1]], points[[1, -2]]
     ahead = (ends - inner) / np.maximum(np.hypot(*(ends - inner).T), np.finfo(float).tiny)[:, None]
     first, last = ends + beyond * ahead
@@ -107,34 +99,21 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
 # --- simplification --------------------------------------------------------------------------------------
 
 
-def simplify(
-    state: State, covariance: Array, detections: DetectionTable, settings: MapperSettings
-) -> tuple[State, Array]:
-    """Return the same poses beside curves on few knots, and the covariance (n, n) of their control points.
+def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> tuple[State, Array]:
+    """Return the same poses beside curves on few knots, and the change F (k, n) of the control points.
 
     The paper's Simplification: `C_new = F C_old`, so the covariance is `F Sigma F'`. The optimum isn't solved
     for on few knots: such a curve passes its cones by a decimetre, on the same side in every lap, which turns
-    vehicle and map by up to a degree in the first seconds.
+    vehicle and map by up to a degree in the first seconds. The detections are associated with the new curves.
     """
-    few, change = simplified(state, detections, settings)
-    associate_again(few, detections, settings)
-    return few, change @ covariance @ change.T
-
-
-def associate_again(few: State, detections: DetectionTable, settings: MapperSettings) -> None:
-    """Place the poses beside simplified curves, and associate the detections with these."""
-    locate_poses(few, settings.batch.association)
-    associate(few, detections, settings, settings.batch.gate, strict=True)
-
-
-def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> tuple[State, Array]:
-    """Return the same poses beside curves on few knots, and the change F (k, n) of the control points."""
     few = reknot(state, detections, settings)
     change = np.zeros((few.map_points.size, state.map_points.size))
     for label, boundary in state.boundaries.items():
         new, new_points = few.boundaries[label], few.control_points(label)
         F = new_from_old(boundary, state.control_points(label), new, new_points)
         change[map_block(few, label), map_block(state, label)] = np.kron(F, np.eye(POINT))
+    locate_poses(few, settings.batch.association)
+    associate(few, detections, settings, settings.batch.gate, strict=True)
     return few, change
 
 
@@ -201,8 +180,7 @@ class Scatter:
 
 def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperSettings) -> Scatter:
     """Return the scatter of the detected cones about the curves of the state."""
-    seen, unseen = [np.zeros(0)], [np.zeros(0)]
-    places, lengths = {}, {}
+    seen, unseen, places, lengths = [], [], {}, {}
     for label, boundary in state.boundaries.items():
         cones = cones_of_curve(state, detections, label, settings)
         u, share = first_parameter(state, label) + cones.u, boundary.size / max(len(cones.u), 1)
@@ -211,7 +189,7 @@ def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperS
         unseen.append(cross_validated(cones.points, boundary.periodic, settings, share))
         places[label] = foot.u
         lengths[label] = boundary.length if boundary.periodic else np.inf
-    return Scatter(_rms(np.concatenate(seen)), _rms(np.concatenate(unseen)), places, lengths)
+    return Scatter(_rms(seen), _rms(unseen), places, lengths)
 
 
 def cross_validated(points: Array, periodic: bool, settings: MapperSettings, share: float) -> Array:
@@ -231,5 +209,6 @@ def cross_validated(points: Array, periodic: bool, settings: MapperSettings, sha
     return np.concatenate(distances)
 
 
-def _rms(values: Array) -> float:
+def _rms(parts: list[Array]) -> float:
+    values = np.concatenate([np.zeros(0), *parts])
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

@@ -38,13 +38,9 @@ ComplexArray = NDArray[np.complex128]
 
 PROFILE_STEP: Final = 0.5  # step at which the path driven is sampled (m)
 SMOOTHING: Final = 3.0  # length over which the curvature is averaged (m)
-CORRELATION_SHARE: Final = 0.8
-"""Least correlation of a lap's lag as a share of the largest one; a lap is about the shortest such lag."""
-RECURS: Final = 0.7
-"""Least correlation of the curvature with itself a lap later. On a track of two loops of which one is wider,
-it is 0.56 at most after one of them."""
-MIN_OVERLAP: Final = 20.0
-"""Least length of the path after a lap (m): over less, straights agree with straights."""
+CORRELATION_SHARE: Final = 0.8  # least correlation of a lap's lag over the largest; it is the shortest such
+RECURS: Final = 0.7  # least correlation a lap later; 0.56 at most after one of two loops, if one is wider
+MIN_OVERLAP: Final = 20.0  # least length of the path after a lap (m): over less, straights agree
 REFERENCE_STEP: Final = 8.0  # distance of the reference poses that every lap passes (m)
 LAP_SIGMAS: Final = np.array([1.5, 1.5, 0.15])  # of a lap's pose about a reference pose (m, m, rad)
 ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the laps together
@@ -52,11 +48,8 @@ ALIGN_TOLERANCE: Final = 1e-6  # largest move of a step at which they are togeth
 MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
 
 
-# --- from an online run ----------------------------------------------------------------------------------
-
-
 class CurveMapper(OnlineEstimator, Protocol):
-    """An online estimator with curves, such as `FixedLagMapper`, with whose map the batch can begin."""
+    """An online estimator with curves, with whose map the batch can begin."""
 
     @property
     def boundaries(self) -> dict[int, Boundary]: ...
@@ -70,9 +63,7 @@ class CurveMapper(OnlineEstimator, Protocol):
 
 def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
     """Return the final map of an online run with all of its poses, and the run."""
-    run = run_online(log, mapper)
-    settings: MapperSettings = mapper.settings
-    state = State()
+    run, state = run_online(log, mapper), State()
     for label, known in mapper.boundaries.items():
         boundary = Boundary(known.knots, known.periodic, exact_settings(known.settings), known.gauge)
         boundary.confirmed_end = known.confirmed_end
@@ -81,7 +72,7 @@ def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
     poses = unwrap(np.concatenate([corrected, run.trajectory[len(corrected) :]]))
     vehicle = mapper.vehicle_state()
     calibration = np.concatenate([vehicle.calibration, vehicle.sensor])
-    add_drive(state, poses, calibration, settings.batch.association)
+    add_drive(state, poses, calibration, mapper.settings.batch.association)
     return state, run
 
 
@@ -98,18 +89,17 @@ class Recurrence:
     """Length of the path driven, and after which length it recurs."""
 
     driven: Array  # path lengths (P,) from the first pose to each pose (m)
-    lap: float  # path length of a lap (m), infinite where the path doesn't recur
-    turn: float  # change of the heading in a lap, by the odometry (rad)
-    correlation: float  # how well the curvature agrees with itself a lap later, 1 where it is the same
+    lap: float = np.inf  # path length of a lap (m), infinite where the path doesn't recur
+    turn: float = 0.0  # change of the heading in a lap, by the odometry (rad)
+    correlation: float = 0.0  # how well the curvature agrees with itself a lap later, 1 where it is the same
 
     @property
     def recurs(self) -> bool:
-        """Return whether a lap was found."""
         return bool(np.isfinite(self.lap))
 
     def denied(self) -> "Recurrence":
         """Return the same path without a lap."""
-        return Recurrence(self.driven, np.inf, 0.0, 0.0)
+        return Recurrence(self.driven)
 
     @property
     def whole_turn(self) -> float:
@@ -130,7 +120,7 @@ def find_recurrence(poses: Array, settings: MapperSettings) -> Recurrence:
     lags = np.arange(first, len(s) - last)
     scores = correlations(x + 1j * y, heading, lags, closing) if len(lags) else np.zeros(0)
     if not scores.max(initial=-np.inf) >= RECURS:
-        return Recurrence(driven, np.inf, 0.0, 0.0)
+        return Recurrence(driven)
     best = int(np.argmax(scores >= CORRELATION_SHARE * scores.max()))
     reach = int(closing.radius / PROFILE_STEP)
     while (step := int(np.argmax(scores[best : best + reach]))) > 0:
@@ -144,37 +134,27 @@ def correlations(place: ComplexArray, heading: Array, lags: IntArray, settings: 
     """Return how well the curvature of a path agrees with itself each of the lags (l,) later, in samples.
 
     `1 - mean((a - b)^2) / (mean(a^2) + mean(b^2))`, and -inf where the path isn't back at about the same
-    place and heading, by the limits of a loop closure. The path is sampled at steps of `PROFILE_STEP`: places
-    x + i y (n,) and headings (n,), which aren't wrapped. The sums come from a Fourier transform.
+    place and heading, by the limits of a loop closure. The places x + i y (n,) and headings (n,), which
+    aren't wrapped, are `PROFILE_STEP` apart. The sums come from a Fourier transform.
     """
     half, number = max(int(0.5 * SMOOTHING / PROFILE_STEP), 1), np.arange(len(heading))
     later, before = np.minimum(number + half, len(heading) - 1), np.maximum(number - half, 0)
     curvature = ((heading[later] - heading[before]) / SMOOTHING).astype(complex)
-    square = _mean_square_difference(place - place.mean(), lags)
-    along = _mean_products(np.exp(1j * heading), lags).real
+    squares, products = _means(place - place.mean(), lags)
+    _, along = _means(np.exp(1j * heading), lags)
     radius = settings.radius + settings.drift * lags * PROFILE_STEP
-    power = np.maximum(_mean_squares(curvature, lags), np.finfo(float).tiny)
-    agreement = 1.0 - _mean_square_difference(curvature, lags) / power
-    back = (square < radius**2) & (along > np.cos(HEADING))
+    back = (squares - 2.0 * products < radius**2) & (along > np.cos(HEADING))
+    squares, products = _means(curvature, lags)
+    agreement = 1.0 - (squares - 2.0 * products) / np.maximum(squares, np.finfo(float).tiny)
     return np.where(back, agreement, -np.inf)
 
 
-def _mean_square_difference(values: ComplexArray, lags: IntArray) -> Array:
-    """Return the mean of `|v(i + lag) - v(i)|^2` for each lag (l,)."""
-    return np.asarray(_mean_squares(values, lags) - 2.0 * _mean_products(values, lags).real)
-
-
-def _mean_squares(values: ComplexArray, lags: IntArray) -> Array:
-    """Return the mean of `|v(i)|^2 + |v(i + lag)|^2` for each lag (l,)."""
-    total = np.append(0.0, np.cumsum(np.abs(values) ** 2))
-    count = len(values) - lags
-    return np.asarray((total[count] + total[-1] - total[lags]) / count)
-
-
-def _mean_products(values: ComplexArray, lags: IntArray) -> ComplexArray:
-    """Return the mean of `v(i + lag) conj(v(i))` for each lag (l,)."""
+def _means(values: ComplexArray, lags: IntArray) -> tuple[Array, Array]:
+    """Return the means of `|v(i)|^2 + |v(i + lag)|^2` and of `Re(v(i + lag) v(i)*)` for each lag (l,)."""
+    total, count = np.append(0.0, np.cumsum(np.abs(values) ** 2)), len(values) - lags
     transform = fft(values, next_fast_len(2 * len(values)))
-    return np.asarray(ifft(np.abs(transform) ** 2)[lags] / (len(values) - lags))
+    products = (ifft(np.abs(transform) ** 2)[lags] / count).real
+    return (total[count] + total[-1] - total[lags]) / count, products
 
 
 # --- from odometry ---------------------------------------------------------------------------------------
@@ -187,12 +167,11 @@ def start_odometry(
     recurrence: Recurrence | None = None,
 ) -> State:
     """Return poses by dead reckoning, and curves through the cones that were seen in the first lap."""
-    calibration = np.array(settings.calibrations)
+    calibration, state = np.array(settings.calibrations), State()
     poses = chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
     recurrence = recurrence or find_recurrence(poses, settings)
     if recurrence.recurs:
         poses, calibration[:CALIBRATION_SIZE] = align_laps(chain, recurrence)
-    state = State()
     for label in BOUNDARIES:
         _begin_boundary(state, label, poses, recurrence, detections, settings)
     add_drive(state, poses, calibration, settings.batch.association)
@@ -254,20 +233,19 @@ def _begin_boundary(
     detections: DetectionTable,
     settings: MapperSettings,
 ) -> None:
-    """Add a curve through the cones of a boundary that were seen in the first lap, if there are enough.
+    """Add a curve through the cones of a boundary that were seen beside the first lap, if there are enough.
 
-    They lie beside its path. A detection whose station isn't about that of its cycle belongs to a stretch
-    that is driven later.
+    A detection whose station isn't about that of its cycle belongs to a stretch that is driven later.
     """
     first_lap, gate = recurrence.driven < recurrence.lap, settings.gate
     rows = np.flatnonzero((detections.label == label) & first_lap[detections.cycle])
     if len(rows) == 0 or first_lap.sum() < 2:
         return
-    cycles = detections.cycle[rows]
-    path, stations = poses[first_lap, :2], recurrence.driven[first_lap]
+    cycles, path, stations = detections.cycle[rows], poses[first_lap, :2], recurrence.driven[first_lap]
+    length = float(stations[-1]) + settings.growth.reach
     if recurrence.recurs:
-        path, stations = np.concatenate([path, path[:1]]), np.append(stations, recurrence.lap)
-    length = recurrence.lap if recurrence.recurs else float(stations[-1]) + settings.growth.reach
+        length, path = recurrence.lap, np.concatenate([path, path[:1]])
+        stations = np.append(stations, length)
     points = to_map(detections.point[rows], poses[cycles])
     station, lateral = along_and_across(points, path, stations)
     side, ahead = SIDES[label] * lateral, station - recurrence.driven[cycles]

@@ -66,11 +66,11 @@ class CurveGauge:
         """
         neighbours, theta = self.neighbours, poses[self.middle_cycle, 2]
         c, s = np.cos(theta), np.sin(theta)
-        turned = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
+        back = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
         weights = np.take_along_axis(self.smoothness, neighbours, axis=1) / self.sigma_smoothness
         in_map = (weights[:, :, None] * control_points[neighbours]).sum(axis=1)
-        residual = (turned @ in_map[:, :, None])[:, :, 0]
-        by_control = weights[:, None, :, None] * turned[:, :, None, :]
+        residual = (back @ in_map[:, :, None])[:, :, 0]
+        by_control = weights[:, None, :, None] * back[:, :, None, :]
         by_pose = np.zeros((len(residual), POINT, POSE))
         by_pose[:, 0, 2], by_pose[:, 1, 2] = residual[:, 1], -residual[:, 0]
         return residual, by_control.reshape(len(residual), POINT, -1), by_pose
@@ -110,8 +110,7 @@ class CurveGauge:
     def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
         """Return rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
 
-        They damp how it moves as seen from the pose beside it, in 1/m^2, and not a map that swings with its
-        poses.
+        They damp (1/m^2) how it moves as seen from the pose beside it, not a map that swings with its poses.
         """
         arm = control_points - poses[self.cycle, :2]
         by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
@@ -125,8 +124,7 @@ class CurveGauge:
     def carried(self, control_points: Array, poses: Array, poses_after: Array) -> Array:
         """Return control points (m, 2) moved rigidly with the poses beside them, from and to (P, 3)."""
         before, after = poses[self.cycle], poses_after[self.cycle]
-        turned = np.column_stack([np.zeros((len(before), 2)), after[:, 2] - before[:, 2]])
-        return after[:, :2] + to_map(control_points - before[:, :2], turned)
+        return after[:, :2] + turned(control_points - before[:, :2], after[:, 2] - before[:, 2])
 
     def cost(self, control_points: Array, poses: Array) -> float:
         """Return half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""
@@ -155,8 +153,7 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
 def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
     """Return (m,) the pose nearest to where each control point acts, of those with the curve's direction.
 
-    On an open curve, which may have drifted over itself, it is within `room` (m) of the nearest along the
-    curve.
+    On an open curve, which may have drifted over itself, it is within `room` (m) of the nearest along it.
     """
     boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
     u = boundary.abscissae
@@ -188,11 +185,6 @@ class Biweight:
         """Return the robust weights `rho'(z) / z = (1 - z^2 / g^2)^2` (m,)."""
         return np.asarray(self._inner(whitened) ** 2)
 
-    @property
-    def ceiling(self) -> float:
-        """Return the loss of a detection that isn't used, which is that at the gate."""
-        return self.gate**2 / 6.0
-
     def _inner(self, whitened: Array) -> Array:
         return np.maximum(1.0 - (whitened / self.gate) ** 2, 0.0)
 
@@ -201,8 +193,7 @@ class Biweight:
 class Projected:
     """The m detections that are used on one boundary, projected on its curve at a state.
 
-    A round holds `sigma` and `inside`, so that the cost does not jump where an end of an open curve slides
-    past a detection.
+    A round holds `sigma` and `inside`: the cost does not jump where an open end slides past a detection.
     """
 
     rows: IntArray  # rows (m,) of the detections in their table
@@ -234,13 +225,10 @@ class BatchSystem:
     def __init__(
         self, detections: DetectionTable, chain: LogOdometry, settings: MapperSettings, kernel: Biweight
     ) -> None:
-        self.detections = detections
-        self.chain = chain
-        self.settings = settings
-        self.kernel = kernel
+        self.detections, self.chain = detections, chain
+        self.settings, self.kernel = settings, kernel
         self.gauges: dict[int, CurveGauge] = {}  # weak priors of each boundary
-        self.revisits: tuple[Revisit, ...] = ()
-        """Poses measured in the frame of earlier ones, where an open road was driven twice."""
+        self.revisits: tuple[Revisit, ...] = ()  # where an open road was driven twice
         count = len(detections)
         self._sigma, self._inside, self._rates = np.ones(count), np.ones(count, bool), np.zeros((count, 2))
 
@@ -260,11 +248,10 @@ class BatchSystem:
         drive += [one.rows(state.poses) for one in self.revisits]
         used = sum(int(p.inside.sum()) for p in projected.values())
         losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
-        cost = losses + self.kernel.ceiling * (len(self.detections) - used) + half_square(drive)
-        cost += sum(
-            self.gauges[label].cost(state.control_points(label), state.poses) for label in state.boundaries
-        )
-        return Evaluation(state, projected, drive, cost)
+        at_gate = self.kernel.gate**2 / 6.0  # the loss of a detection that isn't used
+        cost = losses + at_gate * (len(self.detections) - used) + half_square(drive)
+        gauges = (self.gauges[b].cost(state.control_points(b), state.poses) for b in state.boundaries)
+        return Evaluation(state, projected, drive, cost + sum(gauges))
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
         detections, sensor = self.detections, state.variables.sensor
@@ -313,9 +300,8 @@ class BatchSystem:
 
     def scale(self, projected: Projected) -> Array:
         """Return the factor (m,) that whitens and weights each row (1/m), zero for those not inside."""
-        return np.asarray(
-            np.sqrt(self.kernel.weights(projected.whitened)) * projected.inside / projected.sigma
-        )
+        root = np.sqrt(self.kernel.weights(projected.whitened))
+        return np.asarray(root * projected.inside / projected.sigma)
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return all rows as a linear graph, whose solution is the change from the state."""
@@ -334,8 +320,8 @@ class BatchSystem:
     def retract(self, state: State, step: Array) -> State:
         """Return the state after a step (n,), taken in relative coordinates.
 
-        Each pose changes as seen from the pose before, and each control point as seen from the pose beside
-        it. So a map that swings by a large angle keeps its shape.
+        Poses change as seen from the pose before, and control points as seen from the pose beside them. So a
+        map that swings by a large angle keeps its shape.
         """
         linear = moved(state, step)
         after, poses, goal = linear.copy(), state.poses, linear.poses

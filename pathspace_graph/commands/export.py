@@ -22,7 +22,7 @@ from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
 from pathspace_graph.io.results import TRAJECTORY_FILE, read_trajectory, write_trajectory
 from pathspace_graph.settings.output import SpeedSettings
-from pathspace_graph.spline.planning import LEAST_STEP, MOST_POINTS
+from pathspace_graph.spline.ahead import LEAST_STEP, MOST_POINTS
 
 Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
 ON_EARTH = ("geojson", "lanelet2")

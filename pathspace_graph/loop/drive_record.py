@@ -42,29 +42,23 @@ def bend(poses: Array, known: Mapping[int, Array]) -> Array:
     """
     at, along = np.array(sorted(known)), path_lengths(poses)
     before = at.searchsorted(np.arange(len(poses)), side="right") - 1
-    after = np.minimum(before + 1, len(at) - 1)
-    values = np.array([known[k] for k in at.tolist()])
-    first, second = (_moved(poses, poses[at[nearest]], values[nearest]) for nearest in (before, after))
+    after, values = np.minimum(before + 1, len(at) - 1), np.array([known[k] for k in at.tolist()])
+    moved = []
+    for nearest in (before, after):
+        frames, to = poses[at[nearest]], values[nearest]
+        points = to_map(to_vehicle(poses[:, :2], frames), to)
+        moved.append(np.column_stack([points, poses[:, 2] + to[:, 2] - frames[:, 2]]))
     driven, way = along - along[at[before]], along[at[after]] - along[at[before]]
     weight = np.divide(driven, way, out=np.zeros_like(along), where=way > 0.0)[:, None]
-    change = second - first
+    change = moved[1] - moved[0]
     change[:, 2] = wrap_angle(change[:, 2])
-    return np.asarray(first + weight * change)
+    return np.asarray(moved[0] + weight * change)
 
-
-def _moved(poses: Array, frames: Array, to: Array) -> Array:
-    """Return poses (n, 3) moved rigidly as other poses (n, 3) have moved."""
-    points = to_map(to_vehicle(poses[:, :2], frames), to)
-    return np.column_stack([points, poses[:, 2] + to[:, 2] - frames[:, 2]])
-
-
-# --- the record ------------------------------------------------------------------------------------------
 
 WORKER_IDLE: Final = 600  # time with nothing to do after which the process that solves laps ends (s)
 WATCH_SECONDS: Final = 1.0  # at which a worker checks whether the process that started it is still there
 LATE: Final = "the batch of the lap was late"  # why a batch was given up in the end
-SOLVED: Final = 3.0
-"""Distance from its optimum at which a batch counts as solved (joint sigmas): its marginal has the rest."""
+SOLVED: Final = 3.0  # distance from the optimum of a solved batch (joint sigmas): its marginal has the rest
 
 
 class DriveRecord:
@@ -74,8 +68,7 @@ class DriveRecord:
         self.settings = settings
         self._noise = noise
         self.unsolvable: str | None = None  # why the drive cannot be solved as a batch; None if it can be
-        self.poses: list[Array] = []
-        """Pose (3,) of each cycle, map frame, as it was estimated then or by the newest batch."""
+        self.poses: list[Array] = []  # (3,) of each cycle, map frame, as of then or the newest batch
         self.stamps: list[float] = []  # stamp of each cycle (s)
         self._readings: list[Reading] = []  # whose detections have their stated covariances
         self._beside: dict[int, list[float]] = {}  # parameter on each curve by cycle, NaN before it
@@ -144,21 +137,17 @@ class DriveRecord:
         """Return the recurrence of the path driven since the vehicle was at a place before."""
         poses, (label, u) = np.array(self._reckoned), next(iter(place.beside.items()))
         before = int(np.nanargmin(np.abs(np.array(self._beside[label]) - u)))
-        driven = path_lengths(poses)
-        turn = float(poses[-1, 2] - poses[before, 2])
+        driven, turn = path_lengths(poses), float(poses[-1, 2] - poses[before, 2])
         return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)
 
     def prepare(self) -> None:
-        """Start the process that solves laps, once, so that it is ready when the loop closes.
-
-        This does not wait for it.
-        """
-        if not self._prepared and self.unsolvable is None:
+        """Start the process that solves laps, once, so that it is ready when the loop closes."""
+        if not self._prepared:
             self._prepared = True
-            _submit(_nothing)
+            self.resume()
 
     def resume(self) -> None:
-        """Start the process again where it was ready when a snapshot was taken."""
+        """Start the process again where it was ready when a snapshot was taken, without waiting for it."""
         if self._prepared and self.unsolvable is None:
             _submit(_nothing)
 
@@ -169,15 +158,11 @@ class DriveRecord:
         return ClosedMap(state.splines, poses, state.variables.calibrations.copy())
 
     def lap(self, first_kept: int, start: ClosedMap | Recurrence, settings: MapperSettings) -> OpenLap:
-        """Return the lap, whose search begins at a map that has just been closed, or at odometry.
-
-        The priors of the calibrations are those of the settings, which may have become wide.
-        """
+        """Return the lap; the priors of its calibrations are those of the settings, which may be wide."""
         measured = [one.motion for one in self._readings], [one.detections for one in self._readings]
         motions, detections = self._noise.for_lap(*measured)
         chain = chained(self.stamps, motions, settings.odometry)
-        table = DetectionTable.of(detections, twists=chain.twists)
-        return OpenLap(settings, chain, table, first_kept, start)
+        return OpenLap(settings, chain, DetectionTable.of(detections, twists=chain.twists), first_kept, start)
 
 
 def _together(a: Detections, b: Detections) -> Detections:
@@ -195,9 +180,7 @@ class LapBatch:
 
     def __init__(self, lap: OpenLap, t: float, due: int, last: int) -> None:
         self.t = t  # stamp of the cycle in which the lap was sent (s)
-        self.due = due
-        """Cycle in which the marginal replaces the prior, or the first later one in which it is there."""
-        self.last = last  # latest cycle in which it does so
+        self.due, self.last = due, last  # first and last cycle in which the marginal may replace the prior
         self.first_kept = lap.first_kept  # cycle from which on the window holds the poses until then
         self._lap = lap
         self._future: Future[LapMarginal | None] | None = None
@@ -233,8 +216,7 @@ class LapBatch:
             return " ".join(f"the batch of the lap has failed: {type(error).__name__}: {error}".split())
         if solved is None:
             return "the detections are against the loop"
-        convergence = solved.convergence
-        nearly = convergence.converged or convergence.gradient < SOLVED
+        nearly = solved.convergence.converged or solved.convergence.gradient < SOLVED
         return solved if nearly else "the batch of the lap has not converged"
 
 

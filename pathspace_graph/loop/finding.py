@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.batch.association import locate_poses
+from pathspace_graph.batch.association import locate_poses, path_lengths
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map, wrap_angle
 from pathspace_graph.graph.gaussian import half_solve
@@ -24,12 +24,10 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.registration import Motion, RefinedMotion, Sightings, refine, worst_sigma
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE, State
-from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors that choose a pose's position
-FOUND: Final = "the vehicle was lost, and is found again"
-"""Beginning of the notice of a cycle in which the window starts anew at the place that was found."""
+FOUND: Final = "the vehicle was lost, and is found again"  # notice of the cycle in which it is found
 BESIDE: Final = 1.0  # distance from the closed curve within which an unused detection is explained (m)
 GAP: Final = 3.0  # least distance of neighbouring cones with a gap between them, over the median
 INTERVAL: Final = 0.5  # least time between two attempts (s)
@@ -48,8 +46,7 @@ MIN_SCORE: Final = 0.6  # least score of the place that is accepted; the true on
 MARGIN: Final = 0.1  # least lead of its score over that of every other place
 SIGMA_MAX: Final = 0.5  # largest standard deviation of the position there in its worst direction (m)
 CONFIRMATIONS: Final = 2  # attempts, one after the other, that must find the same place
-WIDENING: Final = 3.0
-"""Factor of the registration's sigmas in the prior of the found pose: its detections are used again."""
+WIDENING: Final = 3.0  # of the registration's sigmas in the prior there: its detections are used again
 STEPS: Final = 2  # Gauss-Newton steps at the place that was found
 
 
@@ -155,19 +152,18 @@ class KnownLoop:
 
     def is_mapped(self, label: int, u: Array) -> BoolArray:
         """Return which parameters (m,) of a boundary lie between cones that were detected."""
-        track, settings = self._smoother.map, self._smoother.map.settings
+        track = self._smoother.map
         cones, length = track.cones.get(label, np.zeros(0)), track.state.boundaries[label].length
-        return is_mapped(u, cones, length, GAP, settings.growth.merge_radius)
+        return is_mapped(u, cones, length, GAP, track.settings.growth.merge_radius)
 
 
 def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_again: BoolArray) -> Evidence:
     """Return what the tested detections say about the newest pose, before the update.
 
     On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
-    for on the whole of their curve: they may be of a stretch across the infield. Three kinds of them say
-    nothing about the vehicle. Those that are not `seen_again` (m,), of all detections of the cycle, may be of
-    nothing at all. Those on the curve of the other colour have a wrong colour. And those beside a gap of the
-    map cannot lie on it.
+    for on the whole of their curve: they may be of a stretch across the infield. Three kinds say nothing
+    about the vehicle: those that are not `seen_again` (m,), of all detections of the cycle, those on the
+    curve of the other colour, and those beside a gap of the map.
     """
     detections, settings = smoother.map.detections, smoother.map.settings.health
     closed, used = smoother.map.state.closed, detections.used[tested.rows]
@@ -204,14 +200,11 @@ def _by_boundary(labels: IntArray) -> tuple[int, int]:
 
 
 def _sigma_of_position(smoother: CurveSmoother) -> float:
-    """Return the standard deviation (m) of the last solved position in its worst direction.
-
-    The newest pose has the last columns of the system, so that the last block of its factor tells it.
-    """
+    """Return the standard deviation (m) of the last solved position in its worst direction."""
     last = smoother.last_step
     if last is None:
         return np.nan
-    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())
+    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose has the last columns
     return worst_sigma(half.T @ half)
 
 
@@ -219,39 +212,34 @@ class Search:
     """What a lost vehicle has seen, and the search for its place on a closed map."""
 
     def __init__(self, smoother: CurveSmoother) -> None:
-        self.settings: MapperSettings = smoother.map.settings
+        self.settings, self._smoother = smoother.map.settings, smoother
         self.loop: Loop  # the map as it was in the last attempt
-        self._smoother = smoother
         self.first_cycle = smoother.next_cycle  # cycle from which on detections are remembered
         self._poses: list[Array] = []
         self._seen: list[Detections] = []
         self._tried = smoother.times[-1]
-        self._last: Motion | None = None
+        self._last: Motion | None = None  # of the last attempt
         self._agreed, self._missed = 0, 0  # attempts in a row
 
     def observe(self, pose: Array, detections: Detections) -> None:
         """Remember a cycle: its pose (3,) by odometry, and its detections."""
         self._poses.append(pose.copy())
         self._seen.append(detections)
-        poses = np.array(self._poses)
-        driven = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-        while len(driven) and driven.sum() > MEMORY:
-            driven = driven[1:]
-            del self._poses[0], self._seen[0]
+        driven = path_lengths(np.array(self._poses))
+        old = int(driven.searchsorted(driven[-1] - MEMORY))
+        del self._poses[:old], self._seen[:old]
 
     def find(self) -> RefinedMotion | None:
         """Return the motion onto the only place that agrees, once it was found several times in a row."""
         if not self._seen or self._seen[-1].t - self._tried < INTERVAL:
             return None
-        self._tried, best = self._seen[-1].t, self._best()
+        best, last, newest = self._best(), self._last, self._poses[-1][None, :2]
+        self._tried, self._last = self._seen[-1].t, None if best is None else best.motion
         if best is None:
-            self._agreed, self._last = 0, None
             return None
-        newest, agrees = self._poses[-1][None, :2], False
-        if self._last is not None:
-            agrees = _distance(best.motion.apply(newest)[0], self._last.apply(newest)[0]) < APART
+        moved = best.motion.apply(newest)[0]
+        agrees = last is not None and _distance(moved, last.apply(newest)[0]) < APART
         self._agreed = self._agreed + 1 if agrees else 1
-        self._last = best.motion
         return best if self._agreed >= CONFIRMATIONS else None
 
     @property
@@ -260,20 +248,16 @@ class Search:
         return self._missed >= CONFIRMATIONS
 
     def _best(self) -> RefinedMotion | None:
-        """Return the motion onto the place that is clearly better than all others, if there is one.
-
-        The loop is laid out each time: the map goes on to relax from the detections that were taken out of
-        use.
-        """
+        """Return the motion onto the place that is clearly better than all others, if there is one."""
         seen = self._sightings()
         if len(seen.rows) < MIN_DETECTIONS:
             return None
-        self._smoother.refresh()
+        self._smoother.refresh()  # the map goes on to relax from the detections that were taken out of use
         state = self._smoother.map.state
         self.loop = lay_out_loop(state)
         centre = self._poses[-1][:2]
         places = [self._refined(state, seen, Motion(centre, vector), i) for vector, i in self._starts(seen)]
-        places = sorted(places, key=lambda place: -place[0])
+        places.sort(key=lambda place: -place[0])
         if not places or places[0][0] < MIN_SCORE:
             self._missed += 1
             return None
@@ -302,8 +286,7 @@ class Search:
         possible = np.flatnonzero(misfit < MISFIT)
         if len(possible) == 0:
             return []
-        turn = np.exp(1j * motions[possible, 2])[:, None]
-        centre = self._poses[-1][:2]
+        turn, centre = np.exp(1j * motions[possible, 2])[:, None], self._poses[-1][:2]
         arms = (seen.points - centre) @ np.array([1.0, 1j])
         moved = turn * arms + (centre + motions[possible, :2]) @ np.array([[1.0], [1j]])
         points = np.stack([moved.real, moved.imag], axis=2)
@@ -327,8 +310,7 @@ class Search:
         They are of least squares; the rms distances (n,) of the path from the middle are returned, too.
         """
         poses = np.array(self._poses)
-        behind = np.hypot(*np.diff(poses[:, :2], axis=0).T)[::-1].cumsum()[::-1]
-        behind = np.append(behind, 0.0)
+        behind = np.append(np.hypot(*np.diff(poses[:, :2], axis=0).T)[::-1].cumsum()[::-1], 0.0)
         _, first = np.unique(behind // STEP, return_index=True)
         ahead = poses[-1, :2] + LEAD * np.array([np.cos(poses[-1, 2]), np.sin(poses[-1, 2])])
         path = np.concatenate([poses[first, :2], ahead[None]]) @ np.array([1.0, 1j])
@@ -346,8 +328,8 @@ class Search:
 
         The score is the agreement of the detections with the map there, from 0 to 1.
         """
-        poses, gate, stretches = np.array(self._poses), self.settings.gate, dict[int, tuple[float, float]]()
-        driven = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+        gate, stretches = self.settings.gate, dict[int, tuple[float, float]]()
+        driven = float(path_lengths(np.array(self._poses))[-1])
         for label, u in self.loop.beside.items():  # what the vehicle has seen on a path that ends there
             tables = state.boundaries[label].tables
             low = float(u[i]) - driven - gate.station_room
@@ -380,5 +362,4 @@ def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) 
     for _ in range(STEPS):
         smoother.step(settings.sigma_step)
     jump = state.poses[-1] - before
-    jump[2] = wrap_angle(jump[2])
-    return np.asarray(jump)
+    return np.append(jump[:2], wrap_angle(jump[2]))

@@ -17,7 +17,7 @@ from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.simplification import fit_through
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map, to_vehicle
-from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.smoother import CurveSmoother
@@ -30,8 +30,7 @@ from pathspace_graph.spline.bspline import BSpline
 
 from .finding import KnownLoop, Loop
 
-MENDED: Final = "the map was mended"
-"""Beginning of the notice of a cycle in which mended curves take the place of the old ones."""
+MENDED: Final = "the map was mended"  # beginning of the notice of the cycle in which it was
 SIGHTINGS: Final = 6  # detections of a cone that contradicts the map; clutter has one, a cone passed twenty
 MEMORY: Final = 30.0  # time after its last detection at which a contradiction is forgotten (s)
 CONES: Final = 3  # least number of contradictions in a row that is mended
@@ -81,10 +80,9 @@ class Contradictions:
             tracks.clear()
 
     def stretches(self, loop: Loop, t: float) -> list[Stretch]:
-        """Return the stretches whose cones contradict the curves of the loop, or stand in a gap.
+        """Return the stretches whose cones contradict the curves of the loop, or stand in a gap, at t (s).
 
-        There are none until the vehicle has passed all of them at t (s), and has not seen their cones for a
-        while. It does not pass a very long one as a whole.
+        There are none until the vehicle has passed all of them, or `MOST` cones of a very long one.
         """
         found = list[Stretch]()
         for label, tracks in self._tracks.items():
@@ -92,13 +90,9 @@ class Contradictions:
             if len(chosen) < CONES:
                 continue
             chosen = chosen[_is_new(loop, label, tracks.points[chosen])]
-            if len(chosen) < CONES:
-                continue
             chosen = chosen[self._undisputed(label, chosen)]
             points, passed = tracks.points[chosen], tracks.last_t[chosen] < t - SETTLE
-            for row in in_rows(points, ROW):
-                if len(row) < CONES:
-                    continue
+            for row in (row for row in in_rows(points, ROW) if len(row) >= CONES):
                 if not passed[row].all() and passed[row].sum() < MOST:
                     return []
                 found.append(Stretch(label, points[row[passed[row]]]))
@@ -106,7 +100,7 @@ class Contradictions:
 
     def _undisputed(self, label: int, chosen: IntArray) -> BoolArray:
         """Return which tracks (k,) were seen more often than those of the other colour at the same place."""
-        tracks, (other,) = self._tracks[label], (self._tracks[b] for b in BOUNDARIES if b != label)
+        tracks, other = self._tracks[label], self._tracks[LEFT + RIGHT - label]
         apart = np.hypot(*(tracks.points[chosen, None] - other.points).transpose(2, 0, 1))
         rival = np.where(apart < other.settings.merge_radius, other.counts, 0).max(axis=1, initial=0)
         return np.asarray(tracks.counts[chosen] > rival)
@@ -114,18 +108,13 @@ class Contradictions:
 
 def _is_new(loop: Loop, label: int, points: Array) -> BoolArray:
     """Return which points (k, 2) of a colour are farther than `BESIDE` from all curves, or in a gap."""
-    new = loop.beside_gaps(np.full(len(points), label), points)
-    new |= loop.curves[label].query(points)[0] > BESIDE
-    for number, curve in loop.curves.items():
-        if number != label:
-            new &= curve.query(points)[0] > BESIDE
-    return new
+    away = {number: curve.query(points)[0] > BESIDE for number, curve in loop.curves.items()}
+    in_gap = loop.beside_gaps(np.full(len(points), label), points)
+    return (away[label] | in_gap) & away[LEFT + RIGHT - label]
 
 
 def in_rows(points: Array, apart: float) -> list[IntArray]:
     """Return the groups (k,) of points (n, 2), by index, whose neighbours are at most this far apart (m)."""
-    if len(points) == 0:
-        return []
     pairs = KDTree(points).sparse_distance_matrix(KDTree(points), apart)
     count, group = connected_components(pairs, directed=False)
     return [np.flatnonzero(group == number) for number in range(count)]
@@ -149,12 +138,9 @@ class Mending:
     def is_due(self, known: KnownLoop, driven: float) -> bool:
         """Return whether the closed map is contradicted, after a path of this length (m)."""
         t = self._smoother.times[-1]
-        if t < self._asked + INTERVAL or driven < self._wait_until:
+        if t < self._asked + INTERVAL or driven < self._wait_until or self._attempts >= ATTEMPTS:
             return False
-        self._asked = t
-        if self._attempts >= ATTEMPTS:
-            return False
-        loop = known.get()
+        loop, self._asked = known.get(), t
         self._stretches = self.contradictions.stretches(loop, t)
         if self._stretches:
             self._attempts, self._wait_until = self._attempts + 1, driven + loop.length
@@ -166,13 +152,10 @@ class Mending:
         The poses (P, 3) are those of all cycles, in the map frame.
         """
         self._smoother.refresh()
-        state = self._smoother.map.state
-        lengths = [boundary.length for boundary in state.boundaries.values()]
-        self._lap = poses[lap_begin(poses, max(lengths)) :]
-        splines = {
-            label: led_through(self._smoother.map, label, self._stretches, poses)
-            for label in state.boundaries
-        }
+        track, state = self._smoother.map, self._smoother.map.state
+        longest = max(boundary.length for boundary in state.boundaries.values())
+        self._lap = poses[lap_begin(poses, longest) :]
+        splines = {label: led_through(track, label, self._stretches, poses) for label in state.boundaries}
         return ClosedMap(splines, poses, state.variables.calibrations.copy())
 
     def is_tried(self) -> bool:
@@ -184,21 +167,17 @@ class Mending:
         stretches, self._stretches = self._stretches, []
         if isinstance(marginal, str):
             return ""
-        label = np.repeat([one.label for one in stretches], [len(one.cones) for one in stretches])
-        cones = np.concatenate([one.cones for one in stretches])
-        end = len(marginal.poses)
-        cones = carried(cones, self._lap, marginal.poses[end - len(self._lap) :])
-        distance = np.full(len(cones), np.inf)
-        for number, spline in marginal.splines.items():
-            curve = KDTree(sampled(spline, SAMPLE))
-            distance[label == number] = curve.query(cones[label == number])[0]
-        explained = distance < BESIDE
-        if explained.mean() < EXPLAINED:
+        now, explained = marginal.poses[len(marginal.poses) - len(self._lap) :], [0, 0]
+        for stretch in stretches:
+            cones = carried(stretch.cones, self._lap, now)
+            distance = KDTree(sampled(marginal.splines[stretch.label], SAMPLE)).query(cones)[0]
+            explained[stretch.label] += int(np.count_nonzero(distance < BESIDE))
+        if sum(explained) < EXPLAINED * sum(len(stretch.cones) for stretch in stretches):
             return ""
         self._wait_until = 0.0
         self.contradictions.clear()
-        names = [name for number, name in enumerate(NAMES) if (label[explained] == number).any()]
-        return f"{MENDED}: {int(explained.sum())} more cones on the {' and on the '.join(names)} lie on it"
+        names = [NAMES[label] for label in BOUNDARIES if explained[label]]
+        return f"{MENDED}: {sum(explained)} more cones on the {' and on the '.join(names)} lie on it"
 
 
 def carried(points: Array, before: Array, after: Array) -> Array:
@@ -232,10 +211,9 @@ def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Ar
 
 
 def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
-    """Return the positions (n, 2) on the newest lap of poses (P, 3), the first one again at the end.
+    """Return the positions (n, 2) and stations (n,) on the newest lap, the first position again at the end.
 
-    It begins at the place nearest to the newest pose about a lap of this length (m) before. The stations (n,)
-    of the positions along it are returned, too.
+    It begins at the one of the poses (P, 3) nearest to the newest, about a lap of this length (m) before.
     """
     first = lap_begin(poses, length)
     lap = np.concatenate([poses[first:, :2], poses[first : first + 1, :2]])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import left_of, wrap_angle
+from pathspace_graph.factors.se2 import left_of, rotations, wrap_angle
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.registration import (
     BEGINNING_SHARE,
@@ -87,8 +87,10 @@ def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) ->
     found: list[RecognizedPlace] = []
     for vector, low in _starts(state, prior, settings):
         place = _register(state, newest, Motion(centre, vector), low, prior, settings)
-        if place is not None and not any(_same(place, other, settings) for other in found):
-            found.append(place)
+        if place is not None:
+            apart = [place.motion.vector[:2] - other.motion.vector[:2] for other in found]
+            if all(np.hypot(*away) >= settings.overlap for away in apart):
+                found.append(place)
     return found[0] if len(found) == 1 else None
 
 
@@ -104,29 +106,22 @@ def newest_stretch(state: State) -> dict[int, tuple[Array, Array]]:
     return found
 
 
-def _same(a: RecognizedPlace, b: RecognizedPlace, settings: ClosingSettings) -> bool:
-    return bool(np.hypot(*(a.motion.vector - b.motion.vector)[:2]) < settings.overlap)
-
-
 def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple[Array, float]]:
     """Return motions (3,) onto earlier stretches that turn as the newest one does, most similar first.
 
     Each goes with the parameter at which the earlier stretch of the first boundary begins. The headings along
     both stretches are compared, after a common turn.
     """
-    label, boundary = next(iter(state.boundaries.items()))
-    control_points, step = state.control_points(label), START_STEP
+    (label, boundary), step = next(iter(state.boundaries.items())), START_STEP
     u = np.arange(boundary.confirmed_end % step, boundary.confirmed_end, step)
-    points, tangents = boundary.evaluate(control_points, u), boundary.evaluate(control_points, u, 1)
+    points, tangents = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
     headings = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
-    count = int(STRETCH / step)
-    last = int(BEGINNING_SHARE * len(points))
+    count, last = int(STRETCH / step), int(BEGINNING_SHARE * len(points))
     turns = sliding_window_view(headings[:last], count) - headings[-count:]
     places = sliding_window_view(points[:last], count, axis=0).mean(axis=2)
     turn, unlike = turns.mean(axis=1), turns.std(axis=1)
     centre, middle = state.poses[-1, :2], points[-count:].mean(axis=0)
-    arm, c, s = middle - centre, np.cos(turn), np.sin(turn)
-    turned = np.column_stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]]) + centre
+    turned = rotations(turn) @ (middle - centre) + centre
     motions = np.column_stack([places - turned, wrap_angle(turn)])
     possible = np.einsum("ij,jk,ik->i", motions, prior, motions) < START_CHI2
     best = _minima(np.where(possible, unlike, np.inf), int(settings.overlap / step))[:STARTS]

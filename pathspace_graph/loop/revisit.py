@@ -80,8 +80,7 @@ class Revisits:
         found = match(known, to_vehicle(seen, poses[-1:]), variances, poses[-1], reaches())
         share = found.matched / len(found.is_matched)
         drift = float(np.hypot(*(found.pose - poses[-1])[:2]))
-        agrees = found.is_certain and share > MIN_SHARE and found.misfit < MOST_MISFIT
-        if not agrees or drift >= MOST_DRIFT:
+        if not (found.is_certain and share > MIN_SHARE and found.misfit < MOST_MISFIT and drift < MOST_DRIFT):
             return None
         keyframes = np.array(smoother.keyframe_cycles)
         first, later = int(keyframes[np.abs(keyframes - place).argmin()]), smoother.first_cycle
@@ -120,7 +119,7 @@ def earlier_pass(poses: Array) -> int | None:
 def have_parted(poses: Array, stations: Array, place: int) -> bool:
     """Return whether the ways to the newest of the poses (P, 3) and to an earlier place were apart."""
     back, ways = np.arange(0.0, min(float(stations[place]), WAY), WAY_STEP), []
-    for cycle in (place, len(poses) - 1):
+    for cycle in (place, -1):
         at = stations[cycle] - back
         points = np.column_stack([np.interp(at, stations, poses[:, k]) for k in range(2)])
         ways.append(to_vehicle(points, poses[cycle][None]))

@@ -6,6 +6,7 @@ it is taken as the circle that osculates it there.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import ClassVar, Final
 
 import numpy as np
@@ -17,8 +18,9 @@ from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from .centre_line import points_across
-from .planning import MOST_POINTS, check_length
 
+LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
+MOST_POINTS: Final = 200_000  # largest number of points of a line, which bounds the memory
 _SAMPLE_STEP: Final = 0.5  # of boundaries (m); the circle at a sample is right to a millimetre
 _ACROSS: Final = 2  # stride of the samples among which the points across are searched
 _BEHIND: Final = 3.0  # distance behind the vehicle at which the samples begin (m), since it may stand askew
@@ -86,6 +88,12 @@ class TrackAhead:
         return float(self.arc_length[-1]) if len(self.arc_length) else 0.0
 
 
+def check_length(name: str, length: float) -> None:
+    """Raise a SettingsError unless a length (m) is a number of at least the shortest step."""
+    if not isinstance(length, Real) or not LEAST_STEP <= length < np.inf:
+        raise SettingsError(f"{name}: expected a number of at least {LEAST_STEP:g} m, found {length!r}")
+
+
 def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:
     """Return the next `distance` metres from a pose (x, y, theta), at points `step` (m) apart.
 
@@ -103,7 +111,7 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
         for label in BOUNDARIES
     ]
     line = _first_line(samples[LEFT], samples[RIGHT]) if len(samples) == len(BOUNDARIES) else None
-    if line is None or len(line.points) < 2:
+    if line is None or len(line) < 2:
         no, none = np.zeros(0), np.zeros((0, 2))
         return TrackAhead(none, no, no, no, no, no, no > 0.0, sides[LEFT], sides[RIGHT])
     line = _from_beside(line, pose[:2], distance, step)
@@ -173,33 +181,29 @@ def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Arra
     return position, (m + x * (2.0 * bend + 3.0 * x * twist)) / h, (2.0 * bend + 6.0 * x * twist) / h**2
 
 
-@dataclass(frozen=True, eq=False)
-class _Line:
-    points: Array
-    left: Array
-    right: Array
+def _first_line(left: _Samples, right: _Samples) -> Array:
+    """Return the middles between samples of the left boundary and those across, in the order of travel.
 
-
-def _first_line(left: _Samples, right: _Samples) -> _Line:
-    """Return the middles between samples of the left boundary and those across, in the order of travel."""
+    Each row (4,) is a middle (m, map frame) and the stations of both samples (m).
+    """
     of = slice(None, None, _ACROSS)
     lefts, rights = left.points[of], right.points[of]
     stations = left.station[of], right.station[of]
     apart = 0.5 * min(left.station[-1], right.station[-1])  # a loop must not be paired across its ends
     i, j = points_across((lefts, rights), (left.tangents[of], right.tangents[of]), stations, apart)
-    forward = j >= np.maximum.accumulate(j) if len(j) else np.zeros(0, bool)
+    forward = j >= np.maximum.accumulate(j)
     i, j = i[forward], j[forward]
-    points = 0.5 * (lefts[i] + rights[j])
-    apart_enough = np.append(True, _distances(points)[1:] > _SETTLED)[: len(points)]
-    i, j = i[apart_enough], j[apart_enough]
-    return _Line(points[apart_enough], stations[0][i], stations[1][j])
+    line = np.column_stack([0.5 * (lefts[i] + rights[j]), stations[0][i], stations[1][j]])
+    apart_enough = _distances(line[:, :2]) > _SETTLED
+    apart_enough[:1] = True
+    return line[apart_enough]
 
 
-def _from_beside(line: _Line, position: Array, distance: float, step: float) -> _Line:
-    """Return the line at even steps, from the point beside a position (2,) on."""
-    edges = np.diff(line.points, axis=0)
+def _from_beside(line: Array, position: Array, distance: float, step: float) -> Array:
+    """Return the line (n, 4) at even steps, from the point beside a position (2,) on."""
+    edges = np.diff(line[:, :2], axis=0)
     squares = _dot(edges, edges)
-    offset = position - line.points[:-1]
+    offset = position - line[:-1, :2]
     share = np.minimum(np.maximum(_dot(offset, edges) / squares, 0.0), 1.0)
     away = offset - share[:, None] * edges
     nearest = int(_dot(away, away).argmin())
@@ -207,15 +211,14 @@ def _from_beside(line: _Line, position: Array, distance: float, step: float) -> 
     begin = lengths[nearest] + share[nearest] * (lengths[nearest + 1] - lengths[nearest])
     count = int(min(distance, lengths[-1] - begin) / step + _SETTLED)
     at = begin + step * np.arange(count + 1)
-    x, y, u, v = (np.interp(at, lengths, values) for values in (*line.points.T, line.left, line.right))
-    return _Line(np.column_stack([x, y]), u, v)
+    return np.column_stack([np.interp(at, lengths, values) for values in line.T])
 
 
 def _settled(
-    left: _Samples, right: _Samples, line: _Line, pose: Array, step: float, sides: Sequence[Array]
+    left: _Samples, right: _Samples, line: Array, pose: Array, step: float, sides: Sequence[Array]
 ) -> TrackAhead:
     """Return the track ahead at the points of the line, moved along its normals to equal distances."""
-    points, feet = line.points, [_Feet(left, line.left), _Feet(right, line.right)]
+    points, feet = line[:, :2], [_Feet(left, line[:, 2]), _Feet(right, line[:, 3])]
     for _ in range(_SETTLING_STEPS):
         for foot in feet:
             foot.find(points)
@@ -286,14 +289,16 @@ class _Feet:
         offset = points - samples.points[at]
         self.a, self.b = _dot(offset, samples.tangents[at]), _dot(offset, self._normals[at])
         self.k = samples.curvature[at]
-        spread = 1.0 - self.k * self.b
-        self.spread = np.where(np.abs(spread) > _SETTLED, spread, _SETTLED)
+        self.spread = self._spread(self.b)
+
+    def _spread(self, distance: Array) -> Array:
+        spread = 1.0 - self.k * distance
+        return np.where(np.abs(spread) > _SETTLED, spread, _SETTLED)
 
     @property
     def offset_curvature(self) -> Array:
         """Return k / (1 - k d) (n,), the curvature of the parallel curve through each point."""
-        spread = 1.0 - self.k * self.distance
-        return np.asarray(self.k / np.where(np.abs(spread) > _SETTLED, spread, _SETTLED))
+        return np.asarray(self.k / self._spread(self.distance))
 
     def width(self, points: Array, way: Array) -> Array:
         """Return how far (n,) the circle is from points (n, 2) along unit vectors (n, 2).

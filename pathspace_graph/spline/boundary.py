@@ -15,7 +15,7 @@ from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
-from .bspline import BSpline, side_of
+from .bspline import BSpline, segments_cross, side_of
 
 ROUND_OFF = 1e-9  # largest difference from a knot of parameters that lie on it (m)
 SAME_DIRECTION = 0.5  # least cosine of the angle between the curve beside a vehicle and the vehicle's heading
@@ -63,10 +63,8 @@ class Boundary:
         self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings, first: int = 0
     ) -> None:
         self.first = first  # number of the first control point's key; new knots have keys with new numbers
-        self.settings = settings
-        self.gauge = gauge
-        self.degree = settings.degree
-        self.periodic = periodic
+        self.settings, self.gauge = settings, gauge
+        self.degree, self.periodic = settings.degree, periodic
         self.confirmed_end = 0.0  # parameter up to which cones support the curve, not extrapolated (m)
         self.observed: Array = np.zeros((0, 2))  # cones that the curve was extended through, map frame (m)
         self.cone_parameters: Array = np.zeros(0)  # (n,) parameter of each of them on the curve (m)
@@ -86,24 +84,22 @@ class Boundary:
 
     def gauge_on(self, points: IntArray) -> Gauge:
         """Return the priors between control points (k,) in driving order; the last result is cached."""
-        if self._gauge is None or self._gauge.points is not points:
-            self._gauge = self._new_gauge(points)
-        return self._gauge
-
-    def _new_gauge(self, points: IntArray) -> Gauge:
+        if self._gauge is not None and self._gauge.points is points:
+            return self._gauge
         whole = self.periodic and len(points) == self.size
         abscissae = self.abscissae[points]
         abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # a stretch past the seam
         spacing = float(np.mean(self.nominal))
         bending = smoothness_coefficients(abscissae, self.length if whole else None, spacing)
         first = points if whole else points[:-1]
-        return Gauge(
+        self._gauge = Gauge(
             points=points,
             pairs=np.stack([first, (first + 1) % self.size], axis=1),
             nominal=self.nominal[first],
             triples=(points[: len(bending), None] + np.arange(3)) % self.size,
             bending=bending / (self.gauge.sigma_smoothness * spacing),
         )
+        return self._gauge
 
     @property
     def numbers(self) -> IntArray:
@@ -146,14 +142,13 @@ class Boundary:
         return joint_foot_points(spans, control_points, points, alone, low, high, *search)
 
     def find_anywhere(self, control_points: Array, points: Array) -> FootPoints:
-        low, high = (np.full(len(points), end) for end in (self.tables.low, self.tables.high))
+        low, high = np.full((len(points), 2), [self.tables.low, self.tables.high]).T
         return self.find(control_points, points, low, high)
 
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
         """Refine the foot points of points (m, 2), starting at the parameters u (m,)."""
-        s = self.settings
+        s, unwrapped = self.settings, self.extended(control_points)
         low, high = u - s.refine_room, self.believed(u + s.refine_room)
-        unwrapped = self.extended(control_points)
         return refine_foot_points(self.tables, unwrapped, points, u, low, high, s.refine_iterations)
 
     @property
@@ -199,9 +194,8 @@ class Boundary:
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
-            self._set_tables(self.tables.extended(np.concatenate([self.knots, last])))
-        from_u = self.confirmed_end if from_u is None else from_u
-        placement = self._placement(old, targets_u, from_u)
+            self._set_tables(self.tables.extended(np.append(self.knots, last)))
+        placement = self._placement(old, targets_u, self.confirmed_end if from_u is None else from_u)
         self.confirmed_end = float(targets_u[-1])
         return placement
 
@@ -273,7 +267,6 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
 
 # --- whether boundaries cross ----------------------------------------------------------------------------
 
-
 NO_PATH: Final = np.zeros((0, 2))
 PATH_STEP: Final = 1.0  # step at which a driven path is looked at for crossings with itself (m)
 LEVEL_SINE: Final = 0.7  # of the angle of a level crossing, at least: laps over one road meet at less
@@ -298,10 +291,8 @@ def at_level_crossing(points: Array, path: Array) -> BoolArray:
         return np.zeros(len(points), bool)
     station = np.append(0.0, np.hypot(*np.diff(path, axis=0).T).cumsum())
     _, kept = np.unique(station // PATH_STEP, return_index=True)
-    own = crossings(path[kept], path[kept], LEVEL_SINE)
-    if len(own) == 0:
-        return np.zeros(len(points), bool)
-    return np.asarray(KDTree(own).query(points)[0] < LEVEL_CROSSING)
+    places = KDTree(crossings(path[kept], path[kept], LEVEL_SINE))
+    return np.asarray(places.query(points)[0] < LEVEL_CROSSING)
 
 
 def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
@@ -312,8 +303,7 @@ def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
     i = np.repeat(np.arange(len(near)), [len(own) for own in near])
     j = np.array([k for own in near for k in own], np.intp)
     (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
-    crossed = (side_of(p, q, r) * side_of(p, q, s) < 0.0) & (side_of(r, s, p) * side_of(r, s, q) < 0.0)
-    p, q, r, s = (points[crossed] for points in (p, q, r, s))
+    p, q, r, s = (points[segments_cross(p, q, r, s)] for points in (p, q, r, s))
     turned = np.abs(side_of(p, q, p + s - r)) > sine * np.hypot(*(q - p).T) * np.hypot(*(s - r).T)
     share = side_of(r, s, p) / (side_of(r, s, p) - side_of(r, s, q))
     return np.asarray((p + share[:, None] * (q - p))[turned])

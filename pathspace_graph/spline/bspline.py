@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # which imports its modules when they are used
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import (
     SpanPolynomials,
     clamped_knots,
@@ -51,7 +51,6 @@ class BSpline:
         object.__setattr__(self, "knots", np.array(self.knots, dtype=np.float64))
         object.__setattr__(self, "control_points", np.array(self.control_points, dtype=np.float64))
         self._check_shapes()
-        self._check_knots()
         if self.periodic:
             self._check_period()
 
@@ -68,16 +67,15 @@ class BSpline:
             raise SettingsError(
                 f"a spline of degree {self.degree} needs control points of shape {shape}, not {points.shape}"
             )
-        if knots.shape != (len(points) + self.degree + 1,):
+        count = len(points) + self.degree + 1
+        if knots.shape != (count,):
             raise SettingsError(
-                f"{len(points)} control points of degree {self.degree} need "
-                f"{len(points) + self.degree + 1} knots, not shape {knots.shape}"
+                f"{len(points)} control points of degree {self.degree} need {count} knots, "
+                f"not shape {knots.shape}"
             )
         if not (np.isfinite(points).all() and np.isfinite(knots).all()):
             raise SettingsError("a spline's knots and control points must be finite")
-
-    def _check_knots(self) -> None:
-        steps = np.diff(self.knots)
+        steps = np.diff(knots)
         if (steps < 0.0).any():
             raise SettingsError(f"knots must not decrease, but knot {int(steps.argmin()) + 1} does")
         if steps[self.degree] <= 0.0 or steps[-self.degree - 1] <= 0.0:
@@ -256,8 +254,7 @@ class BSpline:
 
     def unclamp(self, start: bool = True, end: bool = True) -> "BSpline":
         """Return the same curve with floating ends: p knots repeat the chosen end's interval outward."""
-        knots, p = self.knots.copy(), self.degree
-        outward = np.arange(1, p + 1)
+        knots, p, outward = self.knots.copy(), self.degree, np.arange(1, self.degree + 1)
         if start:
             knots[:p] = knots[p] - (knots[p + 1] - knots[p]) * outward[::-1]
         if end:
@@ -295,16 +292,14 @@ class BSpline:
 
     def normal_sigma(self, u: Array, joint_covariance: Array) -> Array:
         """Return sqrt(n^T cov S(u) n) (k,): the standard deviation across the curve in m."""
-        normal = left_of(self.tangent_unit(u))
+        normal = self.normal_unit(u)
         variance = np.einsum("ka,kab,kb->k", normal, self.covariance_at(u, joint_covariance), normal)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def to_scipy(self) -> "ScipyBSpline":
         """Return the same curve as scipy's class, which gives NaN outside of an open domain."""
-        extrapolate: Literal["periodic", False] = "periodic" if self.periodic else False
-        return scipy.interpolate.BSpline(
-            self.knots, self.control_points, self.degree, extrapolate=extrapolate
-        )
+        beyond: Literal["periodic", False] = "periodic" if self.periodic else False
+        return scipy.interpolate.BSpline(self.knots, self.control_points, self.degree, extrapolate=beyond)
 
     def _refuse_periodic(self, what: str) -> None:
         if self.periodic:
@@ -348,3 +343,9 @@ def cross(a: Array, b: Array) -> Array:
 def side_of(p: Array, q: Array, point: Array) -> Array:
     """Return on which side of the lines from p to q (..., 2) the points lie: positive on the left."""
     return cross(q - p, point - p)
+
+
+def segments_cross(p: Array, q: Array, r: Array, s: Array) -> BoolArray:
+    """Return whether the segments from p to q cross those from r to s (..., 2)."""
+    r_apart_s, p_apart_q = side_of(p, q, r) * side_of(p, q, s), side_of(r, s, p) * side_of(r, s, q)
+    return np.asarray((r_apart_s < 0.0) & (p_apart_q < 0.0))

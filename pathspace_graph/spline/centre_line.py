@@ -16,7 +16,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.spline.bspline import BSpline, side_of
+from pathspace_graph.spline.bspline import BSpline, segments_cross
 
 SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line on which the edge of each label is
 SAMPLE_STEP: Final = 0.5  # distance of the samples of boundaries, of lines, and of edges that are fitted (m)
@@ -129,11 +129,8 @@ class CentreCurve:
         return np.interp(u, table[:, 0], table[:, 1])
 
     def crossings(self, u: Array) -> "list[Crossing]":
-        found = []
-        for side, spline in enumerate(self.sides):
-            own, at = self.table(side).T
-            found.append(_crossing(self.ribbon, u, spline, np.interp(u, at, own), 1.0 - 2.0 * side))
-        return found
+        beside = [np.interp(u, *self.table(side).T[::-1]) for side in range(2)]
+        return [_crossing(self.ribbon, u, self.sides[s], beside[s], 1.0 - 2.0 * s) for s in range(2)]
 
     @cached_property
     def by_boundaries(self) -> Array:
@@ -295,12 +292,8 @@ def _first_pair(
     tangents = [spline.tangent_unit(u) for spline, u in zip(sides, samples, strict=True)]
     # an open map may overlap itself before its loop is closed
     apart = np.inf if closed else 0.5 * min(spline.length() for spline in sides)
-    i, j = points_across(
-        (points[0][some], points[1]),
-        (tangents[0][some], tangents[1]),
-        (lengths[0][some], lengths[1]),
-        apart,
-    )
+    pairs = [(of[0][some], of[1]) for of in (points, tangents, lengths)]
+    i, j = points_across(pairs[0], pairs[1], pairs[2], apart)
     if not len(i):
         raise SettingsError("expected the left boundary to the left of the right one, found none such")
     best = int(((points[0][some[i]] - points[1][j]) ** 2).sum(axis=1).argmin())
@@ -354,10 +347,9 @@ def _check_apart(lefts: Array, rights: Array, i: IntArray, j: IntArray, closed: 
     """Raise a SettingsError where the boundaries cross near a pair of samples that face each other."""
     near = j[:, None] + np.arange(-_NEAR, _NEAR + 1)
     p, q = _segments(lefts, i[:, None], closed)
-    r, s = _segments(rights, near, closed)
-    cross = (side_of(p, q, r) * side_of(p, q, s) < 0.0) & (side_of(r, s, p) * side_of(r, s, q) < 0.0)
-    if cross.any():
-        x, y = p[np.flatnonzero(cross.any(axis=1))[0], 0]
+    crossed = segments_cross(p, q, *_segments(rights, near, closed)).any(axis=1)
+    if crossed.any():
+        x, y = p[crossed.argmax(), 0]
         raise SettingsError(
             f"expected boundaries that do not cross, found them crossing near x = {x:.1f} m, y = {y:.1f} m"
         )

@@ -34,12 +34,11 @@ def quantile_breaks(u: Array, curvature: Array, count: int, baseline: float = BA
     if count < 1:
         raise SettingsError(f"at least one knot interval is needed, not {count}")
     bent = np.minimum(np.abs(curvature), CURVATURE_MAX)
-    total = float(bent.sum())
-    equal = np.full(len(bent), 1.0 / len(bent))
+    total, equal = float(bent.sum()), np.full(len(bent), 1.0 / len(bent))
     share = (1.0 - baseline) * bent / total + baseline * equal if total > 0.0 else equal
-    cumulative = np.concatenate([[0.0], np.cumsum(share)])
+    cumulative = np.append(0.0, np.cumsum(share))
     breaks = np.interp(np.linspace(0.0, 1.0, count + 1), cumulative / cumulative[-1], u)
-    breaks[0], breaks[-1] = u[0], u[-1]
+    breaks[[0, -1]] = u[[0, -1]]
     return breaks
 
 
@@ -100,7 +99,8 @@ def refit(
     domain has no sample, F fills the gap smoothly. What is not `within` these old parameters counts for E
     only.
     """
-    u = _refit_samples(old, new)
+    finer = int(np.ceil(np.diff(old.breaks).max() / np.diff(new.breaks).min()))
+    u = _on_spans(old, _SAMPLES_PER_SPAN * min(max(1, finer), _SAMPLES_PER_SPAN))
     inside = (u >= within[0]) & (u <= within[1])
     w = u if u_map is None else u_map(u)
     local_old, local_new = old.local_basis(u), new.local_basis(w)
@@ -139,23 +139,17 @@ def _normal_solution(normal: Array, right: Array) -> Array:
     return np.asarray(cho_solve(factor, right, check_finite=False))
 
 
-def _refit_samples(old: BSpline, new: BSpline) -> Array:
-    widths = np.diff(old.breaks)
-    finer = int(np.ceil(widths.max() / np.diff(new.breaks).min()))
-    parts = _SAMPLES_PER_SPAN * min(max(1, finer), _SAMPLES_PER_SPAN)
-    offsets = (np.arange(parts) + 0.5) / parts
-    return (old.breaks[:-1, None] + widths[:, None] * offsets).ravel()
-
-
 def _bending_rows(spline: BSpline) -> Array:
     """Return rows whose product with the control points is h^2 S'' at places on every span of width h."""
-    breaks = spline.breaks
-    width = np.diff(breaks)
-    offsets = (np.arange(_BENDING_PER_SPAN) + 0.5) / _BENDING_PER_SPAN
-    u = (breaks[:-1, None] + width[:, None] * offsets).ravel()
-    order = min(2, spline.degree)
+    width, order = np.diff(spline.breaks), min(2, spline.degree)
     scale = np.repeat(width, _BENDING_PER_SPAN) ** order
-    return np.asarray(spline.basis_matrix(u, order) * scale[:, None])
+    return np.asarray(spline.basis_matrix(_on_spans(spline, _BENDING_PER_SPAN), order) * scale[:, None])
+
+
+def _on_spans(spline: BSpline, count: int) -> Array:
+    """Return `count` parameters in each span of a spline, evenly spaced."""
+    offsets = (np.arange(count) + 0.5) / count
+    return (spline.breaks[:-1, None] + np.diff(spline.breaks)[:, None] * offsets).ravel()
 
 
 def fit_spline(
@@ -171,15 +165,14 @@ def fit_spline(
     count = size if periodic else size - degree
     if count < 1 or (periodic and count <= degree):
         raise SettingsError(f"{size} control points are too few for a spline of degree {degree}")
-    knots = np.linspace(0.0, high, count + 1) if breaks is None else breaks
-    best, best_rmse = None, np.inf
-    for _ in range(ROUNDS + 1 if breaks is None else 1):
+    if breaks is not None:
+        return _fit_on(points, u, breaks, periodic, degree)[0]
+    knots, fits = np.linspace(0.0, high, count + 1), []
+    for _ in range(ROUNDS + 1):
         spline, u, rmse = _fit_on(points, u, knots, periodic, degree)
-        if rmse < best_rmse or best is None:
-            best, best_rmse = spline, rmse
+        fits.append((rmse, spline))
         knots = curvature_weighted_breaks(spline, count)
-    assert best is not None
-    return best
+    return min(fits, key=lambda fit: fit[0])[1]
 
 
 def _chord_lengths(points: Array, periodic: bool) -> tuple[Array, float]:
@@ -196,17 +189,14 @@ def _fit_on(
 ) -> tuple[BSpline, Array, float]:
     frame = _frame(breaks, periodic, degree)
     bending = np.sqrt(SMOOTHNESS) * energy_rows(frame)
-    zeros = np.zeros((len(bending), 2))
+    values = np.concatenate([points, np.zeros((len(bending), 2))])
     reach = (breaks[-1] - breaks[0]) / max(len(breaks) - 1, len(points))
-    rmse = np.inf
     for _ in range(REFITS):
         stacked = np.concatenate([frame.basis_matrix(u), bending])
-        solution = np.linalg.lstsq(stacked, np.concatenate([points, zeros]), rcond=None)[0]
-        frame = frame.with_points(solution)
+        frame = frame.with_points(np.linalg.lstsq(stacked, values, rcond=None)[0])
         feet = foot_points(frame.tables, frame.control_points, points, u - reach, u + reach, 0.1 * reach)
-        rmse = float(np.sqrt(np.mean(np.sum((feet.position - points) ** 2, axis=1))))
         u = feet.u
-    return frame, u, rmse
+    return frame, u, float(np.sqrt(np.mean(np.sum((feet.position - points) ** 2, axis=1))))
 
 
 def energy_rows(spline: BSpline) -> Array:
@@ -267,7 +257,8 @@ def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, leas
     decreases by `w' G^-1 a / (a' G^-1 a) a'c`. So it suffices to update `W c` and `W G^-1 A'` by a rank of
     one, where the rows of W are the jumps A at all knots and the basis at the points.
     """
-    breaks = _breaks(u, high)
+    inner = np.unique(u[(u > COINCIDENT) & (u < high - COINCIDENT)])
+    breaks = np.concatenate([[0.0], inner[np.diff(inner, prepend=0.0) > COINCIDENT], [high]])
     while periodic and len(breaks) <= degree + 1:
         breaks = np.sort(np.append(breaks, 0.5 * (breaks[1:] + breaks[:-1])))
     frame = _frame(breaks, periodic, degree)
@@ -291,12 +282,6 @@ def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, leas
             values = values - share[:, None] * values[k]
             spread = dger(-1.0, share, spread[k], a=spread, overwrite_a=1)
             remaining = np.concatenate([remaining[:removed], remaining[removed + 1 :]])
-
-
-def _breaks(u: Array, high: float) -> Array:
-    inner = np.unique(u[(u > COINCIDENT) & (u < high - COINCIDENT)])
-    inner = inner[np.diff(inner, prepend=0.0) > COINCIDENT]
-    return np.concatenate([[0.0], inner, [high]])
 
 
 def _frame(breaks: Array, periodic: bool, degree: int) -> BSpline:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import import_module
 from math import inf, sqrt
-from numbers import Real
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -14,28 +13,13 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.settings.output import SpeedSettings
-from pathspace_graph.spline.bspline import BSpline, cross
-from pathspace_graph.spline.centre_line import CentreCurve, Crossing, find_line
+
+from .ahead import MOST_POINTS, TrackAhead, check_length
+from .bspline import BSpline, cross
+from .centre_line import CentreCurve, Crossing, find_line
 
 if TYPE_CHECKING:
     import pandas as pd  # imported when it is asked for: a planner has no use for it
-
-
-class SampledLine(Protocol):
-    """A line that is sampled at n points, such as `CentreLine` and `TrackAhead`.
-
-    It has the curvature (n,) in 1/m, the length (n,) from its first point, and the whole length (m), with the
-    way back to the first point where the line is closed, a loop.
-    """
-
-    @property
-    def curvature(self) -> Array: ...
-    @property
-    def arc_length(self) -> Array: ...
-    @property
-    def length(self) -> float: ...
-    @property
-    def closed(self) -> bool: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +37,7 @@ class SpeedProfile:
 
 
 def speed_profile(
-    line: SampledLine,
+    line: CentreLine | TrackAhead,
     settings: SpeedSettings | None = None,
     begin: float | None = None,
     end: float | None = None,
@@ -120,8 +104,6 @@ def _square(speed: float | None) -> float:
     return speed**2
 
 
-LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
-MOST_POINTS: Final = 200_000  # largest number of points of a line, which bounds the memory
 _FEWEST: Final = 4  # smallest number of points of a line
 _NEIGHBOURS: Final = 10  # number of points apart up to which normals must not cross
 _SHORT: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
@@ -171,18 +153,10 @@ class CentreLine:
 
     def to_frame(self) -> pd.DataFrame:
         """Return the line as a frame: a row for each point, with x, y and every other array as a column."""
-        x, y = self.points.T
-        names = (entry.name for entry in fields(self))
-        columns = {name: getattr(self, name) for name in names if name != "points"}
-        arrays = {name: value for name, value in columns.items() if isinstance(value, np.ndarray)}
-        frame: pd.DataFrame = import_module("pandas").DataFrame({"x": x, "y": y, **arrays})
+        columns = {"x": self.points[:, 0], "y": self.points[:, 1], **vars(self)}
+        arrays = {name: v for name, v in columns.items() if isinstance(v, np.ndarray) and name != "points"}
+        frame: pd.DataFrame = import_module("pandas").DataFrame(arrays)
         return frame
-
-
-def check_length(name: str, length: float) -> None:
-    """Raise a SettingsError unless a length (m) is a number of at least the shortest step."""
-    if not isinstance(length, Real) or not LEAST_STEP <= length < inf:
-        raise SettingsError(f"{name}: expected a number of at least {LEAST_STEP:g} m, found {length!r}")
 
 
 def centre_line(
@@ -202,15 +176,13 @@ def centre_line(
     length = centre.length()
     count = max(round(length / step), _FEWEST)
     arc_length = np.linspace(0.0, length, count + 1)
-    u = centre.parameters_at(arc_length)
-    tangent, crossings = centre.tangent_unit(u), line.crossings(u)
-    sigmas = _sigmas(line, u, crossings, covariance)
-    own = slice(count if closed else None)
-    widths = _uncrossed(
-        centre.evaluate(u)[own], left_of(tangent)[own], [np.abs(one.offset[own]) for one in crossings], closed
-    )
+    u, own = centre.parameters_at(arc_length), slice(count if closed else None)
+    points, tangent, crossings = centre.evaluate(u)[own], centre.tangent_unit(u), line.crossings(u)
+    across, turn, bend, along, to_left, to_right = _sigmas(line, u, crossings, covariance)
+    offsets = [np.abs(one.offset[own]) for one in crossings]
+    widths = _uncrossed(points, left_of(tangent)[own], offsets, closed)
     return CentreLine(
-        points=centre.evaluate(u)[own],
+        points=points,
         heading=np.arctan2(tangent[own, 1], tangent[own, 0]),
         curvature=centre.curvature(u)[own],
         arc_length=arc_length[own],
@@ -218,13 +190,13 @@ def centre_line(
         width_right=widths[1],
         closed=closed,
         length=length,
-        points_sigma=sigmas[0][own],
-        heading_sigma=sigmas[1][own],
-        curvature_sigma=sigmas[2][own],
-        arc_length_sigma=sigmas[3][own],
-        width_left_sigma=sigmas[4][own],
-        width_right_sigma=sigmas[5][own],
-        length_sigma=float(sigmas[3][-1]),
+        points_sigma=across[own],
+        heading_sigma=turn[own],
+        curvature_sigma=bend[own],
+        arc_length_sigma=along[own],
+        width_left_sigma=to_left[own],
+        width_right_sigma=to_right[own],
+        length_sigma=float(along[-1]),
     )
 
 
@@ -275,16 +247,14 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
     by_parameter = cross(first, third) / cube[:, 0]
     by_parameter -= 3.0 * curvature[:, 0] * np.einsum("kd,kd->k", first, second) / speed**2
     bent = bent - (by_parameter / speed)[:, None] * along
-    intervals = centre.arc_length(u)
     shorter = -curvature * across
-    pieces = 0.5 * np.diff(intervals)[:, None] * (shorter[1:] + shorter[:-1])
+    pieces = 0.5 * np.diff(centre.arc_length(u))[:, None] * (shorter[1:] + shorter[:-1])
     lengths = np.concatenate([np.zeros((1, pieces.shape[1])), np.cumsum(pieces, axis=0)])
     rows = [across, heading, bent, lengths]
     for one, begin in zip(crossings, (0, line.sides[0].size), strict=True):
         turn = one.offset * np.einsum("kd,kd->k", one.own_normal, tangent)
         rows.append(one.along_normal(begin, line.size) + turn[:, None] * heading - across)
-    root = np.asarray(covariance)
-    return [np.sqrt(np.maximum(np.einsum("km,km->k", row @ root, row), 0.0)) for row in rows]
+    return [np.sqrt(np.maximum(np.einsum("km,km->k", row @ covariance, row), 0.0)) for row in rows]
 
 
 def _dot(a: Array, moved: Array) -> Array:

@@ -107,7 +107,8 @@ def test_the_cost_never_grows_in_a_step() -> None:
 def test_a_damping_that_is_too_large_leaves_the_map_beside_its_poses() -> None:
     """The poses are free, as they aren't damped, and the map goes with them."""
     system, state = noisy()
-    optimizer = Optimizer(system, damping=Damping(first=1e12, least=1e12, most=1e13))
+    optimizer = Optimizer(system)
+    optimizer.damping = Damping(first=1e12, least=1e12, most=1e13)
     at, _ = optimizer.run(state, BATCH.gate, 1)
     assert np.abs(at.state.poses - state.poses).max() > 1e-3
     for label, gauge in system.gauges.items():
@@ -117,7 +118,8 @@ def test_a_damping_that_is_too_large_leaves_the_map_beside_its_poses() -> None:
 
 def test_where_no_damping_is_allowed_nothing_moves() -> None:
     system, state = noisy()
-    refused = Optimizer(system, damping=Damping(first=1.0, most=0.1))
+    refused = Optimizer(system)
+    refused.damping = Damping(first=1.0, most=0.1)
     at, _ = refused.run(state, BATCH.gate, 1)
     np.testing.assert_array_equal(at.state.variables.values, state.variables.values)
 
