@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, SolveError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.noise import KnownNoise
@@ -254,10 +254,11 @@ class BatchMapper:
     def solve(
         self, log: Log, start: Start | None = None, on_round: Callable[[], None] | None = None
     ) -> BatchResult:
-        """Return the optimum, which is searched from an online map or from odometry alone.
+        """Return the optimum, which is searched from odometry alone or from an online map.
 
-        By default `batch.start` decides. `on_round` is called after each round. SettingsError if there is no
-        online mapper to begin with, and SolveError where the log leaves no way to an optimum.
+        `start` is by default `batch.start` of the settings. `on_round` is called after each round.
+        SettingsError if there is no online mapper to begin with, and SolveError where the log leaves no way
+        to an optimum.
         """
         watch = Stopwatch()
         judged = judge_log(log, self.noise, own_settings(self.settings))
@@ -266,17 +267,18 @@ class BatchMapper:
         system = BatchSystem(detections, chain, settings, Biweight(LOOSE_GATE))
         optimizer = Optimizer(system, on_round=on_round)
         watch.lap("integrate")
-        if (start or self.settings.batch.start) == "odometry":
-            online = None
-            at, convergence = find_optimum_from_odometry(optimizer)
-        else:
+        start, online = start or self.settings.batch.start, None
+        found = None if start == "online" else find_optimum_from_odometry(optimizer, start == "odometry")
+        if found is None:
             if self.online is None:
                 raise SettingsError("start online: expected an online mapper to begin with, found none")
+            watch.lap("optimum")
             mapper = self.online(replace(self.settings, scale=1.0), self.noise)
             state, online = start_online(log, mapper)
-            system.revisits = mapper.revisits
+            system.revisits, system.kernel = mapper.revisits, Biweight(LOOSE_GATE)
             watch.lap("start")
-            at, convergence = optimizer.find(state)
+            found = optimizer.find(state)
+        at, convergence = found
         at, convergence = _with_doubt(optimizer, at, convergence)
         watch.lap("optimum")
         joint, vehicle = system.eliminated(at).joint(at.state.map_keys), _vehicle(system, at)
@@ -337,15 +339,29 @@ def _vehicle(system: BatchSystem, at: Evaluation) -> VehicleState:
     return VehicleState.split(at.state.poses[-1], variables.calibrations, covariance)
 
 
-def find_optimum_from_odometry(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:
-    """Return the optimum whose search begins at odometry alone."""
+def find_optimum_from_odometry(
+    optimizer: Optimizer, open_too: bool = True
+) -> tuple[Evaluation, Convergence] | None:
+    """Return the optimum whose search begins at odometry alone.
+
+    None where no lap recurs, or the detections are against its loop, unless an open map will do (`open_too`).
+    """
     system = optimizer.system
     chain, detections, settings = system.chain, system.detections, system.settings
     recurrence = find_recurrence(chain.dead_reckoned(np.zeros(CALIBRATION_SIZE)), settings)
+    if not (recurrence.recurs or open_too):
+        return None
     state = start_odometry(chain, detections, settings, recurrence)
-    at, convergence = optimizer.find(state)
-    if not state.closed or is_true_closure(evidence(at, detections, settings), settings):
+    try:
+        at, convergence = optimizer.find(state)
+    except SolveError:
+        if open_too:
+            raise
+        return None
+    if is_true_closure(evidence(at, detections, settings), settings) or (open_too and not state.closed):
         return at, convergence
+    if not open_too:
+        return None
     return optimizer.find(start_odometry(chain, detections, settings, recurrence.denied()))
 
 

@@ -9,7 +9,7 @@ Knots = Literal["cones", "curvature"]
 """What the knots of a closed boundary follow: its cones or its curvature."""
 
 
-Start = Literal["online", "odometry"]
+Start = Literal["auto", "online", "odometry"]
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,9 @@ class OpenLapSettings(Positive, group="open_lap"):
 class BatchSettings(Positive):
     """The batch optimization over a whole log."""
 
-    start: Start = "online"
-    """Start of the optimization: the map of an online run over the log, or odometry alone."""
+    start: Start = "auto"
+    """Start of the optimization: odometry alone, or the map of an online run over the log. With `auto` it is
+    odometry where laps recur and the detections are for the closed loop, else an online run."""
     size_share: float = 0.43
     """Most control points as a share of the distinct cones that were detected (the paper has 0.44)."""
     dense_share: float = 1.0

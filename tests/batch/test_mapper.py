@@ -12,17 +12,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.batch import mapper as batch_mapper
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult, unmapped
-from pathspace_graph.batch.optimizer import Effort
+from pathspace_graph.batch.optimizer import Convergence, Effort, Optimizer
+from pathspace_graph.batch.system import Evaluation
 from pathspace_graph.cli import main
 from pathspace_graph.commands.batch import NOT_CONVERGED
+from pathspace_graph.errors import SolveError
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, write_log
 from pathspace_graph.io.map import SplineBoundary, read_map
 from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.state import State
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.settings.batch import Start
 
 from ..scenes.drives import ahead, bean_track, corridor, exact_log, lap_log, noisy, true_poses
 
@@ -36,11 +41,8 @@ def bean() -> Log:
 
 
 @cache
-def solved(start: str) -> BatchResult:
-    assert start in ("online", "odometry")
-    return BatchMapper(None, bean().odometry_sigma, FixedLagMapper).solve(
-        bean(), "online" if start == "online" else "odometry"
-    )
+def solved(start: Start) -> BatchResult:
+    return BatchMapper(None, bean().odometry_sigma, FixedLagMapper).solve(bean(), start)
 
 
 def broken_off(log: Log, share: float) -> Log:
@@ -50,7 +52,7 @@ def broken_off(log: Log, share: float) -> Log:
 
 
 @pytest.mark.parametrize("start", ["online", "odometry"])
-def test_a_closed_track_is_mapped_within_the_noise(start: str) -> None:
+def test_a_closed_track_is_mapped_within_the_noise(start: Start) -> None:
     result, truth = solved(start), bean().truth
     assert truth is not None
     assert result.convergence.converged
@@ -69,6 +71,36 @@ def test_both_starts_come_to_one_optimum() -> None:
     between = gap(first, second)
     assert max(between.curves.values()) < 0.02
     assert max(between.along, between.across) < 0.05
+
+
+def test_a_drive_of_more_than_a_lap_needs_no_online_run() -> None:
+    """The optimum is that from odometry, to the bit."""
+    result = BatchMapper(None, bean().odometry_sigma).solve(bean())
+    assert result.online is None and result.map.closed
+    np.testing.assert_array_equal(result.trajectory, solved("odometry").trajectory)
+
+
+@pytest.mark.parametrize("why", ["no lap recurs", "the search fails", "the detections are against the loop"])
+def test_the_batch_begins_online_where_odometry_leads_to_no_loop(
+    why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = broken_off(bean(), 0.5) if why == "no lap recurs" else bean()
+    find, searches = Optimizer.find, list[State]()
+
+    def fails_once(self: Optimizer, state: State) -> tuple[Evaluation, Convergence]:
+        searches.append(state)
+        if len(searches) == 1 and why == "the search fails":
+            raise SolveError("no optimum")
+        return find(self, state)
+
+    monkeypatch.setattr(Optimizer, "find", fails_once)
+    if why == "the detections are against the loop":
+        monkeypatch.setattr(batch_mapper, "is_true_closure", lambda *_: False)
+    result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log)
+    assert result.online is not None
+    assert len(searches) == (1 if why == "no lap recurs" else 2)
+    online = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "online")
+    np.testing.assert_allclose(result.trajectory, online.trajectory, atol=1e-9)
 
 
 def test_the_size_keeps_to_its_budget() -> None:
