@@ -87,10 +87,10 @@ class LandmarkFixedLag:
 
     def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
         detections = self.front_end.use_late(detections, self.smoother.times)
-        late = at_nearest_pose(self.smoother, detections, self.settings.motion)
-        new = self.smoother.map.detections.append(late.detections, late.cycle, late.twist)
+        late, cycle, twist = at_nearest_pose(self.smoother, detections, self.settings.motion)
+        new = self.smoother.map.detections.append(late, cycle, twist)
         self.smoother.map.correct()
-        self._use(new, detections.t, watch, late.cycle)
+        self._use(new, detections.t, watch, cycle)
         watch.lap("update")
         used = int(self.smoother.map.detections.used[new].sum())
         return replace(self._result(detections.t, watch.laps), readings=used)

@@ -39,14 +39,10 @@ class LogOdometry:
             poses.append(compose(poses[-1], calibrated_delta(interval, calibration)))
         return np.array(poses)
 
-    def terms(self, poses: Array, calibration: Array) -> tuple[Array, Array]:
-        """Return whitened residuals (P - 1, 3), derivatives (P - 1, 3, 8) by [calibration | pose | next]."""
-        return self.odometry.terms(slice(None), poses, calibration)
-
     def rows(self, poses: Array, calibration: Array) -> list[Rows]:
-        """Return the rows of `terms` and `priors` at poses (P, 3) and a calibration (2,)."""
-        start = np.arange(len(self.odometry))
-        odometry = odometry_rows(start, self.terms(poses, calibration), owners(start))
+        """Return the rows of `odometry` and `priors` at poses (P, 3) and a calibration (2,)."""
+        start, terms = np.arange(len(self.odometry)), self.odometry.terms(slice(None), poses, calibration)
+        odometry = odometry_rows(start, terms, owners(start))
         return [odometry, *self.priors(poses[0], calibration)]
 
     def rows_at(self, variables: Variables, settings: CalibrationSettings) -> list[Rows]:
