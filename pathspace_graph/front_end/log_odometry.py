@@ -13,8 +13,6 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variabl
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
 from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 
-from .motion import mean_bias
-
 
 @dataclass(frozen=True, eq=False)
 class LogOdometry:
@@ -83,6 +81,15 @@ def chained(
         calibration_sigma=np.array(settings.sigmas_calibration),
         bias=mean_bias([motion.bias for motion in motions if motion.bias is not None]),
     )
+
+
+def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
+    """Return the mean of independent measurements of the bias by their information; None without any."""
+    if not measured:
+        return None
+    information = np.array([one.sigma**-2 for one in measured])
+    values = np.array([one.value for one in measured])
+    return BiasMeasurement(float(information @ values / information.sum()), float(information.sum() ** -0.5))
 
 
 def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Rows]:

@@ -161,9 +161,9 @@ class MotionCheck:
         if not (may_doubt or failed):
             return motion
         best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
-        denied = best is not None and self._denies(best, self._difference(odometry, predicted, best))
-        if denied and not failed:
-            failed = best is not None and self._fits_better(best, predicted, detections, variances)
+        if best is not None and not failed:
+            denied = self._denies(best, self._difference(odometry, predicted, best))
+            failed = denied and self._fits_better(best, predicted, detections, variances)
         return self._replaced(motion, best, going_on, dt) if failed else motion
 
     def _fits_better(self, best: Match, predicted: Array, detections: Detections, variances: Array) -> bool:
@@ -177,7 +177,7 @@ class MotionCheck:
     def _best(
         self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float
     ) -> Match | None:
-        matches = [self._match(detections, variances, start, scans.reaches()) for start in starts]
+        matches = [self._match(detections, variances, start, scans.REACHES) for start in starts]
         possible = [one for one in matches if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)
 
@@ -240,11 +240,13 @@ class Rest:
 
     def __init__(self, sigma: Array) -> None:
         self.sigma = sigma
+        self.end()
+
+    def end(self) -> None:
         self._since: float | None = None
-        self._sum: Array = np.zeros(3)
-        self._count = 0
-        self._measured_since = 0.0
-        self._rate_sum, self._rate_count = 0.0, 0
+        self._sum, self._count = np.zeros(3), 0
+        self._measured_since = self._rate_sum = 0.0
+        self._rate_count = 0
 
     def update(self, odometry: Odometry, t: float) -> bool:
         """Return whether the vehicle has stood for long enough at t (s), by the newest twists."""
@@ -260,32 +262,17 @@ class Rest:
         self._rate_count += len(twists)
         return self._is_still(self._sum / self._count, self._count) and t - self._since >= REST
 
-    def end(self) -> None:
-        self._since, self._sum, self._count = None, np.zeros(3), 0
-        self._rate_sum, self._rate_count = 0.0, 0
-
     def bias(self, t: float) -> BiasMeasurement | None:
         """Return the bias that was measured since the last call, if that is long enough ago at t (s)."""
         if t - self._measured_since < REST:
             return None
-        measured = BiasMeasurement(
-            self._rate_sum / self._rate_count, float(self.sigma[2]) / np.sqrt(self._rate_count)
-        )
+        mean, sigma = self._rate_sum / self._rate_count, float(self.sigma[2]) / np.sqrt(self._rate_count)
         self._measured_since, self._rate_sum, self._rate_count = t, 0.0, 0
-        return measured
+        return BiasMeasurement(mean, sigma)
 
     def _is_still(self, mean: Array, count: int) -> bool:
         """Return whether a mean twist (3,) of this number of readings is that of a vehicle at rest."""
         return bool((np.abs(mean) < REST_TWIST + REST_SIGMAS * self.sigma / np.sqrt(count)).all())
-
-
-def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
-    """Return the mean of independent measurements of the bias by their information; None without any."""
-    if not measured:
-        return None
-    information = np.array([one.sigma**-2 for one in measured])
-    values = np.array([one.value for one in measured])
-    return BiasMeasurement(float(information @ values / information.sum()), float(information.sum() ** -0.5))
 
 
 def _is_stuck(twists: Array) -> bool:

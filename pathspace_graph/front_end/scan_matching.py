@@ -32,6 +32,7 @@ REACH: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
 ITERATIONS: Final = 6
+REACHES: Final = [REACH * ((REACH_LAST / REACH) ** (1.0 / (ITERATIONS - 1))) ** k for k in range(ITERATIONS)]
 REACHES_CHECK: Final = (REACH, REACH_LAST)  # of the check, which begins near the solution
 FARTHEST: Final = 3.0  # distance in reaches from which on a remembered detection has no weight
 MIN_WEIGHT: Final = 0.7  # least sum of weights of a matched detection
@@ -41,12 +42,6 @@ SIGMA_CONE: Final = 0.05  # added to a detection's, m, since one side of a cone 
 LEAST_SHARE: Final = 1e-6  # least det of a pose's information by the product of its diagonal
 MOST_MISFIT: Final = 9.0  # largest whitened square in a misfit that is compared with another
 _TINY: Final = float(np.finfo(float).tiny)
-
-
-def reaches(iterations: int = ITERATIONS) -> list[float]:
-    """Return the reach of each iteration (m), which shrinks by the same factor."""
-    shrink = (REACH_LAST / REACH) ** (1.0 / max(iterations - 1, 1))
-    return [REACH * shrink**k for k in range(iterations)]
 
 
 class RecentDetections:
@@ -262,11 +257,7 @@ class SensorErrors:
 
 @compiled
 def off_prediction(
-    pose: Array,
-    information: Array,
-    excess: float,
-    predicted: Array,
-    covariance: Array,
+    pose: Array, information: Array, excess: float, predicted: Array, covariance: Array
 ) -> tuple[Array, Array]:
     """Return how far a match, of variance times `excess`, is off a prediction, and its covariance."""
     turn = np.eye(3)
