@@ -36,21 +36,17 @@ CAUSES: Final = {  # causes by the name of the calibration
 
 def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, float]:
     """Return each calibration whose prior is in a run's settings over the prior's standard deviation."""
-    found = {}
-    for name, (value, _) in state.by_name.items():
-        prior = settings.get(CAUSES[name].group, {}).get(f"sigma_{name}")
-        if prior is not None:
-            found[name] = value / prior
-    return found
+    priors = {name: settings.get(CAUSES[name].group, {}).get(f"sigma_{name}") for name in state.by_name}
+    return {name: state.by_name[name][0] / prior for name, prior in priors.items() if prior is not None}
 
 
 def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
     """Return a line for each calibration that its prior in the settings did not expect, with the cause."""
-    values, lines = state.by_name, []
+    lines = []
     for name, ratio in by_prior(state, settings).items():
         if abs(ratio) > LIMIT:
-            cause, size = CAUSES[name], CAUSES[name].unit * abs(values[name][0])
-            text = cause.text.format(size, cause.signs[0 if ratio > 0.0 else 1])
+            cause, size = CAUSES[name], abs(state.by_name[name][0])
+            text = cause.text.format(cause.unit * size, cause.signs[0 if ratio > 0.0 else 1])
             lines.append(f"{text} ({abs(ratio):.1f} sigmas of its prior)")
     return lines
 

@@ -2,26 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Final
 
 from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE
-
-Cause = Literal[  # the kinds of mistakes that are told
-    "stamps",
-    "clocks",
-    "positions",
-    "speeds",
-    "yaw rate",
-    "y to the right",
-    "sensor frame",
-    "map frame",
-    "odometry",
-    "mounting",
-    "covariances",
-    "noise",
-    "labels",
-    "unexplained",
-]
 
 
 @dataclass(frozen=True)
@@ -30,7 +13,8 @@ class Hint:
 
     LENGTHS: ClassVar = {"found": 1, "likely": 1, "advice": 1}
 
-    cause: Cause
+    cause: str
+    """Kind of the mistake, which begins its row in `TABLE`."""
     file: str
     columns: str
     """Columns of the file, in words."""
@@ -59,7 +43,7 @@ _TURNED = "static cones move as they would for a sensor that is turned by {angle
 _BY_READINGS = "--noise measured takes what is measured"
 _CLASSES = "the classes of the detector were not turned into left and right"
 
-TABLE: Final[dict[str, tuple[Cause, str, str, str, str, str]]] = {
+TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
     "unit of stamps": ("stamps", "{file}", _T, "rows follow each other after {step:.4g} s as a rule",
         "the stamps are in {unit}, not in seconds", "multiply column t by {factor:g}"),
     "fraction of seconds": ("stamps", "{file}", _T,

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.special import bdtrc
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import rotation, se2_exp, wrap_angle
+from pathspace_graph.factors.odometry import integrate_poses
+from pathspace_graph.factors.se2 import rotation, rotations, to_vehicle, wrap_angle
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, UNKNOWN
 
@@ -57,8 +58,7 @@ class Pairs:
 
     def laid(self, frame: Array, motion: Array) -> Array:
         """Return the later detections (P, m, 2) in the earlier vehicle frame."""
-        c, s = np.cos(motion[:, 2]), np.sin(motion[:, 2])
-        turn = np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2)  # the transpose, for points in rows
+        turn = rotations(motion[:, 2]).transpose(0, 2, 1)  # for points in rows
         return np.asarray((self.after @ frame.T) @ turn + motion[:, None, :2])
 
     def explained(self, frame: Array, motion: Array) -> Array:
@@ -73,12 +73,16 @@ class Pairs:
 
     def overlap(self, motion: Array) -> Array:
         """Return the share (P,) of the later detections that the earlier cycle could have seen."""
-        ranges, bearings = _polar(self.before)
+
+        def polar(points: Array) -> tuple[Array, Array]:
+            return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
+
+        ranges, bearings = polar(self.before)
         vector = np.nanmean(np.exp(1j * bearings))
         middle = float(np.angle(vector)) if abs(vector) > ROUND else 0.0
         farthest = np.nanquantile(ranges, SEEN)
         widest = np.nanquantile(np.abs(wrap_angle(bearings - middle)), SEEN)
-        ranges, bearings = _polar(self.laid(np.eye(2), motion))
+        ranges, bearings = polar(self.laid(np.eye(2), motion))
         inside = (ranges < farthest) & (np.abs(wrap_angle(bearings - middle)) < widest)
         return np.asarray(inside.sum(axis=1) / np.isfinite(ranges).sum(axis=1))
 
@@ -135,25 +139,13 @@ def spacing_of(cycles: Sequence[Detections]) -> float | None:
     return float(np.median(np.concatenate(found))) if found else None
 
 
-def _polar(points: Array) -> tuple[Array, Array]:
-    return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
-
-
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
-    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning."""
-    first, last = _at(odometry_t, poses, begin), _at(odometry_t, poses, end)
-    moved = turned(last[:, :2] - first[:, :2], -first[:, 2])
-    return np.column_stack([moved, last[:, 2] - first[:, 2]])
+    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning.
 
-
-def _at(odometry_t: Array, poses: Array, stamps: Array) -> Array:
-    """Return the poses (P, 3) at stamps (P,) by linear interpolation; beyond the ends they are held."""
-    return np.column_stack([np.interp(stamps, odometry_t, column) for column in poses.T])
-
-
-def turned(vectors: Array, angles: Array) -> Array:
-    c, s = np.cos(angles), np.sin(angles)
-    return np.column_stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]])
+    Poses (N, 3) are interpolated linearly; beyond the ends they are held.
+    """
+    first, last = (np.column_stack([np.interp(t, odometry_t, one) for one in poses.T]) for t in (begin, end))
+    return np.column_stack([to_vehicle(last[:, :2], first), last[:, 2] - first[:, 2]])
 
 
 # --- what the columns may mean ---------------------------------------------------------------------------
@@ -202,13 +194,10 @@ class Hypothesis:
             return np.column_stack([measured[:, :2], np.unwrap(measured[:, 2])])
         if self.content == "nothing":
             return np.zeros_like(measured)
-        dt = np.diff(odometry.t)[:, None]
-        heading = np.append(0.0, np.cumsum(measured[:-1, 2:] * dt))
-        if self.content == "twist":
-            steps = turned(se2_exp(measured[:-1] * dt)[:, :2], heading[:-1])
-        else:
-            steps = measured[:-1, :2] * dt
-        return np.column_stack([np.cumsum(np.vstack([np.zeros(2), steps]), axis=0), heading])
+        durations, held = np.diff(odometry.t), measured[:-1]
+        is_twist = self.content == "twist"
+        moved = integrate_poses(durations, held) if is_twist else np.cumsum(held * durations[:, None], axis=0)
+        return np.concatenate([np.zeros((1, 3)), moved])
 
 
 AS_WRITTEN: Final = Hypothesis()  # the log means what it should
@@ -259,7 +248,8 @@ class Trials:
 
     def motion(self, hypothesis: Hypothesis) -> Array:
         """Return the motion (P, 3) of the vehicle from the earlier to the later cycle of each pair."""
-        odometry, pairs, meaning = self.log.odometry, self.pairs, of_odometry(hypothesis)
+        odometry, pairs = self.log.odometry, self.pairs
+        meaning = replace(hypothesis, turn=0.0, mirrored=False, late=0.0)
         if meaning not in self._poses:
             self._poses[meaning] = meaning.poses(odometry)
         begin, end = pairs.begin - hypothesis.late, pairs.end - hypothesis.late
@@ -306,10 +296,6 @@ class Trials:
         distance = np.hypot(*points.T)
         near = (labels != UNKNOWN) & (distance < np.median(distance))
         return points[near], labels[near]
-
-
-def of_odometry(hypothesis: Hypothesis) -> Hypothesis:
-    return replace(hypothesis, turn=0.0, mirrored=False, late=0.0)
 
 
 # --- where the sensor is in the vehicle, and how late it is ----------------------------------------------

@@ -8,6 +8,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import RayNoise, ray_sigmas
 from pathspace_graph.front_end.front_end import measure_log
+from pathspace_graph.front_end.gate import TWIST
 from pathspace_graph.front_end.measurement import DRIFT, LEAST
 from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
 from pathspace_graph.io.log import Log
@@ -19,7 +20,6 @@ NOISE_AGREEMENT: Final = 1.2  # most between differences of different orders of 
 SCATTER_FACTOR: Final = 2.0  # of scatter and covariances, which a few cones and odometry tell less well
 NOISE_SHARE: Final = 0.75  # share of the detections from which on wrong covariances are told
 NOISE_CYCLES: Final = 300  # most cycles on which the noise of detections is measured
-TWIST: Final = (("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s"))
 
 
 def noise_hints(log: Log) -> list[Hint]:
@@ -48,7 +48,7 @@ def _odometry(log: Log) -> list[Hint]:
     for which, values, size in ((small, least, "small"), (large, most, "large")):
         figures = [
             f"{name} scatters by {values[k]:.2g} {unit}, where {stated[k]:.2g} is stated"
-            for k, (name, unit) in enumerate(TWIST)
+            for k, (name, unit) in enumerate(TWIST.items())
             if which[k]
         ]
         if figures:
