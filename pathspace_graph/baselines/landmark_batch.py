@@ -111,21 +111,19 @@ class LandmarkSystem:
 
     def cost(self, state: LandmarkState) -> float:
         """Return half the sum of squares at a state, with Huber's loss of the detections."""
-        losses = huber_loss(self._detection_rows(state, np.inf).residual, self.settings.gate.huber)
-        drive = self.chain.rows_at(state.variables, self.settings.calibration)
-        return half_square(drive) + float(losses.sum())
+        *drive, detections = self.rows(state, np.inf)
+        return half_square(drive) + float(huber_loss(detections.residual, self.settings.gate.huber).sum())
 
-    def rows(self, state: LandmarkState) -> list[Rows]:
-        drive = self.chain.rows_at(state.variables, self.settings.calibration)
-        return [*drive, self._detection_rows(state, self.settings.gate.huber)]
-
-    def eliminated(self, state: LandmarkState) -> Elimination:
-        return Elimination(linear_graph(self.rows(state), state.variables), state.variables.layout)
-
-    def _detection_rows(self, state: LandmarkState, huber: float) -> Rows:
+    def rows(self, state: LandmarkState, huber: float) -> list[Rows]:
+        """Return all rows, those of the detections last, weighted by a Huber threshold (sigmas)."""
         rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
         labels = state.labels[state.positions(indices(rows.keys[:, -1]))]
-        return replace(rows, owner=owners(rows.owner, labels == RIGHT))
+        seen = replace(rows, owner=owners(rows.owner, labels == RIGHT))
+        return [*self.chain.rows_at(state.variables, self.settings.calibration), seen]
+
+    def eliminated(self, state: LandmarkState) -> Elimination:
+        graph = linear_graph(self.rows(state, self.settings.gate.huber), state.variables)
+        return Elimination(graph, state.variables.layout)
 
     def optimize(self, state: LandmarkState) -> None:
         """Move a state to the optimum by Levenberg-Marquardt; the associations stay, the map is damped."""
@@ -137,12 +135,10 @@ class LandmarkSystem:
             if gain < 0.0:
                 variables.values = before
                 damping.grow()
-                if damping.exhausted:
-                    break
-                continue
-            cost -= gain
-            damping.lower()
-            if gain <= TOLERANCE * cost:
+            else:
+                cost -= gain
+                damping.lower()
+            if damping.exhausted or 0.0 <= gain <= TOLERANCE * cost:
                 break
         self.detections.correct(variables.sensor)
 
