@@ -24,7 +24,7 @@ from pathspace_graph.factors.gtsam_factors import pose_array, ribbon_factor
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.graph.gaussian import sparse_marginal
-from pathspace_graph.graph.variables import pose_key
+from pathspace_graph.graph.variables import POSE, pose_key
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import BatchRun, LapBatches, RunNoise, VehicleState
@@ -191,40 +191,31 @@ def shape_factors(ribbon: Ribbon, poses: Array, settings: MapperSettings) -> Ite
         sigma_anchor=np.inf,
     )
     for j in range(ribbon.size):
-        yield factor_beside(keys[j : j + 1], int(cycle[j]), 1, _of_line(beside_of(gauge, j)), RIBBON)
+        terms = _of_ribbon(beside_of(gauge, j), np.zeros((0, 1)))
+        yield factor_beside(keys[j : j + 1], int(cycle[j]), 1, terms, RIBBON)
     for row, weights in enumerate(ribbon.bending / settings.centerline.sigma_width):
-        terms = _with_width(bending_of(gauge, row), weights)
+        terms = _of_ribbon(bending_of(gauge, row), weights[None])
         yield factor_beside(keys[columns[row]], int(gauge.middle_cycle[row]), RIBBON, terms, RIBBON)
 
 
 Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
-def _of_line(terms: Terms) -> Terms:
-    def of_line(points: Array, pose: Array) -> tuple[Array, Array, Array]:
+def _of_ribbon(terms: Terms, weights: Array) -> Terms:
+    """Return terms of control points of a ribbon (k, 3), with a row for each of the weights (r, k) of widths.
+
+    The other rows are those of the centre line, which `terms` are.
+    """
+
+    def of_ribbon(points: Array, pose: Array) -> tuple[Array, Array, Array]:
         residual, by_points, by_pose = terms(points[:, :2], pose)
-        return residual, np.column_stack([by_points, np.zeros(1)]), by_pose
+        count = residual.size
+        by_all, by_any_pose = np.zeros((count + len(weights), *points.shape)), np.zeros((len(weights), POSE))
+        by_all[:count, :, :2], by_all[count:, :, 2] = by_points.reshape(count, -1, 2), weights
+        by_poses = np.vstack([by_pose.reshape(count, POSE), by_any_pose])
+        return np.append(residual, weights @ points[:, 2]), by_all, by_poses
 
-    return of_line
-
-
-def _with_width(terms: Terms, weights: Array) -> Terms:
-    """Return bending terms of three control points of a ribbon, with weights (3,) for that of the width."""
-
-    def with_width(points: Array, pose: Array) -> tuple[Array, Array, Array]:
-        residual, by_points, by_pose = terms(points[:, :2], pose)
-        by_all = np.zeros((RIBBON, 3, RIBBON))
-        by_all[:2, :, :2], by_all[2, :, 2] = by_points.reshape(2, 3, 2), weights
-        return np.append(residual, weights @ points[:, 2]), by_all, np.vstack([by_pose[0], np.zeros(3)])
-
-    return with_width
-
-
-def ribbon_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ribbon: Ribbon) -> Array:
-    keys = np.array(ribbon_keys(ribbon))
-    marginal = sparse_marginal(graph.linearize(values), keys)
-    information, _ = marginal.hessian(gtsam.Ordering(keys.tolist()))
-    return np.asarray(np.linalg.inv(information), np.float64)
+    return of_ribbon
 
 
 @log_at_scale
@@ -256,7 +247,7 @@ class CenterlineBatch:
     def _optimized(self, start: BatchResult, run: BatchRun) -> BatchRun:
         settings, splines, count = self.settings, start.optimum.state.splines, len(start.trajectory)
         if len(splines) < len(SIDE):
-            raise SettingsError(f"a centre line: expected both boundaries, found {len(splines)}")
+            return run
         left, right = splines.values()
         line = find_line(left, right, start.optimum.state.closed, settings.centerline.spacing)
         ribbon, variables, drive = line.ribbon, start.optimum.state.variables, gtsam.NonlinearFactorGraph()
@@ -265,7 +256,8 @@ class CenterlineBatch:
         values = variables.gtsam_values(variables.calibration_keys)
         for k, pose in enumerate(variables.poses):
             values.insert(pose_key(k), gtsam.Pose2(*pose))
-        for key, point in zip(ribbon_keys(ribbon), ribbon.distinct_control_points, strict=True):
+        keys = ribbon_keys(ribbon)
+        for key, point in zip(keys, ribbon.distinct_control_points, strict=True):
             values.insert(key, point)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setRelativeErrorTol(TOLERANCE)
@@ -276,8 +268,9 @@ class CenterlineBatch:
                 graph.add(factor)
             optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
             values = optimizer.optimize()
-            ribbon = ribbon.with_points(np.array([values.atPoint3(key) for key in ribbon_keys(ribbon)]))
-        covariance = ribbon_covariance(graph, values, ribbon)
+            ribbon = ribbon.with_points(np.array([values.atPoint3(key) for key in keys]))
+        marginal = sparse_marginal(graph.linearize(values), np.array(keys))
+        covariance = np.asarray(np.linalg.inv(marginal.hessian(gtsam.Ordering(keys))[0]), np.float64)
         return replace(
             run,
             map=replace(map_of(ribbon, covariance, settings.spline.sigma_shape, {}), points=start.map.points),

@@ -57,11 +57,11 @@ class LandmarkBatch:
         system = LandmarkSystem.of_log(log, self.settings, self.noise)
         system, state = start_online(log, system, self.noise)
         system.optimize(state)
-        rounds, converged = 0, False
-        while not converged and rounds < MAX_ROUNDS:
-            rounds += 1
+        for _ in range(MAX_ROUNDS):
             converged = self._refresh(system, state) <= SETTLED * len(system.detections)
             system.optimize(state)
+            if converged:
+                break
         return self._result(system, state, converged)
 
     def _refresh(self, system: "LandmarkSystem", state: LandmarkState) -> int:
@@ -263,11 +263,9 @@ def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray
     """
     landmark = problem.map.columns(keys)[:, None] + np.arange(POINT)
     pose = POSE * cycles[:, None] + np.arange(POSE)
-    joint = np.empty((len(cycles), POSE + POINT, POSE + POINT))
-    joint[:, :POSE, :POSE] = problem.pose_marginals[cycles]
-    joint[:, :POSE, POSE:] = problem.cross_covariance[pose[:, :, None], landmark[:, None, :]]
-    joint[:, POSE:, :POSE] = np.swapaxes(joint[:, :POSE, POSE:], 1, 2)
-    joint[:, POSE:, POSE:] = problem.map_covariance[landmark[:, :, None], landmark[:, None, :]]
+    cross = problem.cross_covariance[pose[:, :, None], landmark[:, None, :]]
+    own = problem.map_covariance[landmark[:, :, None], landmark[:, None, :]]
+    joint = np.block([[problem.pose_marginals[cycles], cross], [np.swapaxes(cross, 1, 2), own]])
     return np.asarray(jacobian @ joint @ np.swapaxes(jacobian, 1, 2))
 
 
