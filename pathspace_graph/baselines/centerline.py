@@ -7,15 +7,9 @@ from typing import Final
 import gtsam
 import numpy as np
 
+from pathspace_graph.batch import mapper as batch
 from pathspace_graph.batch.association import headings
-from pathspace_graph.batch.mapper import (
-    BatchMapper,
-    BatchResult,
-    bending_of,
-    beside_of,
-    drive_factors,
-    factor_beside,
-)
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.start import CurveMapper
 from pathspace_graph.batch.system import CurveGauge
 from pathspace_graph.errors import SettingsError
@@ -191,11 +185,11 @@ def shape_factors(ribbon: Ribbon, poses: Array, settings: MapperSettings) -> Ite
         sigma_anchor=np.inf,
     )
     for j in range(ribbon.size):
-        terms = _of_ribbon(beside_of(gauge, j), np.zeros((0, 1)))
-        yield factor_beside(keys[j : j + 1], int(cycle[j]), 1, terms, RIBBON)
+        terms = _of_ribbon(batch.beside_of(gauge, j), np.zeros((0, 1)))
+        yield batch.factor_beside(keys[j : j + 1], int(cycle[j]), 1, terms, RIBBON)
     for row, weights in enumerate(ribbon.bending / settings.centerline.sigma_width):
-        terms = _of_ribbon(bending_of(gauge, row), weights[None])
-        yield factor_beside(keys[columns[row]], int(gauge.middle_cycle[row]), RIBBON, terms, RIBBON)
+        terms = _of_ribbon(batch.bending_of(gauge, row), weights[None])
+        yield batch.factor_beside(keys[columns[row]], int(gauge.middle_cycle[row]), RIBBON, terms, RIBBON)
 
 
 Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
@@ -251,7 +245,10 @@ class CenterlineBatch:
         left, right = splines.values()
         line = find_line(left, right, start.optimum.state.closed, settings.centerline.spacing)
         ribbon, variables, drive = line.ribbon, start.optimum.state.variables, gtsam.NonlinearFactorGraph()
-        for factor in (*drive_factors(start.system, start.optimum), *edge_factors(start, line, settings)):
+        for factor in (
+            *batch.drive_factors(start.system, start.optimum),
+            *edge_factors(start, line, settings),
+        ):
             drive.add(factor)
         values = variables.gtsam_values(variables.calibration_keys)
         for k, pose in enumerate(variables.poses):

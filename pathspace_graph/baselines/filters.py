@@ -43,6 +43,9 @@ SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the
 TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
 
+Used = tuple[int, tuple[int, int], bool]  # number of detections that were used, sizes, whether it has closed
+
+
 class _Filter:
     """What both filters share; a late cycle is a ReadingError, since no earlier pose could take it."""
 
@@ -71,10 +74,8 @@ class _Filter:
         return cycle.counted(CycleResult(detections.t, pose, sizes, used, closed, watch.laps))
 
     @abstractmethod
-    def _use(
-        self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch
-    ) -> tuple[int, tuple[int, int], bool]:
-        """Map a cycle; return how many detections were used, the sizes, and whether the loop has closed."""
+    def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
+        """Map a cycle."""
 
     def noise_used(self) -> RunNoise:
         return self.front_end.noise_used
@@ -95,9 +96,7 @@ class CkfMapper(_Filter):
         self._recent: list[tuple[Array, Detections]] = []
         self._last_check = 0.0
 
-    def _use(
-        self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch
-    ) -> tuple[int, tuple[int, int], bool]:
+    def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
         state = self.state
         state.locate_vehicle()
         self.path.update(state.pose.copy())
@@ -246,9 +245,7 @@ class LandmarkCkf(_Filter):
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """Tracks by label that are not landmarks yet."""
 
-    def _use(
-        self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch
-    ) -> tuple[int, tuple[int, int], bool]:
+    def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
         watch.lap("predict")
         landmark, is_new = self._associate(detections)
         watch.lap("associate")

@@ -43,6 +43,7 @@ REST: Final = 1.0  # time of standing from which the mean yaw rate measures the 
 REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest, m/s, m/s, rad/s, but for noise
 REST_SIGMAS: Final = 3.0  # standard deviations of the mean that count as its noise
 SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # m, m, rad, of a motion at rest from cycle to cycle
+Seen = tuple[Array, Array]  # corrected detections (m, 2), vehicle frame, and variances (m,) of a coordinate
 
 
 class MotionCheck:
@@ -79,20 +80,19 @@ class MotionCheck:
         motion = self._integrate(odometry, t)
         columns = by_errors(measured, motion.odometry.twist)
         points, covariances = measured + columns @ self.errors.mean, detections.covariances
-        detections = Detections(t, points, covariances, detections.labels)
-        variances = 0.5 * (detections.covariances[:, 0, 0] + detections.covariances[:, 1, 1])
+        seen = points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
         self._recent.forget(t)
         self._recent.correct(self.errors.mean)
         self._limit = DOUBT_AGAIN if t - self._doubted_at < DISTRUST else self.settings.doubt
         self._matched = None
-        motion = self._checked(motion, detections, variances, may_doubt)
+        motion = self._checked(motion, t, seen, may_doubt)
         if motion.doubted:
             self._doubted_at = t
         if not motion.fault and self._rest.update(odometry, t):
-            motion = self._at_rest(motion, detections, variances)
+            motion = self._at_rest(motion, t, seen)
         self.pose = compose(self.pose, motion.odometry.delta)
-        points = to_map(detections.points_vehicle, self.pose[None])
-        self.seen_again = self._recent.has(points) if self._matched is None else self._matched
+        placed = to_map(points, self.pose[None])
+        self.seen_again = self._recent.has(placed) if self._matched is None else self._matched
         if motion.fault:
             columns = by_errors(measured, motion.odometry.twist)  # by the twist that is believed
         self._recent.add(t, measured, columns, self.pose)
@@ -127,24 +127,22 @@ class MotionCheck:
         stuck = _is_stuck(odometry.twist)
         return MeasuredMotion(integrated, odometry.twist, False, missing, stuck, None, durations, excess)
 
-    def _at_rest(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
-        standing = self._match(detections, variances, self.pose, REACHES_CHECK)
+    def _at_rest(self, motion: MeasuredMotion, t: float, seen: Seen) -> MeasuredMotion:
+        standing = self._match(seen, self.pose, REACHES_CHECK)
         none = integrated_odometry(np.zeros(3), np.diag(SIGMAS_REST) ** 2, NO_CALIBRATION)
         if standing is None or self._denies(standing, self._difference(none, self.pose, standing)):
             self._rest.end()
             return motion
-        return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(detections.t))
+        return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(t))
 
-    def _checked(
-        self, motion: MeasuredMotion, detections: Detections, variances: Array, may_doubt: bool
-    ) -> MeasuredMotion:
+    def _checked(self, motion: MeasuredMotion, t: float, seen: Seen, may_doubt: bool) -> MeasuredMotion:
         """Return the motion, or that of the detections where they contradict it, or where it is missing."""
-        if self._t is None or detections.t <= self._t:
+        if self._t is None or t <= self._t:
             return motion
-        odometry, dt = motion.odometry, detections.t - self._t
+        odometry, dt = motion.odometry, t - self._t
         going_on = dt * (odometry.twist if self._velocity is None else self._velocity)
         predicted = compose(self.pose, odometry.delta)
-        near = self._match(detections, variances, predicted, REACHES_CHECK)
+        near = self._match(seen, predicted, REACHES_CHECK)
         if near is not None and near.misfit > MAX_MISFIT * self._excess:
             near = None
         told = near is not None and near.matched >= MIN_DOUBTING
@@ -160,24 +158,21 @@ class MotionCheck:
                 return motion
         if not (may_doubt or failed):
             return motion
-        best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
+        best = self._best(seen, (compose(self.pose, going_on), predicted), dt)
         if best is not None and not failed:
             denied = self._denies(best, self._difference(odometry, predicted, best))
-            failed = denied and self._fits_better(best, predicted, detections, variances)
+            failed = denied and self._fits_better(best, predicted, seen)
         return self._replaced(motion, best, going_on, dt) if failed else motion
 
-    def _fits_better(self, best: Match, predicted: Array, detections: Detections, variances: Array) -> bool:
+    def _fits_better(self, best: Match, predicted: Array, seen: Seen) -> bool:
         """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
-        points, variances = detections.points_vehicle[best.is_matched], variances[best.is_matched]
-        at_odometry, at_match = (
-            scans.misfit_at(self._recent, points, variances, pose) for pose in (predicted, best.pose)
-        )
+        points, variances = (column[best.is_matched] for column in seen)
+        at_odometry = scans.misfit_at(self._recent, points, variances, predicted)
+        at_match = scans.misfit_at(self._recent, points, variances, best.pose)
         return at_odometry > max(MISFIT_ODOMETRY, MISFIT_RATIO * at_match)
 
-    def _best(
-        self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float
-    ) -> Match | None:
-        matches = [self._match(detections, variances, start, scans.REACHES) for start in starts]
+    def _best(self, seen: Seen, starts: tuple[Array, Array], dt: float) -> Match | None:
+        matches = [self._match(seen, start, scans.REACHES) for start in starts]
         possible = [one for one in matches if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)
 
@@ -190,10 +185,8 @@ class MotionCheck:
     def _denies(self, matched: Match, difference: Difference) -> bool:
         return matched.matched >= MIN_DOUBTING and self.errors.square_of(difference) > self._limit**2
 
-    def _match(
-        self, detections: Detections, variances: Array, start: Array, reaches: Sequence[float]
-    ) -> Match | None:
-        matched = scans.match(self._recent, detections.points_vehicle, variances, start, reaches)
+    def _match(self, seen: Seen, start: Array, reaches: Sequence[float]) -> Match | None:
+        matched = scans.match(self._recent, *seen, start, reaches)
         return matched if matched.matched >= scans.MIN_MATCHED and matched.is_certain else None
 
     def _difference(self, odometry: IntegratedOdometry, predicted: Array, matched: Match) -> Difference:
@@ -229,10 +222,9 @@ class MotionCheck:
                 off = delta - odometry.delta
                 covariance += np.outer(off, off) * BEFORE**2
             mean = delta
-        replaced = replace(integrated_odometry(mean, covariance, NO_CALIBRATION), twist=mean / dt)
-        return MeasuredMotion(
-            replaced, replaced.twist[None], not motion.missing, motion.missing, motion.stuck
-        )
+        replaced, twist = integrated_odometry(mean, covariance, NO_CALIBRATION), mean / dt
+        found = not motion.missing, motion.missing, motion.stuck
+        return MeasuredMotion(replace(replaced, twist=twist), twist[None], *found)
 
 
 class Rest:

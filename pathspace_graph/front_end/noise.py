@@ -127,14 +127,12 @@ class NoiseLearner:
             return settings
         sigmas = np.maximum(measured.sensor_sigma, sensor.sigmas)
         odometry, means = settings.odometry, measured.sensor.copy()
-        if not contradicted[SCALE]:
-            means[SCALE], sigmas[SCALE] = sensor.range_scale, sensor.sigma_range_scale
-        elif self.trusts_odometry(settings):
+        if contradicted[SCALE] and self.trusts_odometry(settings):
             odometry = replace(odometry, hold_scale=True)
         else:
-            scale = float(means[SCALE])
-            sigma = max(float(sigmas[SCALE]), odometry.sigma_scale)
-            odometry = replace(odometry, scale=-scale / (1.0 + scale), doubt=inf, sigma_scale=sigma)
+            if contradicted[SCALE]:
+                scale, sigma = float(means[SCALE]), max(float(sigmas[SCALE]), odometry.sigma_scale)
+                odometry = replace(odometry, scale=-scale / (1.0 + scale), doubt=inf, sigma_scale=sigma)
             means[SCALE], sigmas[SCALE] = sensor.range_scale, sensor.sigma_range_scale
         priors: dict[str, Any] = dict(zip(SENSOR, means.tolist(), strict=True))
         priors |= {f"sigma_{name}": sigma for name, sigma in zip(SENSOR, sigmas.tolist(), strict=True)}

@@ -125,43 +125,26 @@ def _matched(
     reaches: Sequence[float],
     limits: tuple[float, ...],
 ) -> tuple[Array, Array, BoolArray, float]:
-    """Return the pose (3,) of `match`, and of its last step what `_match_step` returns but the gradient."""
-    pose, (min_matched, least_share) = start.copy(), limits[4:]
+    """Return the pose (3,) of `match`, and information (3, 3), matched ones (m,) and cost of its last step."""
+    pose, (farthest, min_weight, huber, sigma_cone, min_matched, least_share) = start.copy(), limits
     for reach in reaches:
-        information, gradient, matched, cost = _match_step(
-            recent, points_vehicle, variances, pose, reach, limits
-        )
+        points = to_map(points_vehicle, pose[None])
+        means, weights = _weighted_means(points, recent, reach, farthest)
+        matched = weights > min_weight
+        off, arm = (points - means)[matched], (points - pose[:2])[matched]
+        precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + sigma_cone**2)
+        square = (off * off).sum(axis=1)
+        precision *= huber_weights(np.sqrt(square * precision), huber)
+        (ax, ay), (ex, ey) = arm.T, off.T
+        w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
+        turning = precision @ (ax * ax + ay * ay)
+        information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
+        gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
         if matched.sum() < min_matched:
             break
         regular = information + np.diag(least_share * information.diagonal())
         pose = pose - np.linalg.solve(regular, gradient)
-    return pose, information, matched, cost
-
-
-def _match_step(
-    recent: Array,
-    points_vehicle: Array,
-    variances: Array,
-    pose: Array,
-    reach: float,
-    limits: tuple[float, ...],
-) -> tuple[Array, Array, BoolArray, float]:
-    """Return information (3, 3), gradient (3,), which detections (m,) match, and their weighted cost."""
-    farthest, min_weight, huber, sigma_cone = limits[:4]
-    points = to_map(points_vehicle, pose[None])
-    means, weights = _weighted_means(points, recent, reach, farthest)
-    matched = weights > min_weight
-    off, arm = (points - means)[matched], (points - pose[:2])[matched]
-    precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + sigma_cone**2)
-    square = (off * off).sum(axis=1)
-    precision *= huber_weights(np.sqrt(square * precision), huber)
-    ax, ay = arm.T
-    ex, ey = off.T
-    w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
-    turning = precision @ (ax * ax + ay * ay)
-    information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
-    gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
-    return information, gradient, matched, float(square @ precision)
+    return pose, information, matched, float(square @ precision)
 
 
 def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:

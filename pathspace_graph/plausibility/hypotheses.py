@@ -10,11 +10,12 @@ from functools import cached_property
 from typing import Final, Literal, Self
 
 import numpy as np
+from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.odometry import integrate_poses
-from pathspace_graph.factors.se2 import rotation, rotations, to_vehicle, wrap_angle
+from pathspace_graph.factors.se2 import left_of, rotation, rotations, to_vehicle, wrap_angle
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, UNKNOWN
 
@@ -129,14 +130,9 @@ def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:
 
 def spacing_of(cycles: Sequence[Detections]) -> float | None:
     """Return the median distance from a detection to the next one of its cycle, or None without any."""
-    found = []
-    for cycle in cycles:
-        points = cycle.points_vehicle
-        off = points[:, None] - points
-        square = (off * off).sum(axis=-1)
-        np.fill_diagonal(square, np.inf)
-        found.append(np.sqrt(square.min(axis=1)))
-    return float(np.median(np.concatenate(found))) if found else None
+    rows = [cycle.points_vehicle for cycle in cycles]
+    nearest = [np.asarray(KDTree(points).query(points, k=2)[0])[:, 1] for points in rows]
+    return float(np.median(np.concatenate(nearest))) if nearest else None
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
@@ -320,36 +316,29 @@ def mounting_of(trials: Trials, hypothesis: Hypothesis) -> Mounting | None:
     `a - R b - t + (J t) yaw + (I - R) l`, in first order of the yaw and exactly in the lever arm l.
     """
     motion, frame = trials.motion(hypothesis), hypothesis.frame
-    values, sigmas = np.zeros(3), np.full(3, np.inf)
+    values = np.zeros(3)
     for _ in range(MOUNTING_STEPS):
-        turned = rotation(values[0]) @ frame
         seen = motion + lever(motion, values[1:])
-        off, variances, rows = _matches(trials, turned, seen)
+        off, variances, rows = _matches(trials, rotation(values[0]) @ frame, seen)
         if len(rows) < LEAST_MATCHES:
             return None
-        columns = _columns(motion[rows], values[1:])
+        by_arm = [-lever(motion[rows], unit)[:, :2] for unit in np.eye(2)]
+        columns = np.stack([left_of(seen[rows, :2]), *by_arm], axis=2)
         normal = np.einsum("nki,nkj->ij", columns, columns)
         if np.linalg.cond(normal) > WORST_CONDITION:
             return None
         values = values - np.linalg.solve(normal, np.einsum("nki,nk->i", columns, off))
-        sigmas = _sigmas(columns, off, rows, normal)
-    scatter = float(np.median(np.hypot(*off.T)))
-    return Mounting(values, sigmas, scatter, float(np.median(np.sqrt(variances * MEDIAN_SQUARE))))
+    scores, inverse = np.zeros((len(motion), 3)), np.linalg.inv(normal)
+    np.add.at(scores, rows, np.einsum("nki,nk->ni", columns, off))  # a pair's matches are one observation
+    sigmas = np.sqrt(np.diag(inverse @ (scores.T @ scores) @ inverse))
+    claimed = np.median(np.sqrt(variances * MEDIAN_SQUARE))
+    return Mounting(values, sigmas, float(np.median(np.hypot(*off.T))), float(claimed))
 
 
 def lever(motion: Array, arm: Array) -> Array:
     """Return what a lever arm (2,) adds to motions (P, 3): a sensor there moves by `t + (R - I) l`."""
     c, s = np.cos(motion[:, 2]) - 1.0, np.sin(motion[:, 2])
     return np.column_stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1], np.zeros(len(motion))])
-
-
-def _columns(motion: Array, arm: Array) -> Array:
-    seen = motion + lever(motion, arm)
-    columns = np.zeros((len(motion), 2, 3))
-    columns[:, 0, 0], columns[:, 1, 0] = -seen[:, 1], seen[:, 0]
-    for k, unit in enumerate(np.eye(2)):
-        columns[:, :, 1 + k] = -lever(motion, unit)[:, :2]
-    return columns
 
 
 def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array, IntArray]:
@@ -363,14 +352,6 @@ def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array,
     after = forth[rows, before]
     off = pairs.before[rows, before] @ frame.T - pairs.laid(frame, motion)[rows, after]
     return off, pairs.variances[rows, before, after], rows
-
-
-def _sigmas(columns: Array, off: Array, rows: IntArray, normal: Array) -> Array:
-    """Return the standard deviations (3,), for which the matches of one pair count as one observation."""
-    scores = np.zeros((int(rows.max()) + 1, 3))
-    np.add.at(scores, rows, np.einsum("nki,nk->ni", columns, off))
-    inverse = np.linalg.inv(normal)
-    return np.asarray(np.sqrt(np.diag(inverse @ (scores.T @ scores) @ inverse)))
 
 
 def best_lateness(trials: Trials, best: Trial) -> Trial:

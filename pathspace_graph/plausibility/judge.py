@@ -19,20 +19,7 @@ from pathspace_graph.settings.online import LimitSettings
 
 from . import hypotheses
 from .hint import Hint, because, told
-from .hypotheses import (
-    AS_WRITTEN,
-    DEGREE,
-    GAPS,
-    LEAST_SHARE,
-    Hypothesis,
-    Mounting,
-    Pairs,
-    Trial,
-    Trials,
-    far_better,
-    motions,
-    pairs_of,
-)
+from .hypotheses import AS_WRITTEN, DEGREE, Hypothesis, Mounting, Pairs, Trial, Trials, far_better
 from .noise import noise_hints
 
 LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is said
@@ -102,7 +89,7 @@ def _hints(log: Log) -> list[Hint]:
         return found + of_clocks
     log, of_positions = positions_in_metres(log)
     found += of_positions
-    pairs = pairs_of(log.cycles)
+    pairs = hypotheses.pairs_of(log.cycles)
     if pairs is None:
         return found + beyond_any_vehicle(log.odometry)
     found += _by_motion(Trials(log, telling_pairs(log, pairs)))
@@ -188,8 +175,8 @@ def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
     like the next. Where the odometry is impossible anyway, the pairs are those that follow each other.
     """
     if beyond_any_vehicle(log.odometry):
-        return pairs.chosen(pairs.gap <= GAPS[1])
-    motion = motions(log.odometry.t, AS_WRITTEN.poses(log.odometry), pairs.begin, pairs.end)
+        return pairs.chosen(pairs.gap <= hypotheses.GAPS[1])
+    motion = hypotheses.motions(log.odometry.t, AS_WRITTEN.poses(log.odometry), pairs.begin, pairs.end)
     return pairs.chosen(pairs.overlap(motion) >= OVERLAP)
 
 
@@ -200,7 +187,7 @@ def _by_motion(trials: Trials) -> list[Hint]:
     if best.hypothesis.content == "nothing" or (found and camera(trials.pairs)):
         return found
     late, of_clocks = _late(trials, best)
-    if best.share < LEAST_SHARE and late is best:
+    if best.share < hypotheses.LEAST_SHARE and late is best:
         return found + (_unexplained(trials, best) if not found else [])
     mounting = hypotheses.mounting_of(trials, late.hypothesis)
     found += of_clocks
