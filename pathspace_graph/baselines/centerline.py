@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import chain
 from typing import Final
 
 import gtsam
@@ -245,10 +246,8 @@ class CenterlineBatch:
         left, right = splines.values()
         line = find_line(left, right, start.optimum.state.closed, settings.centerline.spacing)
         ribbon, variables, drive = line.ribbon, start.optimum.state.variables, gtsam.NonlinearFactorGraph()
-        for factor in (
-            *batch.drive_factors(start.system, start.optimum),
-            *edge_factors(start, line, settings),
-        ):
+        drawn = batch.drive_factors(start.system, start.optimum), edge_factors(start, line, settings)
+        for factor in chain(*drawn):
             drive.add(factor)
         values = variables.gtsam_values(variables.calibration_keys)
         for k, pose in enumerate(variables.poses):

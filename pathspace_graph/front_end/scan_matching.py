@@ -125,7 +125,7 @@ def _matched(
     reaches: Sequence[float],
     limits: tuple[float, ...],
 ) -> tuple[Array, Array, BoolArray, float]:
-    """Return the pose (3,) of `match`, and information (3, 3), matched ones (m,) and cost of its last step."""
+    """Return the pose (3,) of `match`, and information (3, 3), matches (m,) and cost of its last step."""
     pose, (farthest, min_weight, huber, sigma_cone, min_matched, least_share) = start.copy(), limits
     for reach in reaches:
         points = to_map(points_vehicle, pose[None])
