@@ -21,7 +21,7 @@ from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.graph.gaussian import sparse_marginal
 from pathspace_graph.graph.variables import POSE, pose_key
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
+from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, LapBatches, RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -48,19 +48,19 @@ def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: 
     `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.
     """
     edges, joint, at = {label: ribbon.edge_spline(label) for label in BOUNDARIES}, None, 0
-    blocks = dict.fromkeys(BOUNDARIES, NO_COVARIANCE)
     if covariance is not None:
         by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
         joint = by_ribbon @ covariance @ by_ribbon.T
         joint = 0.5 * (joint + joint.T)
-        for label, (_, jacobian) in edges.items():
+    boundaries = {}
+    for label, (spline, jacobian) in edges.items():
+        own = NO_COVARIANCE
+        if joint is not None:
             block = slice(at, at := at + len(jacobian))
-            blocks[label] = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
-    boundaries = {
-        label: SplineBoundary(spline, blocks[label], until.get(label, spline.domain[1]))
-        for label, (spline, _) in edges.items()
-    }
-    return Map(ribbon.periodic, boundaries, None if joint is None else joint_covariance(joint, boundaries))
+            own = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
+            joint[block, block] = own
+        boundaries[label] = SplineBoundary(spline, own, until.get(label, spline.domain[1]))
+    return Map(ribbon.periodic, boundaries, joint)
 
 
 def ribbon_of(track: Map, settings: MapperSettings) -> tuple[Ribbon, Array | None, dict[int, float]]:

@@ -7,12 +7,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.odometry import (
-    CALIBRATION_SIZE,
-    IntegratedOdometry,
-    integrate_twists,
-    integrated_odometry,
-)
+from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, integrate_odometry
@@ -22,7 +17,7 @@ from . import scan_matching as scans
 from .gate import Newest
 from .scan_matching import REACHES_CHECK, Difference, Match, RecentDetections, SensorErrors, by_errors
 
-NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))  # of a motion that is not by odometry
+NO_CALIBRATION: Final = np.zeros((3, 2))  # derivative of a motion that is not by odometry
 DOUBT_AGAIN: Final = 3.8  # contradiction of an odometry that was contradicted not long ago, sigmas
 DISTRUST: Final = 12.0  # time for which it is distrusted so, s: wheels that slip do so in the next bends, too
 DOUBT_RATE: Final = 2.0  # agreement within which a contradicted odometry's yaw rate is believed, sigmas

@@ -15,7 +15,7 @@ from scipy.special import bdtrc
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.odometry import integrate_poses
-from pathspace_graph.factors.se2 import left_of, rotation, rotations, to_vehicle, wrap_angle
+from pathspace_graph.factors.se2 import left_of, rotation, rotations, to_vehicle
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, UNKNOWN
 
@@ -74,18 +74,13 @@ class Pairs:
 
     def overlap(self, motion: Array) -> Array:
         """Return the share (P,) of the later detections that the earlier cycle could have seen."""
-
-        def polar(points: Array) -> tuple[Array, Array]:
-            return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
-
-        ranges, bearings = polar(self.before)
-        vector = np.nanmean(np.exp(1j * bearings))
-        middle = float(np.angle(vector)) if abs(vector) > ROUND else 0.0
-        farthest = np.nanquantile(ranges, SEEN)
-        widest = np.nanquantile(np.abs(wrap_angle(bearings - middle)), SEEN)
-        ranges, bearings = polar(self.laid(np.eye(2), motion))
-        inside = (ranges < farthest) & (np.abs(wrap_angle(bearings - middle)) < widest)
-        return np.asarray(inside.sum(axis=1) / np.isfinite(ranges).sum(axis=1))
+        seen, again = (points @ [1.0, 1j] for points in (self.before, self.laid(np.eye(2), motion)))
+        vector = np.nanmean(np.exp(1j * np.angle(seen)))
+        back = vector.conjugate() if abs(vector) > ROUND else 1.0  # turns the middle of the view ahead
+        farthest = np.nanquantile(np.abs(seen), SEEN)
+        widest = np.nanquantile(np.abs(np.angle(seen * back)), SEEN)
+        inside = (np.abs(again) < farthest) & (np.abs(np.angle(again * back)) < widest)
+        return np.asarray(inside.sum(axis=1) / np.isfinite(again).sum(axis=1))
 
     @property
     def count(self) -> IntArray:
@@ -196,13 +191,25 @@ class Hypothesis:
         return np.concatenate([np.zeros((1, 3)), moved])
 
 
+SPEEDS: Final = {  # what a unit of the speeds (m/s) means
+    1.0 / 3.6: "are in km/h, not in m/s",
+    0.44704: "are in miles per hour, not in m/s",
+    0.514444: "are in knots, not in m/s",
+    1e-2: "are in cm/s, not in m/s",
+    1e-3: "are in mm/s, not in m/s",
+    3.6: "were divided by 3.6 although they were in m/s",
+    1e3: "were divided by 1000 although they were in m/s",
+}
+RATES: Final = {  # what a unit of the yaw rate (rad/s) means
+    DEGREE: "is in degrees per second, not in rad/s",
+    1.0 / DEGREE: "was turned from degrees to radians although it was in rad/s",
+}
 AS_WRITTEN: Final = Hypothesis()  # the log means what it should
 MEANINGS: Final = (  # of the odometry; of equally good ones the first is told
     AS_WRITTEN,
     Hypothesis("nothing"),
-    Hypothesis(rate=DEGREE),
-    Hypothesis(rate=1.0 / DEGREE),
-    *(Hypothesis(speed=speed) for speed in (1.0 / 3.6, 0.44704, 0.514444, 1e-2, 1e-3, 3.6, 1e3)),
+    *(Hypothesis(rate=rate) for rate in RATES),
+    *(Hypothesis(speed=speed) for speed in SPEEDS),
     *(Hypothesis(speed=speed, rate=DEGREE) for speed in (1.0 / 3.6, 1e-2, 1e-3)),
     Hypothesis("twist in the map frame"),
     Hypothesis("twist in the map frame", rate=DEGREE),

@@ -18,9 +18,9 @@ from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
 
 from . import hypotheses
+from .diagnosis import noise_hints
 from .hint import Hint, because, told
 from .hypotheses import AS_WRITTEN, DEGREE, Hypothesis, Mounting, Pairs, Trial, Trials, far_better
-from .noise import noise_hints
 
 LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is said
 OVERLAP: Final = 0.5  # share of its detections that another cycle sees, from which they are compared
@@ -46,19 +46,6 @@ UNEXPLAINED: Final = 0.15  # share of the detections that the best motion must e
 LINE_RATIO: Final = 0.1  # ratio of the variations of two coordinates below which detections lie on a line
 TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size in s
 LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # units of positions by their size in m
-SPEEDS: Final = {  # what a unit of the speeds (m/s) means
-    1.0 / 3.6: "are in km/h, not in m/s",
-    0.44704: "are in miles per hour, not in m/s",
-    0.514444: "are in knots, not in m/s",
-    1e-2: "are in cm/s, not in m/s",
-    1e-3: "are in mm/s, not in m/s",
-    3.6: "were divided by 3.6 although they were in m/s",
-    1e3: "were divided by 1000 although they were in m/s",
-}
-RATES: Final = {  # what a unit of the yaw rate (rad/s) means
-    DEGREE: "is in degrees per second, not in rad/s",
-    1.0 / DEGREE: "was turned from degrees to radians although it was in rad/s",
-}
 FRAMES: Final = {  # what a turn of the sensor (degrees), mirrored or not, means
     (180.0, False): "the sensor's frame has x to the rear and y to the right",
     (-90.0, False): "the sensor's frame has x to the right and y ahead",
@@ -250,9 +237,13 @@ def _of_odometry(meaning: Hypothesis, figures: dict[str, float]) -> list[Hint]:
         return [told("nothing", **figures)]
     found = [] if meaning.content == "twist" else [told(meaning.content, **figures)]
     if meaning.speed != 1.0:
-        found.append(told("unit of speeds", what=SPEEDS[meaning.speed], factor=meaning.speed, **figures))
+        found.append(
+            told("unit of speeds", what=hypotheses.SPEEDS[meaning.speed], factor=meaning.speed, **figures)
+        )
     if meaning.rate != 1.0:
-        found.append(told("unit of yaw rate", what=RATES[meaning.rate], factor=meaning.rate, **figures))
+        found.append(
+            told("unit of yaw rate", what=hypotheses.RATES[meaning.rate], factor=meaning.rate, **figures)
+        )
     return found
 
 
