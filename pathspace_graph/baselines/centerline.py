@@ -39,9 +39,6 @@ MAX_ITERATIONS: Final = 15  # most iterations of one of them
 TOLERANCE: Final = 1e-5  # share by which an iteration lowers the error at least, or it is the last one
 
 
-# --- the map of a ribbon, and the ribbon of a map --------------------------------------------------------
-
-
 def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
     """Return the edges of a ribbon as a map, with the covariance (3m, 3m) of its control points, if known.
 
@@ -126,9 +123,6 @@ class CenterlineMapper:
         return replace(edges, points=track.points)
 
 
-# --- the graph of a log ----------------------------------------------------------------------------------
-
-
 def ribbon_keys(ribbon: Ribbon) -> list[int]:
     return [int(gtsam.symbol(RIBBON_LETTER, j)) for j in range(ribbon.size)]
 
@@ -143,9 +137,8 @@ def edge_factors(
         u = line.ribbon_parameters(side, projected.foot.u[used])
         parts.append((projected.rows[used], np.full(len(u), SIDE[label]), u))
     rows, sides, u = (np.concatenate(part) for part in zip(*parts, strict=True))
-    order = np.lexsort((rows, table.cycle[rows]))
-    cycles = table.cycle[rows[order]]
-    for own in np.split(order, np.flatnonzero(np.diff(cycles)) + 1):
+    order = np.argsort(rows)
+    for own in np.split(order, np.flatnonzero(np.diff(table.cycle[rows[order]])) + 1):
         if len(own):
             row = rows[own]
             yield ribbon_factor(

@@ -164,24 +164,21 @@ def update(state: CurveState, detections: Detections, found: dict[int, OnCurve])
 
 
 def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> CurveBlock:
-    """Return S_z of one curve, on the control points that the detections reach."""
+    """Return S_z of one curve, on the control points that the detections reach.
+
+    Their covariances are `K + sigma_model^2 I + sigma_along^2 t t'`, vehicle frame, with unit tangents t.
+    """
     control = np.flatnonzero(on.basis.sum(axis=0) > LEAST_BASIS)
     known = to_vehicle_rows(state.pose[None], state.control_points(label)[control].reshape(1, -1))
-    fitted = fit_detections(
-        on.basis[:, control],
-        detections.points_vehicle[on.rows],
-        _widened(state, detections.covariances[on.rows], on.tangents),
-        known.reshape(-1, POINT),
+    ckf, points, t = (
         state.settings.ckf,
+        detections.points_vehicle[on.rows],
+        on.tangents @ rotation(state.pose[2]),
     )
+    along = ckf.sigma_along**2 * t[:, :, None] * t[:, None, :]
+    covariances = detections.covariances[on.rows] + ckf.sigma_model**2 * np.eye(POINT) + along
+    fitted = fit_detections(on.basis[:, control], points, covariances, known.reshape(-1, POINT), ckf)
     combinations: Array = np.asarray(np.kron(fitted.range_basis(), np.eye(POINT)), float)
     expected = state.belief.by_sensor(on.basis[:, control] @ fitted.known)
     by_calibration = np.einsum("rm,mik->rik", fitted.gain, expected).reshape(-1, SENSOR_SIZE)
     return CurveBlock(state.columns(label, control), fitted, combinations, by_calibration)
-
-
-def _widened(state: CurveState, covariances: Array, tangents: Array) -> Array:
-    """Return `K + sigma_model^2 I + sigma_along^2 t t'` (m, 2, 2), vehicle frame, of map tangents (m, 2)."""
-    t = tangents @ rotation(state.pose[2])
-    along = state.settings.ckf.sigma_along**2 * t[:, :, None] * t[:, None, :]
-    return np.asarray(covariances + state.settings.ckf.sigma_model**2 * np.eye(POINT) + along)

@@ -131,9 +131,8 @@ class CkfMapper(_Filter):
             return
         self._recent.append((state.pose.copy(), detections))
         self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - registration.WINDOW]
-        if len(state.curves) == 0 or not near_start(self.path, state.pose, settings):
-            return
-        if self.path.length - self._last_check < settings.check_interval:
+        too_soon = self.path.length - self._last_check < settings.check_interval
+        if too_soon or not state.curves or not near_start(self.path, state.pose, settings):
             return
         self._last_check = self.path.length
         motion = associate_early_segment(state, self._recent, self.path.beginning)
@@ -213,19 +212,18 @@ def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Arra
 
 def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
     """Make both curves periodic, on curvature-weighted knots (paper: Simplification)."""
+    settings = state.settings
     for label in state.curves:
         boundary = state.boundary(label)
-        points, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
-        foot = boundary.find(state.control_points(label), points, zero, zero + boundary.confirmed_end)
+        known = state.control_points(label)
+        cones, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
+        foot = boundary.find(known, cones, zero, zero + boundary.confirmed_end)
         boundary.cone_parameters = np.sort(foot.u).tolist()
-        periodic = make_periodic(
-            boundary, state.control_points(label), state.settings, state.settings.ckf.knots
-        )
-        degree = state.settings.spline.degree
+        periodic, degree = make_periodic(boundary, known, settings, settings.ckf.knots), boundary.degree
         points = np.concatenate([periodic.points, periodic.points[:degree]])
         curve = BSpline(periodic.knots, points, degree, periodic=True)
         matrix = refit(state.spline(label), curve, periodic.overlap.new_parameter).new_from_old
-        state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
+        state.replace(label, curve, matrix, settings.spline.sigma_simplify)
         state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 

@@ -1,7 +1,4 @@
-"""Which detection is of which landmark, and which landmarks are one cone.
-
-The Hungarian assignment on Mahalanobis distances, with two gates.
-"""
+"""Which detection is of which landmark, by the Hungarian assignment, and which landmarks are one cone."""
 
 from collections.abc import Callable
 from functools import cache

@@ -200,10 +200,7 @@ class LandmarkFixedLag:
 
 
 class JointCompatibility:
-    """Tests sets of pairs against the joint Gaussian of some recent and some old landmarks.
-
-    `scale` multiplies all standard deviations.
-    """
+    """Tests sets of pairs by the joint Gaussian of recent and old landmarks, all sigmas times `scale`."""
 
     def __init__(self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float) -> None:
         state = smoother.map.state

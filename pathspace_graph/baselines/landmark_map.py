@@ -1,7 +1,4 @@
-"""The landmark map: landmarks with their variables, detections with associations, and their rows.
-
-Two rows for each detection, on the keys of pose and landmark.
-"""
+"""The landmark map: landmarks with their variables, detections with associations, and two rows for each."""
 
 from dataclasses import dataclass, field
 from typing import Final, TypeAlias

@@ -119,7 +119,8 @@ class MotionCheck:
         if missing or held.any():
             excess = held[:, None] * np.array(self.settings.accelerations)
         integrated = integrate_twists(durations, odometry.twist, np.hypot(self.sigma, excess))
-        stuck = _is_stuck(odometry.twist)
+        same = (odometry.twist[1:] == odometry.twist[:-1]).all(axis=1)  # to the last digit
+        stuck = bool(same.sum() >= STUCK)
         return MeasuredMotion(integrated, odometry.twist, False, missing, stuck, None, durations, excess)
 
     def _at_rest(self, motion: MeasuredMotion, t: float, seen: Seen) -> MeasuredMotion:
@@ -260,11 +261,3 @@ class Rest:
     def _is_still(self, mean: Array, count: int) -> bool:
         """Return whether a mean twist (3,) of this number of readings is that of a vehicle at rest."""
         return bool((np.abs(mean) < REST_TWIST + REST_SIGMAS * self.sigma / np.sqrt(count)).all())
-
-
-def _is_stuck(twists: Array) -> bool:
-    """Return whether too many of the twists (k, 3) are equal to the one before, to the last digit."""
-    same = twists[1:, 0] == twists[:-1, 0]
-    if same.sum() < STUCK:
-        return False
-    return bool((twists[1:][same] == twists[:-1][same]).all(axis=1).sum() >= STUCK)

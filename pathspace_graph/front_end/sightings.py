@@ -113,8 +113,7 @@ class Follower:
             round_gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
             return round_gate, round_gate
         along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
-        along, across = (np.minimum(np.maximum(one, GATE_LEAST), GATE_MOST) for one in (along, across))
-        return along, across
+        return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
 
 
 @compiled

@@ -153,7 +153,6 @@ LEAST_MATCHES: Final = 60  # least number of matched detections from which the m
 WORST_CONDITION: Final = 1e6  # largest condition number at which the mounting is found
 LATEST: Final = 10.0  # largest delay or lead of detections that is tried (s)
 LATE_STEP: Final = 0.25  # step of these (s)
-QUARTER: Final = 90.0  # a quarter turn in degrees
 DEGREE: Final = float(np.pi / 180.0)  # in radians
 Content = Literal["twist", "twist in the map frame", "pose", "nothing"]
 
@@ -277,7 +276,7 @@ class Trials:
     def _others(self) -> Iterator[Hypothesis]:
         """Yield frames in fine steps for a right odometry, and in quarter turns for any other."""
         for meaning in MEANINGS:
-            step = TURN_STEP if meaning == AS_WRITTEN else QUARTER
+            step = TURN_STEP if meaning == AS_WRITTEN else 90.0
             for turn in np.arange(0.0, 360.0, step).tolist():
                 for mirrored in (False, True):
                     one = replace(meaning, turn=turn - 360.0 if turn > 180.0 else turn, mirrored=mirrored)
