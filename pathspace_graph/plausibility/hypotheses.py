@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Final, Literal, Self
 
 import numpy as np
-from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
@@ -125,9 +124,13 @@ def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:
 
 def spacing_of(cycles: Sequence[Detections]) -> float | None:
     """Return the median distance from a detection to the next one of its cycle, or None without any."""
-    rows = [cycle.points_vehicle for cycle in cycles]
-    nearest = [np.asarray(KDTree(points).query(points, k=2)[0])[:, 1] for points in rows]
-    return float(np.median(np.concatenate(nearest))) if nearest else None
+    found = []
+    for cycle in cycles:
+        off = cycle.points_vehicle[:, None] - cycle.points_vehicle  # which may be infinite
+        square = (off * off).sum(axis=-1)
+        np.fill_diagonal(square, np.inf)
+        found.append(np.sqrt(square.min(axis=1)))
+    return float(np.median(np.concatenate(found))) if found else None
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
