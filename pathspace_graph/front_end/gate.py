@@ -83,12 +83,13 @@ class Gate:
         A late cycle is admitted between the stamps (s) of the `window`, unless it was used before. Each twist
         is held until the next one, and what was in force before the newest cycle is left out.
         """
-        refused, before = self.refused, self._refused_at
-        self.refused, self._refused_at = refused + 1, None  # until it has passed
-        t = self._refused_at = _stamp(_of_type(Detections, detections, "detections").t)
+        refused, before, said = self.refused, self._refused_at, getattr(detections, "t", None)
+        now = float(said) if isinstance(said, int | float) and abs(said) < inf else None
+        self.refused, self._refused_at = refused + 1, now  # until it has passed
         silence = self.limits.silence
-        if before is not None and 0.0 < t - before <= silence:
+        if now is not None and before is not None and 0.0 < now - before <= silence:
             silence = inf  # a cycle that goes on from the one just refused: two that agree end a silence
+        t = _stamp(_of_type(Detections, detections, "detections").t)
         try:
             possible, notice = possible_detections(detections, t, self.limits)
             stamps, twists = _checked_twists(_of_type(Odometry, odometry, "odometry"), self.limits)
