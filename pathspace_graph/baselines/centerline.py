@@ -2,20 +2,15 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import chain
 from typing import Final
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.batch import mapper as batch
 from pathspace_graph.batch.association import headings
-from pathspace_graph.batch.mapper import (
-    BatchMapper,
-    BatchResult,
-    bending_of,
-    beside_of,
-    drive_factors,
-    factor_beside,
-)
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.start import CurveMapper
 from pathspace_graph.batch.system import CurveGauge
 from pathspace_graph.errors import SettingsError
@@ -24,9 +19,9 @@ from pathspace_graph.factors.gtsam_factors import pose_array, ribbon_factor
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.graph.gaussian import sparse_marginal
-from pathspace_graph.graph.variables import pose_key
+from pathspace_graph.graph.variables import POSE, pose_key
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
+from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, LapBatches, RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -44,28 +39,25 @@ MAX_ITERATIONS: Final = 15  # most iterations of one of them
 TOLERANCE: Final = 1e-5  # share by which an iteration lowers the error at least, or it is the last one
 
 
-# --- the map of a ribbon, and the ribbon of a map --------------------------------------------------------
-
-
 def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
     """Return the edges of a ribbon as a map, with the covariance (3m, 3m) of its control points, if known.
 
     `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.
     """
     edges, joint, at = {label: ribbon.edge_spline(label) for label in BOUNDARIES}, None, 0
-    blocks = dict.fromkeys(BOUNDARIES, NO_COVARIANCE)
     if covariance is not None:
         by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
         joint = by_ribbon @ covariance @ by_ribbon.T
         joint = 0.5 * (joint + joint.T)
-        for label, (_, jacobian) in edges.items():
+    boundaries = {}
+    for label, (spline, jacobian) in edges.items():
+        own = NO_COVARIANCE
+        if joint is not None:
             block = slice(at, at := at + len(jacobian))
-            blocks[label] = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
-    boundaries = {
-        label: SplineBoundary(spline, blocks[label], until.get(label, spline.domain[1]))
-        for label, (spline, _) in edges.items()
-    }
-    return Map(ribbon.periodic, boundaries, None if joint is None else joint_covariance(joint, boundaries))
+            own = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
+            joint[block, block] = own
+        boundaries[label] = SplineBoundary(spline, own, until.get(label, spline.domain[1]))
+    return Map(ribbon.periodic, boundaries, joint)
 
 
 def ribbon_of(track: Map, settings: MapperSettings) -> tuple[Ribbon, Array | None, dict[int, float]]:
@@ -131,9 +123,6 @@ class CenterlineMapper:
         return replace(edges, points=track.points)
 
 
-# --- the graph of a log ----------------------------------------------------------------------------------
-
-
 def ribbon_keys(ribbon: Ribbon) -> list[int]:
     return [int(gtsam.symbol(RIBBON_LETTER, j)) for j in range(ribbon.size)]
 
@@ -148,9 +137,8 @@ def edge_factors(
         u = line.ribbon_parameters(side, projected.foot.u[used])
         parts.append((projected.rows[used], np.full(len(u), SIDE[label]), u))
     rows, sides, u = (np.concatenate(part) for part in zip(*parts, strict=True))
-    order = np.lexsort((rows, table.cycle[rows]))
-    cycles = table.cycle[rows[order]]
-    for own in np.split(order, np.flatnonzero(np.diff(cycles)) + 1):
+    order = np.argsort(rows)
+    for own in np.split(order, np.flatnonzero(np.diff(table.cycle[rows[order]])) + 1):
         if len(own):
             row = rows[own]
             yield ribbon_factor(
@@ -191,40 +179,31 @@ def shape_factors(ribbon: Ribbon, poses: Array, settings: MapperSettings) -> Ite
         sigma_anchor=np.inf,
     )
     for j in range(ribbon.size):
-        yield factor_beside(keys[j : j + 1], int(cycle[j]), 1, _of_line(beside_of(gauge, j)), RIBBON)
+        terms = _of_ribbon(batch.beside_of(gauge, j), np.zeros((0, 1)))
+        yield batch.factor_beside(keys[j : j + 1], int(cycle[j]), 1, terms, RIBBON)
     for row, weights in enumerate(ribbon.bending / settings.centerline.sigma_width):
-        terms = _with_width(bending_of(gauge, row), weights)
-        yield factor_beside(keys[columns[row]], int(gauge.middle_cycle[row]), RIBBON, terms, RIBBON)
+        terms = _of_ribbon(batch.bending_of(gauge, row), weights[None])
+        yield batch.factor_beside(keys[columns[row]], int(gauge.middle_cycle[row]), RIBBON, terms, RIBBON)
 
 
 Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
-def _of_line(terms: Terms) -> Terms:
-    def of_line(points: Array, pose: Array) -> tuple[Array, Array, Array]:
+def _of_ribbon(terms: Terms, weights: Array) -> Terms:
+    """Return terms of control points of a ribbon (k, 3), with a row for each of the weights (r, k) of widths.
+
+    The other rows are those of the centre line, which `terms` are.
+    """
+
+    def of_ribbon(points: Array, pose: Array) -> tuple[Array, Array, Array]:
         residual, by_points, by_pose = terms(points[:, :2], pose)
-        return residual, np.column_stack([by_points, np.zeros(1)]), by_pose
+        count = residual.size
+        by_all, by_any_pose = np.zeros((count + len(weights), *points.shape)), np.zeros((len(weights), POSE))
+        by_all[:count, :, :2], by_all[count:, :, 2] = by_points.reshape(count, -1, 2), weights
+        by_poses = np.vstack([by_pose.reshape(count, POSE), by_any_pose])
+        return np.append(residual, weights @ points[:, 2]), by_all, by_poses
 
-    return of_line
-
-
-def _with_width(terms: Terms, weights: Array) -> Terms:
-    """Return bending terms of three control points of a ribbon, with weights (3,) for that of the width."""
-
-    def with_width(points: Array, pose: Array) -> tuple[Array, Array, Array]:
-        residual, by_points, by_pose = terms(points[:, :2], pose)
-        by_all = np.zeros((RIBBON, 3, RIBBON))
-        by_all[:2, :, :2], by_all[2, :, 2] = by_points.reshape(2, 3, 2), weights
-        return np.append(residual, weights @ points[:, 2]), by_all, np.vstack([by_pose[0], np.zeros(3)])
-
-    return with_width
-
-
-def ribbon_covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ribbon: Ribbon) -> Array:
-    keys = np.array(ribbon_keys(ribbon))
-    marginal = sparse_marginal(graph.linearize(values), keys)
-    information, _ = marginal.hessian(gtsam.Ordering(keys.tolist()))
-    return np.asarray(np.linalg.inv(information), np.float64)
+    return of_ribbon
 
 
 @log_at_scale
@@ -256,16 +235,18 @@ class CenterlineBatch:
     def _optimized(self, start: BatchResult, run: BatchRun) -> BatchRun:
         settings, splines, count = self.settings, start.optimum.state.splines, len(start.trajectory)
         if len(splines) < len(SIDE):
-            raise SettingsError(f"a centre line: expected both boundaries, found {len(splines)}")
+            return run
         left, right = splines.values()
         line = find_line(left, right, start.optimum.state.closed, settings.centerline.spacing)
         ribbon, variables, drive = line.ribbon, start.optimum.state.variables, gtsam.NonlinearFactorGraph()
-        for factor in (*drive_factors(start.system, start.optimum), *edge_factors(start, line, settings)):
+        drawn = batch.drive_factors(start.system, start.optimum), edge_factors(start, line, settings)
+        for factor in chain(*drawn):
             drive.add(factor)
         values = variables.gtsam_values(variables.calibration_keys)
         for k, pose in enumerate(variables.poses):
             values.insert(pose_key(k), gtsam.Pose2(*pose))
-        for key, point in zip(ribbon_keys(ribbon), ribbon.distinct_control_points, strict=True):
+        keys = ribbon_keys(ribbon)
+        for key, point in zip(keys, ribbon.distinct_control_points, strict=True):
             values.insert(key, point)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setRelativeErrorTol(TOLERANCE)
@@ -276,8 +257,9 @@ class CenterlineBatch:
                 graph.add(factor)
             optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
             values = optimizer.optimize()
-            ribbon = ribbon.with_points(np.array([values.atPoint3(key) for key in ribbon_keys(ribbon)]))
-        covariance = ribbon_covariance(graph, values, ribbon)
+            ribbon = ribbon.with_points(np.array([values.atPoint3(key) for key in keys]))
+        marginal = sparse_marginal(graph.linearize(values), np.array(keys))
+        covariance = np.asarray(np.linalg.inv(marginal.hessian(gtsam.Ordering(keys))[0]), np.float64)
         return replace(
             run,
             map=replace(map_of(ribbon, covariance, settings.spline.sigma_shape, {}), points=start.map.points),

@@ -11,11 +11,11 @@ from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.factors.se2 import rotated, rotation, to_map
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections
-from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping import path
 from pathspace_graph.mapping.belief import Belief, point_columns
 from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
-from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
+from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
 from pathspace_graph.settings.batch import CkfSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
@@ -166,9 +166,8 @@ class Expansion:
         """Add all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
         points = to_map(detections.points_vehicle, state.pose[None])
         covariances = rotated(detections.covariances, np.full(len(points), state.pose[2]))
+        add_by_label(self.tentative, detections.labels, points, covariances, detections.t)
         for label, tentative in self.tentative.items():
-            same = detections.labels == label
-            tentative.add(points[same], covariances[same], detections.t)
             known, radius = self.observed[label], self.settings.growth.merge_radius
             for point in tentative.points[tentative.confirmed()]:
                 if not known or np.hypot(*(np.array(known[-RECENT:]) - point).T).min() > radius:
@@ -183,10 +182,9 @@ class Expansion:
             rows = np.flatnonzero(free & (detections.labels == label))
             found = self._candidates(state, label, detections, rows, path_ahead)
             if label not in state.curves:
-                found = found.where(found.sides < self.settings.growth.max_lateral)
-                if len(found.points) > 1:
-                    begin, rows = detections.points_vehicle[found.indices], found.indices
-                    state.begin(label, begin, self._covariances(detections, rows))
+                rows = found.where(found.sides < self.settings.growth.max_lateral).indices
+                if len(rows) > 1:
+                    state.begin(label, detections.points_vehicle[rows], self._covariances(detections, rows))
             elif self._extend(state, label, detections, found):
                 extended.add(label)
                 self._carried[label] = 0.0
@@ -205,20 +203,19 @@ class Expansion:
         found = Candidates(points, rows, stations, SIDES[label] * lateral)
         found = found.where(near & (stations <= path_ahead.stations[-1]) & (found.sides > 0.0))
         found = found.where(np.argsort(found.stations))
-        end = None
-        if label in state.curves:
-            end = _end(state, label, path_ahead, END_BEHIND)
-            found = found.where(self._beyond(state, label, found, end)) if len(found.points) else found
+        if label not in state.curves:
+            return found.where(chain(found, None))
+        end = _end(state, label, path_ahead)
+        if len(found.points):
+            found = found.where(self._beyond(state, label, found, end))
         return found.where(chain(found, end))
 
     def _undisputed(self, label: int, indices: IntArray) -> IntArray:
-        tracks = self.tentative[label]
-        votes = tracks.counts[indices].astype(np.float64)
-        for other in (self.tentative[b] for b in BOUNDARIES if b != label):
-            offset = tracks.points[indices, None] - other.points
-            near = np.hypot(offset[..., 0], offset[..., 1]) < self.settings.growth.merge_radius
-            votes -= near @ other.counts
-        return indices[votes >= 0.0]
+        """Return the tracks with at least as many detections as those of the other label around them."""
+        tracks, other = self.tentative[label], self.tentative[LEFT + RIGHT - label]
+        offset = tracks.points[indices, None] - other.points
+        near = np.hypot(offset[..., 0], offset[..., 1]) < self.settings.growth.merge_radius
+        return indices[tracks.counts[indices] >= near @ other.counts]
 
     def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> BoolArray:
         high, control_points = state.curves[label].domain[1], state.control_points(label)
@@ -250,7 +247,7 @@ class Expansion:
     def _carry_on(self, state: CurveState, label: int, path_ahead: PathAhead) -> bool:
         """Extend a curve whose end the vehicle has passed beside the path, nearly as far as the vehicle."""
         settings = self.settings.growth
-        end = _end(state, label, path_ahead, END_BEHIND)
+        end = _end(state, label, path_ahead)
         if end.station >= path_ahead.driven - path.STRANDED:
             return False
         side = SIDES[label] * max(end.side, path.MIN_LATERAL)
@@ -293,8 +290,8 @@ def _end_position(state: CurveState, label: int) -> Array:
     return np.array(state.control_points(label)[-1])
 
 
-def _end(state: CurveState, label: int, path_ahead: PathAhead, behind: float) -> End:
-    """Return the end of a curve relative to the path from `behind` (m) before the vehicle on."""
+def _end(state: CurveState, label: int, path_ahead: PathAhead) -> End:
+    """Return the end of a curve relative to the path."""
     position = _end_position(state, label)
-    station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position[None])
+    station, lateral = path_ahead.since(path_ahead.driven - END_BEHIND).locate(position[None])
     return End(position, float(station[0]), SIDES[label] * float(lateral[0]))

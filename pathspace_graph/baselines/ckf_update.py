@@ -17,7 +17,7 @@ from pathspace_graph.factors.sensor import SENSOR_SIZE, in_vehicle
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.belief import SENSOR_COLUMNS, point_columns, to_vehicle_rows, transform
+from pathspace_graph.mapping.belief import SENSOR_COLUMNS, to_vehicle_rows, transform
 from pathspace_graph.settings.batch import CkfSettings
 
 from .ckf_curves import CurveState
@@ -61,17 +61,16 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     points = to_map(detections.points_vehicle[rows], poses)
     foot = state.foot_points(label, points, *state.visible_range(label, len(rows)))
     projected = project(points, detections.covariances[rows], poses, foot, state.settings.ckf.sigma_model)
-    control = foot.span[:, None] + np.arange(-curve.degree, 1)
+    control, width = foot.span[:, None] + np.arange(-curve.degree, 1), POINT * (curve.degree + 1)
     control = control % curve.size if curve.periodic else control
-    by_control = projected.by_control.reshape(len(rows), control.shape[1] * POINT)
     expected = to_vehicle(foot.position, poses)
     normals = in_vehicle(foot.normal_unit, poses)
     by_calibration = np.einsum("mi,mik->mk", normals, state.belief.by_sensor(expected))
+    by_control = projected.by_control.reshape(len(rows), width)
     gradient = np.concatenate([projected.by_pose, by_calibration, by_control], axis=1)
-    points_of = point_columns(state.offset(label) + control.ravel())
-    points_of = points_of.reshape(len(rows), POINT * control.shape[1])
     head = np.tile(np.append(np.arange(POSE), SENSOR_COLUMNS), (len(rows), 1))
-    columns = np.concatenate([head, points_of], axis=1)
+    own = state.columns(label, control.ravel()).reshape(len(rows), width)
+    columns = np.concatenate([head, own], axis=1)
     joint = state.belief.covariance[columns[:, :, None], columns[:, None, :]]
     variance = projected.sigma**2 + gate.sigma_floor**2
     variance = variance + np.einsum("mi,mij,mj->m", gradient, joint, gradient)
@@ -148,15 +147,13 @@ def update(state: CurveState, detections: Detections, found: dict[int, OnCurve])
     blocks = [_fit(state, label, detections, on) for label, on in found.items() if len(on.rows)]
     if not blocks:
         return
-    bounds = np.cumsum([0] + [len(block.columns) for block in blocks])
-
+    ends = np.cumsum([len(block.columns) for block in blocks])
     head, now = POSE + SENSOR_SIZE, state.belief.sensor.copy()
 
     def predict(x: Array) -> Array:
         control_vehicle, predicted = to_vehicle_rows(x[:, :POSE], x[:, head:]), []
-        for block, start, stop in zip(blocks, bounds[:-1], bounds[1:], strict=True):
-            points = control_vehicle[:, start:stop].reshape(len(x), -1, POINT)
-            fitted = block.fitted.refitted(points).reshape(len(x), -1)
+        for block, own in zip(blocks, np.split(control_vehicle, ends[:-1], axis=1), strict=True):
+            fitted = block.fitted.refitted(own.reshape(len(x), -1, POINT)).reshape(len(x), -1)
             predicted.append((fitted - (x[:, POSE:head] - now) @ block.by_sensor.T) @ block.combinations)
         return np.concatenate(predicted, axis=1)
 
@@ -167,24 +164,21 @@ def update(state: CurveState, detections: Detections, found: dict[int, OnCurve])
 
 
 def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> CurveBlock:
-    """Return S_z of one curve, on the control points that the detections reach."""
+    """Return S_z of one curve, on the control points that the detections reach.
+
+    Their covariances are `K + sigma_model^2 I + sigma_along^2 t t'`, vehicle frame, with unit tangents t.
+    """
     control = np.flatnonzero(on.basis.sum(axis=0) > LEAST_BASIS)
     known = to_vehicle_rows(state.pose[None], state.control_points(label)[control].reshape(1, -1))
-    fitted = fit_detections(
-        on.basis[:, control],
-        detections.points_vehicle[on.rows],
-        _widened(state, detections.covariances[on.rows], on.tangents),
-        known.reshape(-1, POINT),
+    ckf, points, t = (
         state.settings.ckf,
+        detections.points_vehicle[on.rows],
+        on.tangents @ rotation(state.pose[2]),
     )
+    along = ckf.sigma_along**2 * t[:, :, None] * t[:, None, :]
+    covariances = detections.covariances[on.rows] + ckf.sigma_model**2 * np.eye(POINT) + along
+    fitted = fit_detections(on.basis[:, control], points, covariances, known.reshape(-1, POINT), ckf)
     combinations: Array = np.asarray(np.kron(fitted.range_basis(), np.eye(POINT)), float)
     expected = state.belief.by_sensor(on.basis[:, control] @ fitted.known)
     by_calibration = np.einsum("rm,mik->rik", fitted.gain, expected).reshape(-1, SENSOR_SIZE)
     return CurveBlock(state.columns(label, control), fitted, combinations, by_calibration)
-
-
-def _widened(state: CurveState, covariances: Array, tangents: Array) -> Array:
-    """Return `K + sigma_model^2 I + sigma_along^2 t t'` (m, 2, 2), vehicle frame, of map tangents (m, 2)."""
-    t = tangents @ rotation(state.pose[2])
-    along = state.settings.ckf.sigma_along**2 * t[:, :, None] * t[:, None, :]
-    return np.asarray(covariances + state.settings.ckf.sigma_model**2 * np.eye(POINT) + along)

@@ -15,7 +15,7 @@ from pathspace_graph.graph.variables import POINT, POSE, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import RunNoise, VehicleState
-from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping import registration
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -43,6 +43,9 @@ SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the
 TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
 
+Used = tuple[int, tuple[int, int], bool]  # number of detections that were used, sizes, whether it has closed
+
+
 class _Filter:
     """What both filters share; a late cycle is a ReadingError, since no earlier pose could take it."""
 
@@ -50,9 +53,7 @@ class _Filter:
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = settings or MapperSettings()
-        noise = known_noise(odometry_sigma)
-        self.odometry_sigma = noise.odometry
-        self.front_end = FrontEnd(self.settings, noise)
+        self.front_end = FrontEnd(self.settings, known_noise(odometry_sigma))
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
         """State `x = [pose | calibration | control points or landmarks]`."""
         self._begin()
@@ -67,19 +68,14 @@ class _Filter:
         cycle = self.front_end.admit(odometry, detections)
         reading = self.front_end.update(cycle.odometry, cycle.detections)
         self.belief.follow(reading.motion)
-        self._locate(reading.motion)
         detections = self.belief.corrected(reading.detections)
-        watch.lap("predict")
-        used, sizes, closed = self._use(detections, watch)
+        used, sizes, closed = self._use(reading.motion, detections, watch)
         pose = self.belief.pose.copy()
         return cycle.counted(CycleResult(detections.t, pose, sizes, used, closed, watch.laps))
 
-    def _locate(self, motion: MeasuredMotion) -> None:
-        """Take the newest pose into account."""
-
     @abstractmethod
-    def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
-        """Map a cycle; return how many detections were used, the sizes, and whether the loop has closed."""
+    def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
+        """Map a cycle."""
 
     def noise_used(self) -> RunNoise:
         return self.front_end.noise_used
@@ -100,22 +96,22 @@ class CkfMapper(_Filter):
         self._recent: list[tuple[Array, Detections]] = []
         self._last_check = 0.0
 
-    def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
-        found = classify(self.state, detections)
+    def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
+        state = self.state
+        state.locate_vehicle()
+        self.path.update(state.pose.copy())
+        self.path.steer(motion.twists)
+        watch.lap("predict")
+        found = classify(state, detections)
         watch.lap("classify")
         found = self._expand(detections, found)
         watch.lap("expand")
-        update(self.state, detections, found)
+        update(state, detections, found)
         watch.lap("update")
         self._close(detections)
         watch.lap("close")
-        sizes = [self.state.curves[label].size if label in self.state.curves else 0 for label in BOUNDARIES]
-        return sum(len(on.rows) for on in found.values()), (sizes[LEFT], sizes[RIGHT]), self.closed
-
-    def _locate(self, motion: MeasuredMotion) -> None:
-        self.state.locate_vehicle()
-        self.path.update(self.state.pose.copy())
-        self.path.steer(motion.twists)
+        left, right = (state.curves[label].size if label in state.curves else 0 for label in BOUNDARIES)
+        return sum(len(on.rows) for on in found.values()), (left, right), self.closed
 
     def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
         if self.closed:
@@ -135,9 +131,8 @@ class CkfMapper(_Filter):
             return
         self._recent.append((state.pose.copy(), detections))
         self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - registration.WINDOW]
-        if len(state.curves) == 0 or not near_start(self.path, state.pose, settings):
-            return
-        if self.path.length - self._last_check < settings.check_interval:
+        too_soon = self.path.length - self._last_check < settings.check_interval
+        if too_soon or not state.curves or not near_start(self.path, state.pose, settings):
             return
         self._last_check = self.path.length
         motion = associate_early_segment(state, self._recent, self.path.beginning)
@@ -148,9 +143,7 @@ class CkfMapper(_Filter):
     def map(self) -> Map:
         state = self.state
         curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
-        keys = [state.columns(b, np.arange(curve.size)) for b, curve in sorted(state.curves.items())]
-        columns = np.concatenate([np.zeros(0, np.intp), *keys])
-        return Map(self.closed, curves, state.belief.covariance[np.ix_(columns, columns)])
+        return Map(self.closed, curves, state.belief.covariance[HEAD:, HEAD:].copy())
 
     def outline(self) -> Map:
         curves = {b: SplineBoundary(self.state.spline(b), NO_COVARIANCE) for b in self.state.curves}
@@ -164,13 +157,6 @@ def associate_early_segment(
     closing = replace(
         state.settings.closing, sigma_reading=SIGMA_MATCH, patience=PATIENCE, sigma_patience=SIGMA_PATIENCE
     )
-    covariance = state.belief.covariance[:POSE, :POSE]
-    times = [detections.t for _, detections in cycles]
-    found = registration.register(_recent(state, cycles), times, covariance, beginning, closing)
-    return None if found is None else found.motion
-
-
-def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveMap:
     track = CurveMap(state.settings)
     for label in state.curves:
         track.state.add_boundary(label, state.boundary(label), state.control_points(label))
@@ -178,7 +164,10 @@ def _recent(state: CurveState, cycles: list[tuple[Array, Detections]]) -> CurveM
         track.variables.insert(pose_keys(np.array([cycle])), pose)
         track.detections.append(detections, cycle)
     track.detections.used[:] = True  # a filter keeps no record of what its curves explained
-    return track
+    times = [detections.t for _, detections in cycles]
+    covariance = state.belief.covariance[:POSE, :POSE]
+    found = registration.register(track, times, covariance, beginning, closing)
+    return None if found is None else found.motion
 
 
 def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
@@ -223,19 +212,18 @@ def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Arra
 
 def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
     """Make both curves periodic, on curvature-weighted knots (paper: Simplification)."""
+    settings = state.settings
     for label in state.curves:
         boundary = state.boundary(label)
-        points, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
-        foot = boundary.find(state.control_points(label), points, zero, zero + boundary.confirmed_end)
+        known = state.control_points(label)
+        cones, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
+        foot = boundary.find(known, cones, zero, zero + boundary.confirmed_end)
         boundary.cone_parameters = np.sort(foot.u)
-        periodic = make_periodic(
-            boundary, state.control_points(label), state.settings, state.settings.ckf.knots
-        )
-        degree = state.settings.spline.degree
+        periodic, degree = make_periodic(boundary, known, settings, settings.ckf.knots), boundary.degree
         points = np.concatenate([periodic.points, periodic.points[:degree]])
         curve = BSpline(periodic.knots, points, degree, periodic=True)
         matrix = refit(state.spline(label), curve, periodic.overlap.new_parameter).new_from_old
-        state.replace(label, curve, matrix, state.settings.spline.sigma_simplify)
+        state.replace(label, curve, matrix, settings.spline.sigma_simplify)
         state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 
@@ -255,7 +243,8 @@ class LandmarkCkf(_Filter):
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         """Tracks by label that are not landmarks yet."""
 
-    def _use(self, detections: Detections, watch: Stopwatch) -> tuple[int, tuple[int, int], bool]:
+    def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
+        watch.lap("predict")
         landmark, is_new = self._associate(detections)
         watch.lap("associate")
         self._update(detections, landmark)
@@ -267,7 +256,11 @@ class LandmarkCkf(_Filter):
     def _associate(self, detections: Detections) -> tuple[IntArray, BoolArray]:
         points = to_map(detections.points_vehicle, self.belief.pose[None])
         nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH)[1])
-        predicted, covariances = self._predict(nearby)
+        predicted, covariances = np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
+        if (k := len(nearby)) > 0:
+            seen = self.belief.predict_detections(nearby)
+            predicted = seen.mean.reshape(k, POINT)
+            covariances = seen.covariance.reshape(k, POINT, k, POINT)[np.arange(k), :, np.arange(k)]
         cost = pair_costs(detections.points_vehicle, detections.covariances, predicted, covariances)
         cost[~compatible(detections.labels, self.labels[nearby])] = np.inf
         column, is_new = associate(cost, Gates.of(self.settings.landmark))
@@ -275,14 +268,6 @@ class LandmarkCkf(_Filter):
         landmark = np.full(len(detections.labels), UNASSOCIATED, np.intp)
         landmark[matched] = nearby[column[matched]]
         return landmark, is_new
-
-    def _predict(self, landmarks: IntArray) -> tuple[Array, Array]:
-        k = len(landmarks)
-        if k == 0:
-            return np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
-        predicted = self.belief.predict_detections(landmarks)
-        blocks = predicted.covariance.reshape(k, POINT, k, POINT)
-        return predicted.mean.reshape(k, POINT), blocks[np.arange(k), :, np.arange(k)]
 
     def _update(self, detections: Detections, landmark: IntArray) -> None:
         rows = np.flatnonzero(landmark != UNASSOCIATED)
@@ -302,12 +287,10 @@ class LandmarkCkf(_Filter):
             rows = np.flatnonzero(new & (detections.labels == label))
             tentative.add(points[rows], covariances[rows], detections.t)
             confirmed = np.flatnonzero(tentative.counts >= self.settings.ckf.sightings)
-            offset = points[rows][:, None] - tentative.points[confirmed][None]
-            distance = np.hypot(offset[..., 0], offset[..., 1])
-            if distance.size:
-                near = distance.min(axis=0) < self.settings.growth.merge_radius
-                chosen.append(rows[np.unique(distance.argmin(axis=0)[near])])
-                tentative.remove(confirmed[near])
+            radius = self.settings.growth.merge_radius
+            nearest, near = nearest_within(tentative.points[confirmed], points[rows], radius)
+            chosen.append(rows[np.unique(nearest[near])])
+            tentative.remove(confirmed[near])
         rows = np.concatenate(chosen)
         if len(rows):
             self.belief.add_points(detections.points_vehicle[rows], detections.covariances[rows])

@@ -1,12 +1,8 @@
-"""Which detection is of which landmark, and which landmarks are one cone.
-
-The Hungarian assignment on Mahalanobis distances, with two gates.
-"""
+"""Which detection is of which landmark, by the Hungarian assignment, and which landmarks are one cone."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy  # which imports its modules when they are used
@@ -27,8 +23,7 @@ ROUGH: Final = 5.0  # a landmark farther from every detection of a cycle than th
 HELD_MARGIN: Final = 1e-9  # of a held pair below the match gate, where round-off would decide
 
 
-@dataclass(frozen=True)
-class Gates:
+class Gates(NamedTuple):
     """Two gates on squared Mahalanobis distances with two degrees of freedom."""
 
     match: float  # a detection may be associated with a landmark below this distance
@@ -152,9 +147,7 @@ def find_duplicates(
     involved, index = np.unique(np.concatenate([newer, older]), return_inverse=True)
     if len(involved) == 0:
         return newer, older
-    k, (i, j) = len(involved), index.reshape(2, -1)
-    blocks = covariance(state.keys[involved]).reshape(k, POINT, k, POINT)
-    spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
+    spread = difference_covariances(covariance(state.keys[involved]), *index.reshape(2, -1))
     offset = state.landmarks[newer] - state.landmarks[older]
     same = compatible_pairs(newer, older, offset, spread, settings.landmark)
     return newer[same], older[same]
@@ -168,6 +161,16 @@ def pairs_within(landmarks: Array, labels: IntArray, radius: float) -> tuple[Int
     return newer, older
 
 
+def difference_covariances(joint: Array, i: IntArray, j: IntArray) -> Array:
+    """Return the covariances (..., 2, 2) of what points i and j (...,) with a joint one (2n, 2n) are apart.
+
+    Two estimates of one cone may differ by `SIGMA_MERGE` more.
+    """
+    blocks = joint.reshape(len(joint) // POINT, POINT, -1, POINT)
+    spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
+    return np.asarray(spread + SIGMA_MERGE**2 * np.eye(POINT))
+
+
 def compatible_pairs(
     newer: IntArray, older: IntArray, offset: Array, covariances: Array, settings: LandmarkSettings
 ) -> IntArray:
@@ -175,7 +178,7 @@ def compatible_pairs(
 
     The nearest pair is taken first, and each landmark is in one pair at most.
     """
-    distance = squared_mahalanobis(offset, covariances + SIGMA_MERGE**2 * np.eye(POINT))
+    distance = squared_mahalanobis(offset, covariances)
     taken: set[int] = set()
     chosen = []
     for row in np.argsort(distance)[: int((distance < Gates.of(settings).match).sum())].tolist():

@@ -57,11 +57,11 @@ class LandmarkBatch:
         system = LandmarkSystem.of_log(log, self.settings, self.noise)
         system, state = start_online(log, system, self.noise)
         system.optimize(state)
-        rounds, converged = 0, False
-        while not converged and rounds < MAX_ROUNDS:
-            rounds += 1
+        for _ in range(MAX_ROUNDS):
             converged = self._refresh(system, state) <= SETTLED * len(system.detections)
             system.optimize(state)
+            if converged:
+                break
         return self._result(system, state, converged)
 
     def _refresh(self, system: "LandmarkSystem", state: LandmarkState) -> int:
@@ -111,21 +111,19 @@ class LandmarkSystem:
 
     def cost(self, state: LandmarkState) -> float:
         """Return half the sum of squares at a state, with Huber's loss of the detections."""
-        losses = huber_loss(self._detection_rows(state, np.inf).residual, self.settings.gate.huber)
-        drive = self.chain.rows_at(state.variables, self.settings.calibration)
-        return half_square(drive) + float(losses.sum())
+        *drive, detections = self.rows(state, np.inf)
+        return half_square(drive) + float(huber_loss(detections.residual, self.settings.gate.huber).sum())
 
-    def rows(self, state: LandmarkState) -> list[Rows]:
-        drive = self.chain.rows_at(state.variables, self.settings.calibration)
-        return [*drive, self._detection_rows(state, self.settings.gate.huber)]
-
-    def eliminated(self, state: LandmarkState) -> Elimination:
-        return Elimination(linear_graph(self.rows(state), state.variables), state.variables.layout)
-
-    def _detection_rows(self, state: LandmarkState, huber: float) -> Rows:
+    def rows(self, state: LandmarkState, huber: float) -> list[Rows]:
+        """Return all rows, those of the detections last, weighted by a Huber threshold (sigmas)."""
         rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
         labels = state.labels[state.positions(indices(rows.keys[:, -1]))]
-        return replace(rows, owner=owners(rows.owner, labels == RIGHT))
+        seen = replace(rows, owner=owners(rows.owner, labels == RIGHT))
+        return [*self.chain.rows_at(state.variables, self.settings.calibration), seen]
+
+    def eliminated(self, state: LandmarkState) -> Elimination:
+        graph = linear_graph(self.rows(state, self.settings.gate.huber), state.variables)
+        return Elimination(graph, state.variables.layout)
 
     def optimize(self, state: LandmarkState) -> None:
         """Move a state to the optimum by Levenberg-Marquardt; the associations stay, the map is damped."""
@@ -137,12 +135,10 @@ class LandmarkSystem:
             if gain < 0.0:
                 variables.values = before
                 damping.grow()
-                if damping.exhausted:
-                    break
-                continue
-            cost -= gain
-            damping.lower()
-            if gain <= TOLERANCE * cost:
+            else:
+                cost -= gain
+                damping.lower()
+            if damping.exhausted or 0.0 <= gain <= TOLERANCE * cost:
                 break
         self.detections.correct(variables.sensor)
 
@@ -267,11 +263,9 @@ def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray
     """
     landmark = problem.map.columns(keys)[:, None] + np.arange(POINT)
     pose = POSE * cycles[:, None] + np.arange(POSE)
-    joint = np.empty((len(cycles), POSE + POINT, POSE + POINT))
-    joint[:, :POSE, :POSE] = problem.pose_marginals[cycles]
-    joint[:, :POSE, POSE:] = problem.cross_covariance[pose[:, :, None], landmark[:, None, :]]
-    joint[:, POSE:, :POSE] = np.swapaxes(joint[:, :POSE, POSE:], 1, 2)
-    joint[:, POSE:, POSE:] = problem.map_covariance[landmark[:, :, None], landmark[:, None, :]]
+    cross = problem.cross_covariance[pose[:, :, None], landmark[:, None, :]]
+    own = problem.map_covariance[landmark[:, :, None], landmark[:, None, :]]
+    joint = np.block([[problem.pose_marginals[cycles], cross], [np.swapaxes(cross, 1, 2), own]])
     return np.asarray(jacobian @ joint @ np.swapaxes(jacobian, 1, 2))
 
 

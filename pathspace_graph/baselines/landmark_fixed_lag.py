@@ -30,7 +30,7 @@ from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from . import landmark_association as association
-from .landmark_association import Gates, find_duplicates, squared_mahalanobis
+from .landmark_association import Gates, difference_covariances, find_duplicates, squared_mahalanobis
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 
 UNSEEN: Final = 40.0  # path (m) without a detection after which a landmark is not associated near the start
@@ -50,9 +50,7 @@ class LandmarkFixedLag:
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = settings or MapperSettings()
-        noise = motions.known_noise(odometry_sigma)
-        self.odometry_sigma = noise.odometry
-        self.front_end = FrontEnd(self.settings, noise)
+        self.front_end = FrontEnd(self.settings, motions.known_noise(odometry_sigma))
         self.smoother = FixedLagSmoother(motions.smoother_settings(self.settings), LandmarkMap(self.settings))
         self.smoother.window.exact = True
         self.path = DrivenPath()
@@ -87,10 +85,10 @@ class LandmarkFixedLag:
 
     def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
         detections = self.front_end.use_late(detections, self.smoother.times)
-        late = at_nearest_pose(self.smoother, detections, self.settings.motion)
-        new = self.smoother.map.detections.append(late.detections, late.cycle, late.twist)
+        late, cycle, twist = at_nearest_pose(self.smoother, detections, self.settings.motion)
+        new = self.smoother.map.detections.append(late, cycle, twist)
         self.smoother.map.correct()
-        self._use(new, detections.t, watch, late.cycle)
+        self._use(new, detections.t, watch, cycle)
         watch.lap("update")
         used = int(self.smoother.map.detections.used[new].sum())
         return replace(self._result(detections.t, watch.laps), readings=used)
@@ -202,10 +200,7 @@ class LandmarkFixedLag:
 
 
 class JointCompatibility:
-    """Tests sets of pairs against the joint Gaussian of some recent and some old landmarks.
-
-    `scale` multiplies all standard deviations. Two estimates of one cone may differ by SIGMA_MERGE more.
-    """
+    """Tests sets of pairs by the joint Gaussian of recent and old landmarks, all sigmas times `scale`."""
 
     def __init__(self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float) -> None:
         state = smoother.map.state
@@ -217,12 +212,8 @@ class JointCompatibility:
 
     def distances(self, mean: Array, covariance: Array) -> Array:
         """Return the squared Mahalanobis distances (k, n) of all pairs; other labels give infinity."""
-        k, points = len(self.recent), len(mean)
-        blocks = covariance.reshape(points, POINT, points, POINT).transpose(0, 2, 1, 3)
-        marginal = blocks[np.arange(points), np.arange(points)]
-        cross = blocks[:k, k:]
-        spread = marginal[:k, None] + marginal[None, k:] - cross - np.swapaxes(cross, 2, 3)
-        spread = spread + SIGMA_MERGE**2 * np.eye(POINT)
+        k = len(self.recent)
+        spread = difference_covariances(covariance, np.arange(k)[:, None], np.arange(k, len(mean)))
         return np.where(self.same_label, squared_mahalanobis(mean[:k, None] - mean[None, k:], spread), np.inf)
 
     def conditioned(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
@@ -261,12 +252,12 @@ def detect_loop(
     They are those of the best hypothesis, and None if it is not clear or too small. It explains detections
     better than new landmarks do, by a gate for each pair less the distance of all.
     """
-    points = smoother.map.state.landmarks
-    old = old[nearest_within(points[old], points[recent], reach)[1]]
+    state, settings = smoother.map.state, smoother.map.settings
+    old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
         return None
-    gate = Gates.of(smoother.map.settings.landmark).match
-    test = JointCompatibility(smoother, recent, old, smoother.map.settings.closing.prior_scale)
+    gate = Gates.of(settings.landmark).match
+    test = JointCompatibility(smoother, recent, old, settings.closing.prior_scale)
     seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
     if len(seeds) == 0:
         return None
@@ -277,12 +268,10 @@ def detect_loop(
     if max(scores) - max(others, default=0.0) < MIN_LEAD * gate:
         return None
     i, j = np.array(pairs, np.intp).T
-    labels = smoother.map.state.labels[recent[i]]
+    labels = state.labels[recent[i]]
     enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
-    if not enough or len(labels) < MIN_PAIRS:
-        return None
-    joint = chi2_quantile(smoother.map.settings.landmark.create, POINT * len(labels))
-    return (recent[i], old[j]) if distance < joint else None
+    fits = distance < chi2_quantile(settings.landmark.create, POINT * len(labels))
+    return (recent[i], old[j]) if enough and len(labels) >= MIN_PAIRS and fits else None
 
 
 def optimize_loop(smoother: LandmarkSmoother, recent: IntArray, old: IntArray) -> None:

@@ -1,7 +1,4 @@
-"""The landmark map: landmarks with their variables, detections with associations, and their rows.
-
-Two rows for each detection, on the keys of pose and landmark.
-"""
+"""The landmark map: landmarks with their variables, detections with associations, and two rows for each."""
 
 from dataclasses import dataclass, field
 from typing import Final, TypeAlias
@@ -38,8 +35,8 @@ NO_PAIRS: IntArray = np.zeros((0, 2), np.intp)
 class LandmarkState:
     """Landmarks, oldest first. A landmark's number is that of its key and never changes."""
 
-    def __init__(self, variables: Variables | None = None) -> None:
-        self.variables = variables or Variables()  # landmarks, calibration and poses by key
+    def __init__(self) -> None:
+        self.variables = Variables()  # landmarks, calibration and poses by key
         self.numbers: IntArray = np.zeros(0, np.intp)  # (n,) numbers of the landmarks, ascending
         self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)  # (n, 2) detections by label
@@ -73,11 +70,10 @@ class LandmarkState:
 
     def vote(self, labels: IntArray, numbers: IntArray) -> None:
         """Count detections with labels (k,) on landmarks (k,), which take the label of their majority."""
-        known = np.isin(labels, BOUNDARIES)
+        known, rows = np.isin(labels, BOUNDARIES), np.arange(len(self))
         np.add.at(self.votes, (self.positions(numbers[known]), labels[known]), 1)
         most = self.votes.argmax(axis=1)
-        outvoted = self.votes[np.arange(len(most)), most] > self.votes[np.arange(len(most)), self.labels]
-        self.labels = np.where(outvoted, most, self.labels)
+        self.labels = np.where(self.votes[rows, most] > self.votes[rows, self.labels], most, self.labels)
 
     def keep(self, stays: BoolArray) -> None:
         """Remove the landmarks whose entry in `stays` (n,) is not set; the variables stay as they are."""
@@ -141,7 +137,7 @@ class LandmarkMap:
 
     @property
     def structure(self) -> object:
-        """Return another object whenever other landmarks are held together than before."""
+        """Object that is another one whenever other landmarks are held together."""
         return self.loop_pairs
 
     def gauge(self, whole: bool) -> list[Rows]:
@@ -190,13 +186,11 @@ def landmark_rows(
     w is the root of each row's Huber weight. The detections z are corrected by the sensor's calibration, and
     the residuals are those of measured ones (`factors.sensor:restored`).
     """
-    cycles, numbers = detections.cycle[chosen], detections.landmark[chosen]
-    points = state.landmarks[state.positions(numbers)]
-    sensor = state.variables.sensor
-    seen = detections.corrected(chosen, sensor)
-    predicted = landmark_residuals(state.variables.poses_at(cycles), points, seen)
-    measured, twists = detections.measured[chosen], detections.twist[chosen]
-    inverse, by_calibration = restored(predicted.residual, measured, twists, sensor)
+    cycles, numbers, sensor = detections.cycle[chosen], detections.landmark[chosen], state.variables.sensor
+    poses, points = state.variables.poses_at(cycles), state.landmarks[state.positions(numbers)]
+    predicted = landmark_residuals(poses, points, detections.corrected(chosen, sensor))
+    measured = detections.measured[chosen], detections.twist[chosen]
+    inverse, by_calibration = restored(predicted.residual, *measured, sensor)
     white = whiteners(detections.covariance[chosen])
     residual = np.einsum("mij,mj->mi", white @ inverse, predicted.residual)
     weight = np.sqrt(huber_weights(residual, huber))

@@ -29,17 +29,15 @@ from .noise import NoiseLearner
 from .sides import SideJudge
 from .sightings import SeenCycle, TwistRecord
 
-SWAPPED: Final = {
+SWAPPED: Final = {  # notices that the colours are swapped from now on, or no longer
     True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "
     "is driven the other way round, or y points to the right in the whole log",
     False: "the colours are as they were said to be",
 }
-"""Notices that the colours are swapped from now on, or no longer."""
-COLOURLESS: Final = {
+COLOURLESS: Final = {  # notices that most colours are unknown from now on, or no longer
     True: "most detections have no colour: the way driven tells their sides",
     False: "most detections have a colour again",
 }
-"""Notices that most colours are unknown from now on, or no longer."""
 NEAREST: Final = 2  # number of nearest cones that are orange where the vehicle drives between orange cones
 
 
@@ -65,8 +63,7 @@ class FrontEnd:
         self.gate = Gate(settings.limits)
         self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
         self._settings = settings
-        self._begun = False
-        self._sensor_doubted = False
+        self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
 
     def admit(self, odometry: Odometry, detections: Detections, window: Sequence[float] = ()) -> Admitted:
@@ -81,27 +78,29 @@ class FrontEnd:
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Return the judged readings of a cycle: the twists since the last one, and its detections."""
-        noise, twist = self.noise, odometry.twist[-1] if len(odometry.t) else np.zeros(3)
+        noise, check, sides = self.noise, self._motion, self._sides
         of_orange = is_orange(detections)
-        in_lane = is_in_orange_lane(detections, of_orange)
-        orange = detections.where(of_orange)
-        detections = detections.where(~of_orange) if len(orange.labels) else detections
-        checked = noise.for_check(detections, twist)
-        motion = self._motion.update(odometry, checked, may_doubt=noise.is_settled)
-        sides = self._sides
+        cones, orange = detections.where(~of_orange), detections.where(of_orange)
+        checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
+        motion = check.update(odometry, checked, may_doubt=noise.is_settled)
         swapped, colourless = sides.swapped, sides.colourless
-        labels = sides.update(self._motion.pose, motion.twists, checked, in_lane=in_lane).labels
-        columns = detections.points_vehicle, detections.covariances
+        in_lane = is_in_orange_lane(detections, of_orange)
+        labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane).labels
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
-        judged = noise.for_map(Detections(detections.t, *columns, labels))
+        cones = Detections(cones.t, cones.points_vehicle, cones.covariances, labels)
+        judged, orange = noise.for_map(cones), noise.for_map(orange)
         # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
         if not (self._sensor_doubted or noise.of_detections):
-            self._sensor_doubted = self._motion.errors.contradict(self._settings.calibration)
-        orange, seen, stated = noise.for_map(orange), self._motion.seen_again, detections.covariances
-        measured = self._measured(odometry, Detections(detections.t, *columns, labels), motion)
-        doubted = self._sensor_doubted
-        return Reading(motion, judged, seen, orange, stated, doubted, measured, "; ".join(notices))
+            self._sensor_doubted = check.errors.contradict(self._settings.calibration)
+        fresh, settings = noise.observe(odometry, cones, motion, check.pose), self._settings
+        if fresh:
+            check.believe(noise.twist_sigma)
+        if fresh or not self._begun:
+            settings, self._begun = noise.calibrated(settings), True
+        measured = None if settings is self._settings else settings
+        seen, doubted, notice = check.seen_again, self._sensor_doubted, "; ".join(notices)
+        return Reading(motion, judged, seen, orange, cones.covariances, doubted, measured, notice)
 
     @property
     def noise_used(self) -> RunNoise:
@@ -111,19 +110,6 @@ class FrontEnd:
     def pose(self) -> Array:
         """Copy of the newest pose (3,) by odometry alone."""
         return self._motion.pose.copy()
-
-    def _measured(
-        self, odometry: Odometry, detections: Detections, motion: MeasuredMotion
-    ) -> MapperSettings | None:
-        """Learn the noise from a cycle; return settings with new priors where there are any."""
-        fresh = self.noise.observe(odometry, detections, motion, self._motion.pose)
-        if fresh:
-            self._motion.believe(self.noise.twist_sigma)
-        if self._begun and not fresh:
-            return None
-        self._begun = True
-        settings = self.noise.calibrated(self._settings)
-        return None if settings == self._settings else settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,12 +130,11 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
         front_end = FrontEnd(settings, replace(noise, measured=measure_log(log)))
     admitted = (front_end.admit(odometry, cycle) for odometry, cycle in split_odometry(log))
     readings = [front_end.update(cycle.odometry, cycle.detections) for cycle in admitted]
-    motions = [reading.motion for reading in readings]
     settings = readings[0].measured or settings
     if readings[-1].sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
-    chain = chained([cycle.t for cycle in log.cycles], motions, settings.odometry)
-    cycles, orange = ([r.detections for r in readings], [r.orange for r in readings])
+    chain = chained([cycle.t for cycle in log.cycles], [one.motion for one in readings], settings.odometry)
+    cycles, orange = [one.detections for one in readings], [one.orange for one in readings]
     return JudgedLog(chain, cycles, orange, settings, front_end.noise_used)
 
 
@@ -184,25 +169,17 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
     return cycles, twists
 
 
-@dataclass(frozen=True, eq=False)
-class LateDetections:
-    """The detections of a late cycle as they would be seen from a pose of the window."""
-
-    detections: Detections  # detections in the vehicle frame of that pose
-    cycle: int
-    twist: Array  # (3,) mean twist of the vehicle then, m/s, m/s and rad/s
-
-
 def at_nearest_pose(
     smoother: FixedLagSmoother[MapRows], detections: Detections, settings: MotionSettings
-) -> LateDetections:
+) -> tuple[Detections, int, Array]:
     """Return late detections as they would be seen from the pose of the window that is nearest in time.
 
-    The vehicle moves with a constant twist between the poses around the stamp. With T the motion from the
-    nearest pose to the late one, a detection z with covariance K becomes `T z` with `R (K + G Q G') R'`,
-    where `G = [I | J z]` and J is the quarter turn. Q is the covariance of the odometry for the share of the
-    interval, and of a changing twist: half the acceleration times the times to both poses. Errors count as
-    independent, though one motion has moved them all.
+    Also return the cycle of that pose, and the mean twist (3,) of the vehicle then (m/s, m/s, rad/s), which
+    is constant between the poses around the stamp. With T the motion from the nearest pose to the late one, a
+    detection z with covariance K becomes `T z` with `R (K + G Q G') R'`, where `G = [I | J z]` and J is the
+    quarter turn. Q is the covariance of the odometry for the share of the interval, and of a changing twist:
+    half the acceleration times the times to both poses. Errors count as independent, though one motion has
+    moved them all.
     """
     times, poses, t = smoother.times, smoother.variables.poses, detections.t
     after = int(np.searchsorted(times, t))
@@ -213,10 +190,9 @@ def at_nearest_pose(
     moved, whitener = se2_exp(share * motion[None])[0], smoother.window.odometry.whiteners[before]
     bend = 0.5 * (t - times[before]) * (times[after] - t) * np.array(settings.accelerations)
     spread = abs(share) * np.linalg.inv(whitener.T @ whitener) + np.diag(bend**2)
-    z = detections.points_vehicle
+    z, turn = detections.points_vehicle, rotation(moved[2])
     by_motion = np.zeros((len(z), 2, 3))
     by_motion[:, :, :2], by_motion[:, :, 2] = np.eye(2), left_of(z)
-    turn = rotation(moved[2])
     covariances = turn @ (detections.covariances + by_motion @ spread @ by_motion.transpose(0, 2, 1)) @ turn.T
     seen = replace(detections, points_vehicle=move_points(moved, z), covariances=covariances)
-    return LateDetections(seen, smoother.first_cycle + nearest, motion / duration)
+    return seen, smoother.first_cycle + nearest, motion / duration

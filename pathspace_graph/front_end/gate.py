@@ -23,10 +23,10 @@ from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.scale import in_scene, scale_of
 from pathspace_graph.settings.online import LimitSettings
 
-UNITS: Final = "stamps are in seconds"  # hint where a stamp looks like one in milliseconds or nanoseconds
-TWIST: Final = ("vx", "vy", "wz")
-UNIT: Final = ("m/s", "m/s", "rad/s")
+TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
 MAX_STAMP: Final = 1e11  # largest stamp, s: some three thousand years. Stamps in nanoseconds are larger
+UNITS: Final = "stamps are in seconds"  # hint where a stamp looks like one in milliseconds or nanoseconds
+STAMPS: Final = f"at most {MAX_STAMP:g} s ({UNITS})"
 MIN_INTERVAL: Final = 1e-3  # s from cycle to cycle: below, the odometry is too certain for doubles
 MAX_TWISTS: Final = 100_000
 MAX_DETECTIONS: Final = 500  # largest numbers of twists and detections in a cycle, which bound its time
@@ -36,7 +36,6 @@ MAX_SIGMA: Final = 100.0  # least and largest standard deviation of a detection 
 MIN_DETERMINANT: Final = 1e-12  # least det of a covariance over xx * yy: singular to doubles below
 MAX_ASYMMETRY: Final = 1e-6  # largest |xy - yx| of a covariance by its larger eigenvalue
 _KNOWN_LABELS: Final = "one of " + ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
-_COVARIANCES: Final = (MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA, MAX_SIGMA)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,38 +65,8 @@ class Admitted:
         return replace(result, notice=notice, dropped=self.dropped, late=self.late, refused=self.refused)
 
 
-def admit(
-    odometry: Odometry,
-    detections: Detections,
-    limits: LimitSettings,
-    newest: Newest,
-    window: Sequence[float] = (),
-    used: Sequence[float] = (),
-) -> Admitted:
-    """Return a cycle as an estimator may use it, or raise a ReadingError.
-
-    A late cycle is admitted between the stamps (s) of the `window`, unless its stamp is among those `used`.
-    Each twist is held until the next one, and what was in force before the newest cycle is left out.
-    """
-    t = _stamp(_of_type(Detections, detections, "detections").t)
-    try:
-        possible, notice = possible_detections(detections, t, limits)
-        stamps, twists = _checked_twists(_of_type(Odometry, odometry, "odometry"), limits)
-        late = newest.t is not None and t <= newest.t
-        if late:
-            _check_late(stamps, t, window, used)
-            stamps, twists = stamps[:0], twists[:0]
-        else:
-            _check_order(stamps, t, newest, limits)
-            stamps, twists = _since(stamps, twists, newest)
-    except ReadingError as error:
-        raise error.at(t) from None
-    dropped = len(detections.labels) - len(possible.labels)
-    return Admitted(Odometry(stamps, twists), possible, dropped, late, notice=notice)
-
-
 class Gate:
-    """Counter of refused cycles, which remembers the late cycles that were used."""
+    """Check of each cycle, which counts refused cycles, and remembers the late ones that were used."""
 
     def __init__(self, limits: LimitSettings) -> None:
         self.limits = limits
@@ -109,27 +78,36 @@ class Gate:
     def admit(
         self, odometry: Odometry, detections: Detections, newest: Newest, window: Sequence[float] = ()
     ) -> Admitted:
-        """Return `admit` with the cycles that were refused meanwhile, or raise and count one more."""
-        limits = replace(self.limits, silence=inf) if self._goes_on(detections) else self.limits
+        """Return a cycle as an estimator may use it; otherwise raise a ReadingError and count it as refused.
+
+        A late cycle is admitted between the stamps (s) of the `window`, unless it was used before. Each twist
+        is held until the next one, and what was in force before the newest cycle is left out.
+        """
+        refused, before, said = self.refused, self._refused_at, getattr(detections, "t", None)
+        now = float(said) if isinstance(said, int | float) and abs(said) < inf else None
+        self.refused, self._refused_at = refused + 1, now  # until it has passed
+        silence = self.limits.silence
+        if now is not None and before is not None and 0.0 < now - before <= silence:
+            silence = inf  # a cycle that goes on from the one just refused: two that agree end a silence
+        t = _stamp(_of_type(Detections, detections, "detections").t)
         try:
-            admitted = admit(odometry, detections, limits, newest, window, self._late)
-        except ReadingError:
-            self.refused += 1
-            self._refused_at = _stamp_or_none(detections)
-            raise
-        if self.refused or (self._dropping and admitted.notice):
-            notice = "" if self._dropping else admitted.notice
-            admitted = replace(admitted, refused=self.refused, notice=notice)
-        self.refused, self._dropping, self._refused_at = 0, admitted.dropped > 0, None
-        return admitted
+            possible, notice = possible_detections(detections, t, self.limits)
+            stamps, twists = _checked_twists(_of_type(Odometry, odometry, "odometry"), self.limits)
+            late = newest.t is not None and t <= newest.t
+            if late:
+                _check_late(stamps, t, window, self._late)
+                stamps, twists = stamps[:0], twists[:0]
+            else:
+                _check_order(stamps, t, newest.t, silence)
+                stamps, twists = _since(stamps, twists, newest)
+        except ReadingError as error:
+            raise error.at(t) from None
+        dropped, notice = len(detections.labels) - len(possible.labels), "" if self._dropping else notice
+        self.refused, self._refused_at, self._dropping = 0, None, dropped > 0
+        return Admitted(Odometry(stamps, twists), possible, dropped, late, refused, notice)
 
     def refuse(self) -> None:
         self.refused += 1
-
-    def _goes_on(self, detections: Detections) -> bool:
-        """Return whether a cycle goes on from the one just refused: two that agree end a silence."""
-        t, before = _stamp_or_none(detections), self._refused_at
-        return t is not None and before is not None and 0.0 < t - before <= self.limits.silence
 
     def use_late(self, t: float, window: Sequence[float]) -> None:
         self._late = [stamp for stamp in self._late if stamp >= window[0]] + [t]
@@ -137,11 +115,11 @@ class Gate:
 
 def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
     """Read a log whose cycles may all be used; otherwise raise an InputError with file, row and stamp."""
-    log, newest = read_log(folder), Newest()
+    log, newest, gate = read_log(folder), Newest(), Gate(limits)
     scale = scale_of(log)
     for odometry, detections in split_odometry(scaled(log, 1.0 / scale)):
         try:
-            admitted = admit(odometry, detections, limits, newest)
+            admitted = gate.admit(odometry, detections, newest)
         except ReadingError as error:
             raise _of_file(in_scene(error, scale), folder, log, odometry) from error
         newest = Newest(detections.t, admitted.odometry.twist[-1] if len(admitted.odometry.t) else None)
@@ -157,18 +135,13 @@ def _of_file(error: ReadingError, folder: Path, log: Log, odometry: Odometry) ->
     return InputError(folder / (ODOMETRY_FILE if of_odometry else DETECTIONS_FILE), text, row)
 
 
-def _stamp_or_none(detections: Any) -> float | None:
-    t = getattr(detections, "t", None)
-    return float(t) if isinstance(t, int | float) and abs(t) < inf else None
-
-
 def _stamp(value: Any) -> float:
     try:
         t = float(value)
     except (TypeError, ValueError, OverflowError):
         raise ReadingError("detections.t", "a number", type(value).__name__) from None
     if not abs(t) <= MAX_STAMP:
-        raise ReadingError("detections.t", f"at most {MAX_STAMP:g} s ({UNITS})", t)
+        raise ReadingError("detections.t", STAMPS, t)
     return t
 
 
@@ -185,20 +158,20 @@ def _check_late(stamps: Array, t: float, window: Sequence[float], used: Sequence
         raise ReadingError("odometry.t", expected, float(stamps[-1]), len(stamps) - 1)
 
 
-def _check_order(stamps: Array, t: float, newest: Newest, limits: LimitSettings) -> None:
-    """Refuse twists (k,) that are later than their cycle at t (s), and a long time without any reading."""
+def _check_order(stamps: Array, t: float, newest: float | None, silence: float) -> None:
+    """Refuse twists (k,) that are later than their cycle at t (s), and a silence since the newest one."""
     if len(stamps) and stamps[-1] > t:
         row = int(stamps.searchsorted(t, side="right"))
         raise ReadingError("odometry.t", "none later than the cycle", float(stamps[row]), row)
-    if newest.t is not None and t < newest.t + MIN_INTERVAL:
+    if newest is not None and t < newest + MIN_INTERVAL:
         raise ReadingError("detections.t", f"at least {MIN_INTERVAL:g} s after the newest cycle", t)
-    before = [] if newest.t is None else [newest.t]
+    before = [] if newest is None else [newest]
     known = np.concatenate([before, stamps, [t]])
     steps = known[1:] - known[:-1]
-    if len(steps) == 0 or steps.max() <= limits.silence:
+    if len(steps) == 0 or steps.max() <= silence:
         return
     at = int(steps.argmax()) + 1
-    expected = f"at most {limits.silence:g} s after the reading at {known[at - 1]:.12g} s ({UNITS})"
+    expected = f"at most {silence:g} s after the reading at {known[at - 1]:.12g} s ({UNITS})"
     if at == len(known) - 1:
         raise ReadingError("detections.t", expected, t)
     raise ReadingError("odometry.t", expected, float(known[at]), at - len(before))
@@ -212,14 +185,14 @@ def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, A
         raise ReadingError("odometry.t", f"at most {MAX_TWISTS} twists", len(stamps))
     within, later = np.abs(stamps) <= MAX_STAMP, np.ones(len(stamps), bool)
     later[1:] = stamps[1:] > stamps[:-1]
-    if not (within & later).all():
-        _require(within, "odometry.t", f"at most {MAX_STAMP:g} s ({UNITS})", stamps)
-        _require(later, "odometry.t", "a stamp later than the one before", stamps)
+    _require(within, "odometry.t", STAMPS, stamps)
+    _require(later, "odometry.t", "a stamp later than the one before", stamps)
     most = limits.speed, limits.speed, limits.yaw_rate
     good = np.abs(twists) <= most
     if not good.all():
         row, column = divmod(int(good.argmin()), len(TWIST))
-        expected = "{0} from -{1:g} to {1:g} {2}".format(TWIST[column], most[column], UNIT[column])
+        name, unit = list(TWIST.items())[column]
+        expected = f"{name} from -{most[column]:g} to {most[column]:g} {unit}"
         raise ReadingError("odometry.twist", expected, float(twists[row, column]), row)
     return stamps, twists
 
@@ -251,7 +224,8 @@ def possible_detections(detections: Detections, t: float, limits: LimitSettings)
     labels = _labels(detections.labels, count)
     if count > MAX_DETECTIONS:
         raise ReadingError("detections.points_vehicle", f"at most {MAX_DETECTIONS} rows", count)
-    near, definite = _usable(points, covariances, (MIN_RANGE, limits.range_max, *_COVARIANCES))
+    possible = MIN_RANGE, limits.range_max, MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA, MAX_SIGMA
+    near, definite = _usable(points, covariances, possible)
     good = near & definite
     if good.all():
         return Detections(t, points, covariances, labels), ""
@@ -270,7 +244,7 @@ def possible_detections(detections: Detections, t: float, limits: LimitSettings)
 def _usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tuple[BoolArray, BoolArray]:
     """Return which points (m, 2) are where a sensor sees, and which covariances (m, 2, 2) are possible.
 
-    The limits are MIN_RANGE, the largest range, and `_COVARIANCES`.
+    The limits are those of the range, MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA and MAX_SIGMA.
     """
     min_range, max_range, asymmetry, determinant, min_sigma, max_sigma = limits
     distance = np.hypot(points[:, 0], points[:, 1])

@@ -13,8 +13,6 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variabl
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
 from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 
-from .motion import mean_bias
-
 
 @dataclass(frozen=True, eq=False)
 class LogOdometry:
@@ -39,14 +37,10 @@ class LogOdometry:
             poses.append(compose(poses[-1], calibrated_delta(interval, calibration)))
         return np.array(poses)
 
-    def terms(self, poses: Array, calibration: Array) -> tuple[Array, Array]:
-        """Return whitened residuals (P - 1, 3), derivatives (P - 1, 3, 8) by [calibration | pose | next]."""
-        return self.odometry.terms(slice(None), poses, calibration)
-
     def rows(self, poses: Array, calibration: Array) -> list[Rows]:
-        """Return the rows of `terms` and `priors` at poses (P, 3) and a calibration (2,)."""
-        start = np.arange(len(self.odometry))
-        odometry = odometry_rows(start, self.terms(poses, calibration), owners(start))
+        """Return the rows of `odometry` and `priors` at poses (P, 3) and a calibration (2,)."""
+        start, terms = np.arange(len(self.odometry)), self.odometry.terms(slice(None), poses, calibration)
+        odometry = odometry_rows(start, terms, owners(start))
         return [odometry, *self.priors(poses[0], calibration)]
 
     def rows_at(self, variables: Variables, settings: CalibrationSettings) -> list[Rows]:
@@ -87,6 +81,15 @@ def chained(
         calibration_sigma=np.array(settings.sigmas_calibration),
         bias=mean_bias([motion.bias for motion in motions if motion.bias is not None]),
     )
+
+
+def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
+    """Return the mean of independent measurements of the bias by their information; None without any."""
+    if not measured:
+        return None
+    information = np.array([one.sigma**-2 for one in measured])
+    values = np.array([one.value for one in measured])
+    return BiasMeasurement(float(information @ values / information.sum()), float(information.sum() ** -0.5))
 
 
 def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Rows]:

@@ -52,7 +52,8 @@ class _Cones:
     """Sightings of cones seen often enough, sorted by cone, with their linear model `p + A b` in the map."""
 
     table: Sightings
-    begins: IntArray
+    begins: IntArray  # (c,) row of each cone's first sighting
+    counts: IntArray  # (c,) number of its sightings
     pairs: tuple[IntArray, IntArray]  # of one cone's sightings less than `NEAR_TIME` apart, by index
     ranges: Array  # (n,) range of the cone as the sensor measures it, without noise (m)
     ray: Array  # (n, 2) unit vector along the ray, map frame
@@ -67,13 +68,15 @@ class _Cones:
         """
         seen = self.table.point - np.einsum("nij,nj->ni", rotations(-self.table.pose[:, 2]), off)
         ranges = np.maximum(np.hypot(*seen.T), np.finfo(float).tiny)
-        return replace(self, ranges=ranges, columns=_columns(self.table, self.begins, seen))
+        return replace(
+            self, ranges=ranges, columns=_columns(self.table, np.repeat(self.begins, self.counts), seen)
+        )
 
     def sums(self, values: Array) -> Array:
         return np.asarray(np.add.reduceat(values, self.begins, axis=0))
 
     def spread(self, values: Array) -> Array:
-        return np.repeat(values, np.diff(np.append(self.begins, len(self.ranges))), axis=0)
+        return np.repeat(values, self.counts, axis=0)
 
 
 def _cones(sightings: Sightings) -> _Cones | None:
@@ -86,21 +89,23 @@ def _cones(sightings: Sightings) -> _Cones | None:
         return None
     table = sightings.where(chosen[np.argsort(sightings.cone[chosen], kind="stable")])
     begins = np.flatnonzero(np.diff(table.cone, prepend=-1))
+    counts = np.diff(np.append(begins, len(table.cone)))
     ranges = np.maximum(np.hypot(*table.point.T), np.finfo(float).tiny)
     turn = rotations(table.pose[:, 2])
     ray = np.einsum("nij,nj->ni", turn, table.point / ranges[:, None])
     i, j = pairs(table.cone)
     near = np.abs(table.t[j] - table.t[i]) < NEAR_TIME
-    known = table, begins, (i[near], j[near]), ranges, ray, left_of(ray), to_map(table.point, table.pose)
-    return _Cones(*known, _columns(table, begins, table.point))
+    known = (i[near], j[near]), ranges, ray, left_of(ray), to_map(table.point, table.pose)
+    columns = _columns(table, np.repeat(begins, counts), table.point)
+    return _Cones(table, begins, counts, *known, columns)
 
 
-def _columns(table: Sightings, begins: IntArray, seen: Array) -> Array:
+def _columns(table: Sightings, first: IntArray, seen: Array) -> Array:
     """Return the derivatives (n, 2, 6) of sightings at points (n, 2), vehicle frame, in the map frame.
 
-    The bias of the yaw rate counts from each cone's first sighting: before, it turns all of the cone's alike.
+    The bias of the yaw rate counts from each cone's first sighting, at rows (n,): before, it turns all of the
+    cone's alike.
     """
-    first = np.repeat(begins, np.diff(np.append(begins, len(seen))))
     turn, by_bias, then = rotations(table.pose[:, 2]), table.by_bias, table.by_bias[first]
     moved = table.pose[:, :2] - table.pose[first, :2]
     at_pose = by_bias[:, :2] - then[:, :2] - then[:, 2:] * left_of(moved)
@@ -140,7 +145,7 @@ def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
     With the scores g (c, 6) of the cones summed over `STRETCH` seconds it is `P (sum g g') P` (White's
     estimator for clusters), which has the errors of the odometry in it.
     """
-    middle = cones.sums(cones.table.t) / np.diff(np.append(cones.begins, len(cones.ranges)))
+    middle = cones.sums(cones.table.t) / cones.counts
     _, stretch = np.unique(np.floor(middle / STRETCH), return_inverse=True)
     count = int(stretch.max()) + 1
     summed = np.zeros((count, scores.shape[1]))
@@ -148,24 +153,21 @@ def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
     return np.asarray(covariance @ (summed.T @ summed) @ covariance * count / max(count - 1, 1))
 
 
-@dataclass(eq=False)
-class _Residuals:
-    """What is left of far sightings about nearer ones of the same cone, after the constant errors."""
+def _residuals(
+    cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], odometry: Array
+) -> tuple[IntArray, Array, Array]:
+    """Return rows (k,) of far sightings, and what is left of them about nearer ones of the same cone.
 
-    rows: IntArray
-    offsets: Array  # (k, 2) along the ray and across it, m
-    reference: Array  # (k, 2) variance of reference and odometry, along and across (m^2)
-
-
-def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], odometry: Array) -> _Residuals:
-    """Return the residuals against nearer sightings, with the drift (3,) by root of s of white noise."""
+    The offsets (2, k) along and across the ray (m) are without the constant errors. With them come the
+    variances (2, k) of reference and odometry (m^2), with the drift (3,) by root of s of white noise.
+    """
     (i, j), t, ranges = cones.pairs, cones.table.t, cones.ranges
     near = ranges[j] < NEAR * ranges[i]
     i, j = i[near], j[near]
     rows, begins, counts = np.unique(i, return_index=True, return_counts=True)
     enough = counts >= 2
     if not enough.any():
-        return _Residuals(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2)))
+        return np.zeros(0, np.intp), np.zeros((2, 0)), np.zeros((2, 0))
     points = cones.points + cones.columns @ errors
     isotropic = 0.5 * (noise[0].sigmas(ranges) ** 2 + noise[1].sigmas(ranges) ** 2)
 
@@ -176,13 +178,12 @@ def _residuals(cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], o
 
     lag = mean(np.abs(t[j] - t[i]))
     off = points[rows] - mean(points[j])
-    offsets = np.stack([(off * cones.ray[rows]).sum(axis=1), (off * cones.side[rows]).sum(axis=1)], axis=1)
-    known = np.stack(
-        [odometry[0] ** 2 * lag, (odometry[1] ** 2 + (odometry[2] * ranges[rows]) ** 2) * lag], 1
-    )
+    offsets = np.array([(off * axis[rows]).sum(axis=1) for axis in (cones.ray, cones.side)])
+    across = odometry[1] ** 2 + (odometry[2] * ranges[rows]) ** 2
+    known = np.array([odometry[0] ** 2 * lag, across * lag])
     for axis, one in enumerate(noise):
-        known[:, axis] += mean(one.sigmas(ranges[j])) ** 2 * np.maximum(1.0 / counts, one.share)
-    return _Residuals(rows[enough], offsets[enough], known[enough])
+        known[axis] += mean(one.sigmas(ranges[j])) ** 2 * np.maximum(1.0 / counts, one.share)
+    return rows[enough], offsets[:, enough], known[:, enough]
 
 
 def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
@@ -195,19 +196,21 @@ def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
     return i, np.repeat(np.repeat(begins, counts), repeats) + nth
 
 
-def _ray_noise(cones: _Cones, left: _Residuals, axis: int) -> RayNoise:
-    """Return the noise along (axis 0) or across (axis 1) the ray by range, and how long it stays."""
-    ranges, off, reference = cones.ranges[left.rows], left.offsets[:, axis], left.reference[:, axis]
+def _ray_noise(
+    cones: _Cones, rows: IntArray, off: Array, reference: Array, least: tuple[float, float]
+) -> RayNoise:
+    """Return the noise along or across the ray by range, and how long it stays, from `_residuals` (k,)."""
+    ranges = cones.ranges[rows]
     order = np.argsort(ranges)
     bins = np.array_split(order, max(min(BINS, len(order) // (MIN_ROWS // 2)), 2))
     middle = np.array([ranges[one].mean() for one in bins])
     scatter = np.array([(MAD * np.median(np.abs(off[one]))) ** 2 for one in bins])
     known = np.array([reference[one].mean() for one in bins])
     sigma = np.sqrt(np.clip(scatter - known, 0.25 * scatter, 4.0 * scatter))
-    least = (LEAST[0], 0.0) if axis == 0 else (0.0, LEAST[1])
     found = RayNoise(np.maximum(_line(middle, sigma), least))
-    share, time = _staying(cones, left, axis, found)
-    count = len(np.unique(cones.table.cone[left.rows]))
+    cone = cones.table.cone[rows]
+    share, time = _staying(cone, cones.table.t[rows], off, reference, found.sigmas(ranges))
+    count = len(np.unique(cone))
     share = (count * share + FIRST_CONES * FIRST_SHARE) / (count + FIRST_CONES)
     return replace(found, share=share, time=time)
 
@@ -223,12 +226,9 @@ def _line(ranges: Array, sigma: Array) -> Array:
     return np.asarray(share * (np.arange(2) == best))
 
 
-def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tuple[float, float]:
-    """Return share and correlation time (s) of the errors of a cone that stay with it."""
-    sigma = noise.sigmas(cones.ranges[left.rows])
-    whitened = np.clip(left.offsets[:, axis] / sigma, -3.0, 3.0)
-    own = left.reference[:, axis] / sigma**2
-    cone, t = cones.table.cone[left.rows], cones.table.t[left.rows]
+def _staying(cone: IntArray, t: Array, off: Array, reference: Array, sigma: Array) -> tuple[float, float]:
+    """Return share and correlation time (s) of the errors (k,) of a cone that stay with it."""
+    whitened, own = np.clip(off / sigma, -3.0, 3.0), reference / sigma**2
     i, j = pairs(cone)
     lag = t[j] - t[i]
     product = whitened[i] * whitened[j] - 0.5 * (own[i] + own[j])
@@ -252,64 +252,16 @@ def _staying(cones: _Cones, left: _Residuals, axis: int, noise: RayNoise) -> tup
     return best[1], best[2]
 
 
-class _Rounds:
-    """Search for errors, noise and weights in turn."""
-
-    def __init__(self, sightings: Sightings, cones: _Cones, found: MeasuredNoise) -> None:
-        self._sightings, self._cones, self._found = sightings, cones, found
-        self._noise = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
-        self._weights: Array = np.ones(len(cones.ranges))
-        self._left = ROUNDS
-
-    def advance(self) -> MeasuredNoise | None:
-        walk, noise = self._found.odometry * np.sqrt(self._found.interval), self._noise
-        information = _information(self._cones, *noise, self._weights)
-        errors, *covariances, off = _solve(self._cones, information)
-        cones = self._cones = self._cones.without(off)
-        square = ((off * cones.ray).sum(axis=1) / noise[0].sigmas(cones.ranges)) ** 2
-        square += ((off * cones.side).sum(axis=1) / noise[1].sigmas(cones.ranges)) ** 2
-        self._weights = huber_weights(np.sqrt(square), HUBER) ** 2
-        self._weights[cones.ranges > COUNTED * MAX_RANGE] = HARDLY
-        left = _residuals(cones, errors, noise, walk)
-        if len(left.rows) < MIN_ROWS:
-            return self._found
-        self._noise = _ray_noise(cones, left, 0), _ray_noise(cones, left, 1)
-        self._left -= 1
-        return None if self._left else self._result(errors, *covariances)
-
-    def _result(self, errors: Array, covariance: Array, clustered: Array) -> MeasuredNoise:
-        """Return what was found, with errors (6,) and both covariances (6, 6) of them.
-
-        What stays of a cone's errors shifts its place; only what changes is taken for an error of the sensor.
-        """
-        stamps, cones = np.unique(self._sightings.t), self._cones
-        period = float(np.median(np.diff(stamps)))
-        count = int(np.median(np.diff(np.append(cones.begins, len(cones.ranges)))))
-        stays = max(one.inflation_of_slope(count, period) for one in self._noise)
-        sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
-        return replace(
-            self._found,
-            along=self._noise[0],
-            across=self._noise[1],
-            count=count,
-            period=period,
-            per_cycle=len(self._sightings.t) / len(stamps),
-            sensor=errors[:SENSOR_SIZE],
-            sensor_sigma=np.hypot(sigmas, MODEL_ERROR * np.abs(errors))[:SENSOR_SIZE],
-            seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
-        )
-
-
 class Measurement:
-    """Measurement of noise in steps short enough for a perception cycle, in passes of follow and measure."""
+    """Measurement of noise in steps short enough for a perception cycle.
+
+    Each pass follows the cones by what was found so far, and then finds errors, noise and weights in turn.
+    """
 
     def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
         """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least."""
-        self._cycles, self._found = cycles, found
-        self._passes = PASSES if found.along is None else 1
-        self._follower, self._sightings = Follower(found), [Sightings.none()]
-        self._followed = 0
-        self._rounds: _Rounds | None = None
+        self._cycles, self._passes = cycles, PASSES if found.along is None else 1
+        self._begin(found)
 
     @classmethod
     def of(cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None) -> Self | None:
@@ -321,26 +273,71 @@ class Measurement:
         found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
         return cls(cycles, replace(found, odometry=sigma, interval=interval))
 
+    def _begin(self, found: MeasuredNoise) -> None:
+        self._found, self._follower, self._followed = found, Follower(found), 0
+        self._sightings: list[Sightings] = []
+        self._cones: _Cones | None = None
+
     def advance(self) -> MeasuredNoise | None:
-        if self._rounds is not None:
-            found = self._rounds.advance()
-            return None if found is None else self._passed(found)
+        """Make the next step; return what was found if it is the last one."""
+        if self._cones is not None:
+            return self._round(self._cones)
         cycles = self._cycles[self._followed : self._followed + FOLLOWED]
         self._sightings.append(self._follower.follow(cycles))
         self._followed += FOLLOWED
         if self._followed < len(self._cycles):
             return None
-        sightings = Sightings.stacked(self._sightings)
-        cones = _cones(sightings)
-        if cones is None:
+        self._sightings = [Sightings.stacked(self._sightings)]
+        self._cones = _cones(self._sightings[0])
+        if self._cones is None:
             return self._passed(self._found)
-        self._rounds = _Rounds(sightings, cones, self._found)
+        self._noise = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
+        self._weights, self._rounds = np.ones(len(self._cones.ranges)), ROUNDS
         return None
+
+    def _round(self, cones: _Cones) -> MeasuredNoise | None:
+        walk, noise = self._found.odometry * np.sqrt(self._found.interval), self._noise
+        errors, *covariances, off = _solve(cones, _information(cones, *noise, self._weights))
+        cones = self._cones = cones.without(off)
+        square = ((off * cones.ray).sum(axis=1) / noise[0].sigmas(cones.ranges)) ** 2
+        square += ((off * cones.side).sum(axis=1) / noise[1].sigmas(cones.ranges)) ** 2
+        self._weights = huber_weights(np.sqrt(square), HUBER) ** 2
+        self._weights[cones.ranges > COUNTED * MAX_RANGE] = HARDLY
+        rows, (along, across), (by_along, by_across) = _residuals(cones, errors, noise, walk)
+        if len(rows) < MIN_ROWS:
+            return self._passed(self._found)
+        self._noise = (
+            _ray_noise(cones, rows, along, by_along, (LEAST[0], 0.0)),
+            _ray_noise(cones, rows, across, by_across, (0.0, LEAST[1])),
+        )
+        self._rounds -= 1
+        return None if self._rounds else self._passed(self._result(cones, errors, *covariances))
+
+    def _result(self, cones: _Cones, errors: Array, covariance: Array, clustered: Array) -> MeasuredNoise:
+        """Return what was found, with errors (6,) and both covariances (6, 6) of them.
+
+        What stays of a cone's errors shifts its place; only what changes is taken for an error of the sensor.
+        """
+        (sightings,), count = self._sightings, int(np.median(cones.counts))
+        stamps = np.unique(sightings.t)
+        period = float(np.median(np.diff(stamps)))
+        stays = max(one.inflation_of_slope(count, period) for one in self._noise)
+        sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
+        return replace(
+            self._found,
+            along=self._noise[0],
+            across=self._noise[1],
+            count=count,
+            period=period,
+            per_cycle=len(sightings.t) / len(stamps),
+            sensor=errors[:SENSOR_SIZE],
+            sensor_sigma=np.hypot(sigmas, MODEL_ERROR * np.abs(errors))[:SENSOR_SIZE],
+            seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
+        )
 
     def _passed(self, found: MeasuredNoise) -> MeasuredNoise | None:
         self._passes -= 1
-        self._found, self._rounds, self._followed = found, None, 0
-        self._follower, self._sightings = Follower(found), [Sightings.none()]
+        self._begin(found)
         return None if self._passes else found
 
 

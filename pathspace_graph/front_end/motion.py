@@ -7,12 +7,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.odometry import (
-    CALIBRATION_SIZE,
-    IntegratedOdometry,
-    integrate_twists,
-    integrated_odometry,
-)
+from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, integrate_odometry
@@ -22,7 +17,7 @@ from . import scan_matching as scans
 from .gate import Newest
 from .scan_matching import REACHES_CHECK, Difference, Match, RecentDetections, SensorErrors, by_errors
 
-NO_CALIBRATION: Final = np.zeros((3, CALIBRATION_SIZE))  # of a motion that is not by odometry
+NO_CALIBRATION: Final = np.zeros((3, 2))  # derivative of a motion that is not by odometry
 DOUBT_AGAIN: Final = 3.8  # contradiction of an odometry that was contradicted not long ago, sigmas
 DISTRUST: Final = 12.0  # time for which it is distrusted so, s: wheels that slip do so in the next bends, too
 DOUBT_RATE: Final = 2.0  # agreement within which a contradicted odometry's yaw rate is believed, sigmas
@@ -43,6 +38,7 @@ REST: Final = 1.0  # time of standing from which the mean yaw rate measures the 
 REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest, m/s, m/s, rad/s, but for noise
 REST_SIGMAS: Final = 3.0  # standard deviations of the mean that count as its noise
 SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # m, m, rad, of a motion at rest from cycle to cycle
+Seen = tuple[Array, Array]  # corrected detections (m, 2), vehicle frame, and variances (m,) of a coordinate
 
 
 class MotionCheck:
@@ -79,20 +75,19 @@ class MotionCheck:
         motion = self._integrate(odometry, t)
         columns = by_errors(measured, motion.odometry.twist)
         points, covariances = measured + columns @ self.errors.mean, detections.covariances
-        detections = Detections(t, points, covariances, detections.labels)
-        variances = 0.5 * (detections.covariances[:, 0, 0] + detections.covariances[:, 1, 1])
+        seen = points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
         self._recent.forget(t)
         self._recent.correct(self.errors.mean)
         self._limit = DOUBT_AGAIN if t - self._doubted_at < DISTRUST else self.settings.doubt
         self._matched = None
-        motion = self._checked(motion, detections, variances, may_doubt)
+        motion = self._checked(motion, t, seen, may_doubt)
         if motion.doubted:
             self._doubted_at = t
         if not motion.fault and self._rest.update(odometry, t):
-            motion = self._at_rest(motion, detections, variances)
+            motion = self._at_rest(motion, t, seen)
         self.pose = compose(self.pose, motion.odometry.delta)
-        points = to_map(detections.points_vehicle, self.pose[None])
-        self.seen_again = self._recent.has(points) if self._matched is None else self._matched
+        placed = to_map(points, self.pose[None])
+        self.seen_again = self._recent.has(placed) if self._matched is None else self._matched
         if motion.fault:
             columns = by_errors(measured, motion.odometry.twist)  # by the twist that is believed
         self._recent.add(t, measured, columns, self.pose)
@@ -124,27 +119,26 @@ class MotionCheck:
         if missing or held.any():
             excess = held[:, None] * np.array(self.settings.accelerations)
         integrated = integrate_twists(durations, odometry.twist, np.hypot(self.sigma, excess))
-        stuck = _is_stuck(odometry.twist)
+        same = (odometry.twist[1:] == odometry.twist[:-1]).all(axis=1)  # to the last digit
+        stuck = bool(same.sum() >= STUCK)
         return MeasuredMotion(integrated, odometry.twist, False, missing, stuck, None, durations, excess)
 
-    def _at_rest(self, motion: MeasuredMotion, detections: Detections, variances: Array) -> MeasuredMotion:
-        standing = self._match(detections, variances, self.pose, REACHES_CHECK)
+    def _at_rest(self, motion: MeasuredMotion, t: float, seen: Seen) -> MeasuredMotion:
+        standing = self._match(seen, self.pose, REACHES_CHECK)
         none = integrated_odometry(np.zeros(3), np.diag(SIGMAS_REST) ** 2, NO_CALIBRATION)
         if standing is None or self._denies(standing, self._difference(none, self.pose, standing)):
             self._rest.end()
             return motion
-        return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(detections.t))
+        return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(t))
 
-    def _checked(
-        self, motion: MeasuredMotion, detections: Detections, variances: Array, may_doubt: bool
-    ) -> MeasuredMotion:
+    def _checked(self, motion: MeasuredMotion, t: float, seen: Seen, may_doubt: bool) -> MeasuredMotion:
         """Return the motion, or that of the detections where they contradict it, or where it is missing."""
-        if self._t is None or detections.t <= self._t:
+        if self._t is None or t <= self._t:
             return motion
-        odometry, dt = motion.odometry, detections.t - self._t
+        odometry, dt = motion.odometry, t - self._t
         going_on = dt * (odometry.twist if self._velocity is None else self._velocity)
         predicted = compose(self.pose, odometry.delta)
-        near = self._match(detections, variances, predicted, REACHES_CHECK)
+        near = self._match(seen, predicted, REACHES_CHECK)
         if near is not None and near.misfit > MAX_MISFIT * self._excess:
             near = None
         told = near is not None and near.matched >= MIN_DOUBTING
@@ -160,24 +154,21 @@ class MotionCheck:
                 return motion
         if not (may_doubt or failed):
             return motion
-        best = self._best(detections, variances, (compose(self.pose, going_on), predicted), dt)
-        denied = best is not None and self._denies(best, self._difference(odometry, predicted, best))
-        if denied and not failed:
-            failed = best is not None and self._fits_better(best, predicted, detections, variances)
+        best = self._best(seen, (compose(self.pose, going_on), predicted), dt)
+        if best is not None and not failed:
+            denied = self._denies(best, self._difference(odometry, predicted, best))
+            failed = denied and self._fits_better(best, predicted, seen)
         return self._replaced(motion, best, going_on, dt) if failed else motion
 
-    def _fits_better(self, best: Match, predicted: Array, detections: Detections, variances: Array) -> bool:
+    def _fits_better(self, best: Match, predicted: Array, seen: Seen) -> bool:
         """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
-        points, variances = detections.points_vehicle[best.is_matched], variances[best.is_matched]
-        at_odometry, at_match = (
-            scans.misfit_at(self._recent, points, variances, pose) for pose in (predicted, best.pose)
-        )
+        points, variances = (column[best.is_matched] for column in seen)
+        at_odometry = scans.misfit_at(self._recent, points, variances, predicted)
+        at_match = scans.misfit_at(self._recent, points, variances, best.pose)
         return at_odometry > max(MISFIT_ODOMETRY, MISFIT_RATIO * at_match)
 
-    def _best(
-        self, detections: Detections, variances: Array, starts: tuple[Array, Array], dt: float
-    ) -> Match | None:
-        matches = [self._match(detections, variances, start, scans.reaches()) for start in starts]
+    def _best(self, seen: Seen, starts: tuple[Array, Array], dt: float) -> Match | None:
+        matches = [self._match(seen, start, scans.REACHES) for start in starts]
         possible = [one for one in matches if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)
 
@@ -190,10 +181,8 @@ class MotionCheck:
     def _denies(self, matched: Match, difference: Difference) -> bool:
         return matched.matched >= MIN_DOUBTING and self.errors.square_of(difference) > self._limit**2
 
-    def _match(
-        self, detections: Detections, variances: Array, start: Array, reaches: Sequence[float]
-    ) -> Match | None:
-        matched = scans.match(self._recent, detections.points_vehicle, variances, start, reaches)
+    def _match(self, seen: Seen, start: Array, reaches: Sequence[float]) -> Match | None:
+        matched = scans.match(self._recent, *seen, start, reaches)
         return matched if matched.matched >= scans.MIN_MATCHED and matched.is_certain else None
 
     def _difference(self, odometry: IntegratedOdometry, predicted: Array, matched: Match) -> Difference:
@@ -229,10 +218,9 @@ class MotionCheck:
                 off = delta - odometry.delta
                 covariance += np.outer(off, off) * BEFORE**2
             mean = delta
-        replaced = replace(integrated_odometry(mean, covariance, NO_CALIBRATION), twist=mean / dt)
-        return MeasuredMotion(
-            replaced, replaced.twist[None], not motion.missing, motion.missing, motion.stuck
-        )
+        replaced, twist = integrated_odometry(mean, covariance, NO_CALIBRATION), mean / dt
+        found = not motion.missing, motion.missing, motion.stuck
+        return MeasuredMotion(replace(replaced, twist=twist), twist[None], *found)
 
 
 class Rest:
@@ -240,11 +228,13 @@ class Rest:
 
     def __init__(self, sigma: Array) -> None:
         self.sigma = sigma
+        self.end()
+
+    def end(self) -> None:
         self._since: float | None = None
-        self._sum: Array = np.zeros(3)
-        self._count = 0
-        self._measured_since = 0.0
-        self._rate_sum, self._rate_count = 0.0, 0
+        self._sum, self._count = np.zeros(3), 0
+        self._measured_since = self._rate_sum = 0.0
+        self._rate_count = 0
 
     def update(self, odometry: Odometry, t: float) -> bool:
         """Return whether the vehicle has stood for long enough at t (s), by the newest twists."""
@@ -260,37 +250,14 @@ class Rest:
         self._rate_count += len(twists)
         return self._is_still(self._sum / self._count, self._count) and t - self._since >= REST
 
-    def end(self) -> None:
-        self._since, self._sum, self._count = None, np.zeros(3), 0
-        self._rate_sum, self._rate_count = 0.0, 0
-
     def bias(self, t: float) -> BiasMeasurement | None:
         """Return the bias that was measured since the last call, if that is long enough ago at t (s)."""
         if t - self._measured_since < REST:
             return None
-        measured = BiasMeasurement(
-            self._rate_sum / self._rate_count, float(self.sigma[2]) / np.sqrt(self._rate_count)
-        )
+        mean, sigma = self._rate_sum / self._rate_count, float(self.sigma[2]) / np.sqrt(self._rate_count)
         self._measured_since, self._rate_sum, self._rate_count = t, 0.0, 0
-        return measured
+        return BiasMeasurement(mean, sigma)
 
     def _is_still(self, mean: Array, count: int) -> bool:
         """Return whether a mean twist (3,) of this number of readings is that of a vehicle at rest."""
         return bool((np.abs(mean) < REST_TWIST + REST_SIGMAS * self.sigma / np.sqrt(count)).all())
-
-
-def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
-    """Return the mean of independent measurements of the bias by their information; None without any."""
-    if not measured:
-        return None
-    information = np.array([one.sigma**-2 for one in measured])
-    values = np.array([one.value for one in measured])
-    return BiasMeasurement(float(information @ values / information.sum()), float(information.sum() ** -0.5))
-
-
-def _is_stuck(twists: Array) -> bool:
-    """Return whether too many of the twists (k, 3) are equal to the one before, to the last digit."""
-    same = twists[1:, 0] == twists[:-1, 0]
-    if same.sum() < STUCK:
-        return False
-    return bool((twists[1:][same] == twists[:-1][same]).all(axis=1).sum() >= STUCK)

@@ -84,12 +84,9 @@ class NoiseLearner:
         if not self.of_sensor or measured is None or measured.along is None:
             return detections
         covariances = measured.covariances(points, inflated=False) if self.of_detections else None
-        return Detections(
-            detections.t,
-            measured.corrected(points, twist, shown=True),
-            detections.covariances if covariances is None else covariances,
-            detections.labels,
-        )
+        covariances = detections.covariances if covariances is None else covariances
+        corrected = measured.corrected(points, twist, shown=True)
+        return Detections(detections.t, corrected, covariances, detections.labels)
 
     def for_map(self, detections: Detections) -> Detections:
         """Return detections whose covariances say what each adds to the others of its cone."""
@@ -110,17 +107,12 @@ class NoiseLearner:
         """
         if self.of_odometry and self.measured is not None:
             motions = [motion.with_sigma(self.twist_sigma) for motion in motions]
-        counts = [len(cycle.labels) for cycle in detections]
-        stated = Detections(
-            0.0,
-            np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in detections)]),
-            np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in detections)]),
-            np.zeros(sum(counts), np.intp),
-        )
-        used = np.split(self.for_map(stated).covariances, np.cumsum(counts)[:-1])
+        points = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in detections)])
+        stated = np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in detections)])
+        used = self.for_map(Detections(0.0, points, stated, np.zeros(len(points), np.intp))).covariances
+        parts = np.split(used, np.cumsum([len(cycle.labels) for cycle in detections])[:-1])
         return list(motions), [
-            Detections(cycle.t, cycle.points_vehicle, covariances, cycle.labels)
-            for cycle, covariances in zip(detections, used, strict=True)
+            replace(cycle, covariances=part) for cycle, part in zip(detections, parts, strict=True)
         ]
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
@@ -135,14 +127,12 @@ class NoiseLearner:
             return settings
         sigmas = np.maximum(measured.sensor_sigma, sensor.sigmas)
         odometry, means = settings.odometry, measured.sensor.copy()
-        if not contradicted[SCALE]:
-            means[SCALE], sigmas[SCALE] = sensor.range_scale, sensor.sigma_range_scale
-        elif self.trusts_odometry(settings):
+        if contradicted[SCALE] and self.trusts_odometry(settings):
             odometry = replace(odometry, hold_scale=True)
         else:
-            scale = float(means[SCALE])
-            sigma = max(float(sigmas[SCALE]), odometry.sigma_scale)
-            odometry = replace(odometry, scale=-scale / (1.0 + scale), doubt=inf, sigma_scale=sigma)
+            if contradicted[SCALE]:
+                scale, sigma = float(means[SCALE]), max(float(sigmas[SCALE]), odometry.sigma_scale)
+                odometry = replace(odometry, scale=-scale / (1.0 + scale), doubt=inf, sigma_scale=sigma)
             means[SCALE], sigmas[SCALE] = sensor.range_scale, sensor.sigma_range_scale
         priors: dict[str, Any] = dict(zip(SENSOR, means.tolist(), strict=True))
         priors |= {f"sigma_{name}": sigma for name, sigma in zip(SENSOR, sigmas.tolist(), strict=True)}
@@ -160,14 +150,13 @@ class NoiseLearner:
 
     def used(self, settings: MapperSettings) -> RunNoise:
         """Return the noise used, and what sets the size of the map where ranges and speeds disagree."""
-        measured = self.measured
+        measured, known = self.measured, self.known
         size: Literal["odometry", "ranges"] | None = None
         if self._contradicted(settings)[SCALE]:
             size = "odometry" if self.trusts_odometry(settings) else "ranges"
-        known = measured is not None, measured is not None and measured.along is not None
-        stated = self.known.odometry_stated, self.known.detections_stated
-        own = self.of_odometry, self.of_detections
-        odometry, detections = (_source(*one) for one in zip(stated, own, known, strict=True))
+        has_rays = measured is not None and measured.along is not None
+        odometry = _source(known.odometry_stated, self.of_odometry, measured is not None)
+        detections = _source(known.detections_stated, self.of_detections, has_rays)
         return RunNoise(odometry, detections, measured, size)
 
     def trusts_odometry(self, settings: MapperSettings) -> bool:

@@ -32,6 +32,7 @@ REACH: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
 ITERATIONS: Final = 6
+REACHES: Final = [REACH * ((REACH_LAST / REACH) ** (1.0 / (ITERATIONS - 1))) ** k for k in range(ITERATIONS)]
 REACHES_CHECK: Final = (REACH, REACH_LAST)  # of the check, which begins near the solution
 FARTHEST: Final = 3.0  # distance in reaches from which on a remembered detection has no weight
 MIN_WEIGHT: Final = 0.7  # least sum of weights of a matched detection
@@ -41,12 +42,6 @@ SIGMA_CONE: Final = 0.05  # added to a detection's, m, since one side of a cone 
 LEAST_SHARE: Final = 1e-6  # least det of a pose's information by the product of its diagonal
 MOST_MISFIT: Final = 9.0  # largest whitened square in a misfit that is compared with another
 _TINY: Final = float(np.finfo(float).tiny)
-
-
-def reaches(iterations: int = ITERATIONS) -> list[float]:
-    """Return the reach of each iteration (m), which shrinks by the same factor."""
-    shrink = (REACH_LAST / REACH) ** (1.0 / max(iterations - 1, 1))
-    return [REACH * shrink**k for k in range(iterations)]
 
 
 class RecentDetections:
@@ -130,43 +125,26 @@ def _matched(
     reaches: Sequence[float],
     limits: tuple[float, ...],
 ) -> tuple[Array, Array, BoolArray, float]:
-    """Return the pose (3,) of `match`, and of its last step what `_match_step` returns but the gradient."""
-    pose, (min_matched, least_share) = start.copy(), limits[4:]
+    """Return the pose (3,) of `match`, and information (3, 3), matches (m,) and cost of its last step."""
+    pose, (farthest, min_weight, huber, sigma_cone, min_matched, least_share) = start.copy(), limits
     for reach in reaches:
-        information, gradient, matched, cost = _match_step(
-            recent, points_vehicle, variances, pose, reach, limits
-        )
+        points = to_map(points_vehicle, pose[None])
+        means, weights = _weighted_means(points, recent, reach, farthest)
+        matched = weights > min_weight
+        off, arm = (points - means)[matched], (points - pose[:2])[matched]
+        precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + sigma_cone**2)
+        square = (off * off).sum(axis=1)
+        precision *= huber_weights(np.sqrt(square * precision), huber)
+        (ax, ay), (ex, ey) = arm.T, off.T
+        w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
+        turning = precision @ (ax * ax + ay * ay)
+        information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
+        gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
         if matched.sum() < min_matched:
             break
         regular = information + np.diag(least_share * information.diagonal())
         pose = pose - np.linalg.solve(regular, gradient)
-    return pose, information, matched, cost
-
-
-def _match_step(
-    recent: Array,
-    points_vehicle: Array,
-    variances: Array,
-    pose: Array,
-    reach: float,
-    limits: tuple[float, ...],
-) -> tuple[Array, Array, BoolArray, float]:
-    """Return information (3, 3), gradient (3,), which detections (m,) match, and their weighted cost."""
-    farthest, min_weight, huber, sigma_cone = limits[:4]
-    points = to_map(points_vehicle, pose[None])
-    means, weights = _weighted_means(points, recent, reach, farthest)
-    matched = weights > min_weight
-    off, arm = (points - means)[matched], (points - pose[:2])[matched]
-    precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + sigma_cone**2)
-    square = (off * off).sum(axis=1)
-    precision *= huber_weights(np.sqrt(square * precision), huber)
-    ax, ay = arm.T
-    ex, ey = off.T
-    w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
-    turning = precision @ (ax * ax + ay * ay)
-    information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
-    gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
-    return information, gradient, matched, float(square @ precision)
+    return pose, information, matched, float(square @ precision)
 
 
 def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:
@@ -262,11 +240,7 @@ class SensorErrors:
 
 @compiled
 def off_prediction(
-    pose: Array,
-    information: Array,
-    excess: float,
-    predicted: Array,
-    covariance: Array,
+    pose: Array, information: Array, excess: float, predicted: Array, covariance: Array
 ) -> tuple[Array, Array]:
     """Return how far a match, of variance times `excess`, is off a prediction, and its covariance."""
     turn = np.eye(3)

@@ -98,9 +98,8 @@ class SideJudge:
         agree = (lateral > 0.0) == is_left
         self._agreeing += int((agree & beside).sum())
         self._opposing += int((~agree & beside).sum())
-        winning, losing = self._opposing, self._agreeing
-        if self.swapped:
-            winning, losing = losing, winning
+        votes = self._opposing, self._agreeing
+        winning, losing = votes[::-1] if self.swapped else votes
         if winning >= self.settings.min_votes and winning > MAJORITY * losing:
             self.swapped = not self.swapped
 
@@ -136,12 +135,12 @@ class SideJudge:
         order = np.flatnonzero(beside)[np.argsort(stations[beside])]
         cones = seen[order[in_front_row(stations[order], side[order], BESIDE, LATERAL_GAP)]].tolist()
         left = np.array([-np.sin(pose[2]), np.cos(pose[2])])
-        row = Row([], pose[:2] + SIDES[label] * HALF_WIDTH * left, float(pose[2]))
-        for cone in cones[-2:]:
-            row.lead_to(cone, self._cones.points[cone])
-        if len(cones) < 2:
-            row.heading = float(pose[2])
-        row.cones = cones
+        points = self._cones.points[cones[-2:]]
+        row = Row(cones, pose[:2] + SIDES[label] * HALF_WIDTH * left, float(pose[2]))
+        if cones:
+            row.end = points[-1]
+        if len(cones) > 1:
+            row.heading = float(np.arctan2(*(points[1] - points[0])[::-1]))
         return row
 
 

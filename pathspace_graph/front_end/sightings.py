@@ -62,11 +62,6 @@ class SeenCycle:
     twist: Array  # (3,) twist of the vehicle: m/s, m/s, rad/s
 
 
-def follow(cycles: Sequence[SeenCycle], known: MeasuredNoise) -> Sightings:
-    """Return the sightings of cones in the cycles, in order of time, as measured."""
-    return Follower(known).follow(cycles)
-
-
 class Follower:
     """Cones that were seen in the last seconds, by dead reckoning."""
 
@@ -78,28 +73,27 @@ class Follower:
         self._from: tuple[float, Array, Array] | None = None  # stamp, pose and `by_bias` of the latest cycle
 
     def follow(self, cycles: Sequence[SeenCycle]) -> Sightings:
-        """Return the sightings of the next cycles, in order of time, and the nearest first in each."""
+        """Return the sightings of the next cycles as measured, in order of time, the nearest first."""
         if not cycles:
             return Sightings.none()
-        t = np.array([cycle.detections.t for cycle in cycles])
-        poses, twists = (np.array([getattr(cycle, name) for cycle in cycles]) for name in ("pose", "twist"))
-        cycle = np.repeat(np.arange(len(cycles)), [len(one.detections.labels) for one in cycles])
-        measured = np.concatenate([one.detections.points_vehicle for one in cycles])
-        labels = np.concatenate([one.detections.labels for one in cycles])
+        poses, twists = np.array([one.pose for one in cycles]), np.array([one.twist for one in cycles])
+        seen = [one.detections for one in cycles]
+        t, labels = np.array([one.t for one in seen]), np.concatenate([one.labels for one in seen])
+        cycle = np.repeat(np.arange(len(seen)), [len(one.labels) for one in seen])
+        measured = np.concatenate([one.points_vehicle for one in seen])
         ranges = np.hypot(*measured.T)
         order = np.lexsort((ranges, cycle))
         order = order[ranges[order] < MAX_RANGE]
         cycle, measured, ranges = cycle[order], measured[order], ranges[order]
         points = to_map(self._known.corrected(measured, twists[cycle]), poses[cycle])
         begins, gates = cycle.searchsorted(np.arange(len(cycles) + 1)), self._gates(ranges)
-        seen = (points, labels[order], ranges, *gates)
+        cycles_seen = begins, t, poses[:, :2].copy(), points, labels[order], ranges, *gates
         cones, self._cones, self._count = _followed(
-            begins, t, poses[:, :2].copy(), *seen, self._cones, self._count, (MAX_AGE, *FOLLOWING)
+            *cycles_seen, self._cones, self._count, (MAX_AGE, *FOLLOWING)
         )
-        by_bias, own = self._by_bias(t, poses), cycle[cones >= 0]
-        return Sightings(
-            cones[cones >= 0], t[own], measured[cones >= 0], twists[own], poses[own], by_bias[own]
-        )
+        of_cone, by_bias = cones >= 0, self._by_bias(t, poses)
+        own = cycle[of_cone]
+        return Sightings(cones[of_cone], t[own], measured[of_cone], twists[own], poses[own], by_bias[own])
 
     def _by_bias(self, t: Array, poses: Array) -> Array:
         """Return the derivatives (c, 3) of the poses by the bias of the yaw rate."""
@@ -119,8 +113,7 @@ class Follower:
             round_gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
             return round_gate, round_gate
         along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
-        along, across = (np.minimum(np.maximum(one, GATE_LEAST), GATE_MOST) for one in (along, across))
-        return along, across
+        return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
 
 
 @compiled

@@ -15,7 +15,7 @@ from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.start import unwrap
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import compose, inverse, relative, rotation, to_map, to_vehicle
-from pathspace_graph.front_end.scan_matching import ERRORS, RecentDetections, match, reaches
+from pathspace_graph.front_end.scan_matching import ERRORS, REACHES, RecentDetections, match
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import HEADING
 from pathspace_graph.mapping.revisit import Revisit
@@ -77,7 +77,7 @@ class Revisits:
             return None
         known = RecentDetections()
         known.add(0.0, earlier, np.zeros((len(earlier), 2, len(ERRORS))), np.zeros(3))
-        found = match(known, to_vehicle(seen, poses[-1:]), variances, poses[-1], reaches())
+        found = match(known, to_vehicle(seen, poses[-1:]), variances, poses[-1], REACHES)
         share = found.matched / len(found.is_matched)
         drift = float(np.hypot(*(found.pose - poses[-1])[:2]))
         if not (found.is_certain and share > MIN_SHARE and found.misfit < MOST_MISFIT and drift < MOST_DRIFT):

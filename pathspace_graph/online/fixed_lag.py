@@ -231,10 +231,10 @@ class FixedLagMapper(MapperEstimate):
 
     def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
         detections = self.front_end.use_late(detections, self.smoother.times)
-        late = at_nearest_pose(self.smoother, detections, self.settings.motion)
+        late, cycle, twist = at_nearest_pose(self.smoother, detections, self.settings.motion)
         table = self.smoother.map.detections
-        new = table.append(late.detections, late.cycle, late.twist)
-        self.loop.record.measured_late(late.cycle, late.detections)
+        new = table.append(late, cycle, twist)
+        self.loop.record.measured_late(cycle, late)
         if self.boundaries and not self.loop.is_searching:
             self.smoother.associate_late(new)
         if not self.closed:

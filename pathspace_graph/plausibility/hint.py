@@ -2,26 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Final
 
 from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE
-
-Cause = Literal[  # the kinds of mistakes that are told
-    "stamps",
-    "clocks",
-    "positions",
-    "speeds",
-    "yaw rate",
-    "y to the right",
-    "sensor frame",
-    "map frame",
-    "odometry",
-    "mounting",
-    "covariances",
-    "noise",
-    "labels",
-    "unexplained",
-]
 
 
 @dataclass(frozen=True)
@@ -30,7 +13,8 @@ class Hint:
 
     LENGTHS: ClassVar = {"found": 1, "likely": 1, "advice": 1}
 
-    cause: Cause
+    cause: str
+    """Kind of the mistake, which begins its row in `TABLE`."""
     file: str
     columns: str
     """Columns of the file, in words."""
@@ -59,7 +43,7 @@ _TURNED = "static cones move as they would for a sensor that is turned by {angle
 _BY_READINGS = "--noise measured takes what is measured"
 _CLASSES = "the classes of the detector were not turned into left and right"
 
-TABLE: Final[dict[str, tuple[Cause, str, str, str, str, str]]] = {
+TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
     "unit of stamps": ("stamps", "{file}", _T, "rows follow each other after {step:.4g} s as a rule",
         "the stamps are in {unit}, not in seconds", "multiply column t by {factor:g}"),
     "fraction of seconds": ("stamps", "{file}", _T,
@@ -67,8 +51,8 @@ TABLE: Final[dict[str, tuple[Cause, str, str, str, str, str]]] = {
         "this is only the fraction of each second", "add the seconds to it"),
     "whole seconds": ("stamps", "{file}", _T, "the stamps are whole numbers, {rows:.0f} rows to each",
         "these are only the whole seconds", "add the fraction of each second"),
-    "milliseconds": ("stamps", ODOMETRY_FILE, _T, _EXPECTED,
-        "the stamps are in milliseconds, not in seconds", "multiply column t by 0.001"),
+    "milliseconds": ("stamps", ODOMETRY_FILE, _T, _EXPECTED, "the stamps are in milliseconds, not in seconds",
+        "multiply column t by 0.001"),
     "two clocks": ("clocks", DETECTIONS_FILE, _T,
         "the stamps go from {begin:.12g} to {end:.12g} s, those of " + ODOMETRY_FILE
         + " from {first:.12g} to {last:.12g} s",
@@ -79,8 +63,7 @@ TABLE: Final[dict[str, tuple[Cause, str, str, str, str, str]]] = {
         "stamp odometry and detections when they are measured, by one clock"),
     "unit of positions": ("positions", DETECTIONS_FILE, _XY, "detections are {typical:.4g} m away as a rule",
         "the positions {what}", "multiply x and y by {factor:g}"),
-    "too fast": ("speeds", ODOMETRY_FILE, _V,
-        "the speed is more than {speed:.4g} m/s in a tenth of the rows",
+    "too fast": ("speeds", ODOMETRY_FILE, _V, "the speed is more than {speed:.4g} m/s in a tenth of the rows",
         "the speeds are not in m/s, but in mm/s or cm/s", "give them in m/s"),
     "turns too fast": ("yaw rate", ODOMETRY_FILE, _WZ,
         "the yaw rate is more than {rate:.4g} rad/s in a tenth of the rows",
@@ -120,8 +103,7 @@ TABLE: Final[dict[str, tuple[Cause, str, str, str, str, str]]] = {
         "add {ahead:.2f} to x and {left:.2f} to y, or state the sensor's mounting"),
     "covariances": ("covariances", DETECTIONS_FILE, _K,
         "detections of one cone are {scatter:.2g} m apart as a rule, by their covariances {claimed:.2g} m",
-        "the covariances are in {unit}, or no covariances at all",
-        "give each detection's covariance in m^2"),
+        "the covariances are in {unit}, or no covariances at all", "give each detection's covariance in m^2"),
     "one label": ("labels", DETECTIONS_FILE, _LABEL,
         "all labels are {label}, and {share:.0%} of the cones are on that side", _CLASSES,
         "write left, right or unknown for each detection"),

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.special import bdtrc
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import rotation, se2_exp, wrap_angle
+from pathspace_graph.factors.odometry import integrate_poses
+from pathspace_graph.factors.se2 import left_of, rotation, rotations, to_vehicle
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, UNKNOWN
 
@@ -57,8 +58,7 @@ class Pairs:
 
     def laid(self, frame: Array, motion: Array) -> Array:
         """Return the later detections (P, m, 2) in the earlier vehicle frame."""
-        c, s = np.cos(motion[:, 2]), np.sin(motion[:, 2])
-        turn = np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2)  # the transpose, for points in rows
+        turn = rotations(motion[:, 2]).transpose(0, 2, 1)  # for points in rows
         return np.asarray((self.after @ frame.T) @ turn + motion[:, None, :2])
 
     def explained(self, frame: Array, motion: Array) -> Array:
@@ -73,14 +73,13 @@ class Pairs:
 
     def overlap(self, motion: Array) -> Array:
         """Return the share (P,) of the later detections that the earlier cycle could have seen."""
-        ranges, bearings = _polar(self.before)
-        vector = np.nanmean(np.exp(1j * bearings))
-        middle = float(np.angle(vector)) if abs(vector) > ROUND else 0.0
-        farthest = np.nanquantile(ranges, SEEN)
-        widest = np.nanquantile(np.abs(wrap_angle(bearings - middle)), SEEN)
-        ranges, bearings = _polar(self.laid(np.eye(2), motion))
-        inside = (ranges < farthest) & (np.abs(wrap_angle(bearings - middle)) < widest)
-        return np.asarray(inside.sum(axis=1) / np.isfinite(ranges).sum(axis=1))
+        seen, again = (points @ [1.0, 1j] for points in (self.before, self.laid(np.eye(2), motion)))
+        vector = np.nanmean(np.exp(1j * np.angle(seen)))
+        back = vector.conjugate() if abs(vector) > ROUND else 1.0  # turns the middle of the view ahead
+        farthest = np.nanquantile(np.abs(seen), SEEN)
+        widest = np.nanquantile(np.abs(np.angle(seen * back)), SEEN)
+        inside = (np.abs(again) < farthest) & (np.abs(np.angle(again * back)) < widest)
+        return np.asarray(inside.sum(axis=1) / np.isfinite(again).sum(axis=1))
 
     @property
     def count(self) -> IntArray:
@@ -127,33 +126,20 @@ def spacing_of(cycles: Sequence[Detections]) -> float | None:
     """Return the median distance from a detection to the next one of its cycle, or None without any."""
     found = []
     for cycle in cycles:
-        points = cycle.points_vehicle
-        off = points[:, None] - points
+        off = cycle.points_vehicle[:, None] - cycle.points_vehicle  # which may be infinite
         square = (off * off).sum(axis=-1)
         np.fill_diagonal(square, np.inf)
         found.append(np.sqrt(square.min(axis=1)))
     return float(np.median(np.concatenate(found))) if found else None
 
 
-def _polar(points: Array) -> tuple[Array, Array]:
-    return np.hypot(points[..., 0], points[..., 1]), np.arctan2(points[..., 1], points[..., 0])
-
-
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
-    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning."""
-    first, last = _at(odometry_t, poses, begin), _at(odometry_t, poses, end)
-    moved = turned(last[:, :2] - first[:, :2], -first[:, 2])
-    return np.column_stack([moved, last[:, 2] - first[:, 2]])
+    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning.
 
-
-def _at(odometry_t: Array, poses: Array, stamps: Array) -> Array:
-    """Return the poses (P, 3) at stamps (P,) by linear interpolation; beyond the ends they are held."""
-    return np.column_stack([np.interp(stamps, odometry_t, column) for column in poses.T])
-
-
-def turned(vectors: Array, angles: Array) -> Array:
-    c, s = np.cos(angles), np.sin(angles)
-    return np.column_stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]])
+    Poses (N, 3) are interpolated linearly; beyond the ends they are held.
+    """
+    first, last = (np.column_stack([np.interp(t, odometry_t, one) for one in poses.T]) for t in (begin, end))
+    return np.column_stack([to_vehicle(last[:, :2], first), last[:, 2] - first[:, 2]])
 
 
 # --- what the columns may mean ---------------------------------------------------------------------------
@@ -170,7 +156,6 @@ LEAST_MATCHES: Final = 60  # least number of matched detections from which the m
 WORST_CONDITION: Final = 1e6  # largest condition number at which the mounting is found
 LATEST: Final = 10.0  # largest delay or lead of detections that is tried (s)
 LATE_STEP: Final = 0.25  # step of these (s)
-QUARTER: Final = 90.0  # a quarter turn in degrees
 DEGREE: Final = float(np.pi / 180.0)  # in radians
 Content = Literal["twist", "twist in the map frame", "pose", "nothing"]
 
@@ -202,22 +187,31 @@ class Hypothesis:
             return np.column_stack([measured[:, :2], np.unwrap(measured[:, 2])])
         if self.content == "nothing":
             return np.zeros_like(measured)
-        dt = np.diff(odometry.t)[:, None]
-        heading = np.append(0.0, np.cumsum(measured[:-1, 2:] * dt))
-        if self.content == "twist":
-            steps = turned(se2_exp(measured[:-1] * dt)[:, :2], heading[:-1])
-        else:
-            steps = measured[:-1, :2] * dt
-        return np.column_stack([np.cumsum(np.vstack([np.zeros(2), steps]), axis=0), heading])
+        durations, held = np.diff(odometry.t), measured[:-1]
+        is_twist = self.content == "twist"
+        moved = integrate_poses(durations, held) if is_twist else np.cumsum(held * durations[:, None], axis=0)
+        return np.concatenate([np.zeros((1, 3)), moved])
 
 
+SPEEDS: Final = {  # what a unit of the speeds (m/s) means
+    1.0 / 3.6: "are in km/h, not in m/s",
+    0.44704: "are in miles per hour, not in m/s",
+    0.514444: "are in knots, not in m/s",
+    1e-2: "are in cm/s, not in m/s",
+    1e-3: "are in mm/s, not in m/s",
+    3.6: "were divided by 3.6 although they were in m/s",
+    1e3: "were divided by 1000 although they were in m/s",
+}
+RATES: Final = {  # what a unit of the yaw rate (rad/s) means
+    DEGREE: "is in degrees per second, not in rad/s",
+    1.0 / DEGREE: "was turned from degrees to radians although it was in rad/s",
+}
 AS_WRITTEN: Final = Hypothesis()  # the log means what it should
 MEANINGS: Final = (  # of the odometry; of equally good ones the first is told
     AS_WRITTEN,
     Hypothesis("nothing"),
-    Hypothesis(rate=DEGREE),
-    Hypothesis(rate=1.0 / DEGREE),
-    *(Hypothesis(speed=speed) for speed in (1.0 / 3.6, 0.44704, 0.514444, 1e-2, 1e-3, 3.6, 1e3)),
+    *(Hypothesis(rate=rate) for rate in RATES),
+    *(Hypothesis(speed=speed) for speed in SPEEDS),
     *(Hypothesis(speed=speed, rate=DEGREE) for speed in (1.0 / 3.6, 1e-2, 1e-3)),
     Hypothesis("twist in the map frame"),
     Hypothesis("twist in the map frame", rate=DEGREE),
@@ -259,7 +253,8 @@ class Trials:
 
     def motion(self, hypothesis: Hypothesis) -> Array:
         """Return the motion (P, 3) of the vehicle from the earlier to the later cycle of each pair."""
-        odometry, pairs, meaning = self.log.odometry, self.pairs, of_odometry(hypothesis)
+        odometry, pairs = self.log.odometry, self.pairs
+        meaning = replace(hypothesis, turn=0.0, mirrored=False, late=0.0)
         if meaning not in self._poses:
             self._poses[meaning] = meaning.poses(odometry)
         begin, end = pairs.begin - hypothesis.late, pairs.end - hypothesis.late
@@ -284,7 +279,7 @@ class Trials:
     def _others(self) -> Iterator[Hypothesis]:
         """Yield frames in fine steps for a right odometry, and in quarter turns for any other."""
         for meaning in MEANINGS:
-            step = TURN_STEP if meaning == AS_WRITTEN else QUARTER
+            step = TURN_STEP if meaning == AS_WRITTEN else 90.0
             for turn in np.arange(0.0, 360.0, step).tolist():
                 for mirrored in (False, True):
                     one = replace(meaning, turn=turn - 360.0 if turn > 180.0 else turn, mirrored=mirrored)
@@ -306,10 +301,6 @@ class Trials:
         distance = np.hypot(*points.T)
         near = (labels != UNKNOWN) & (distance < np.median(distance))
         return points[near], labels[near]
-
-
-def of_odometry(hypothesis: Hypothesis) -> Hypothesis:
-    return replace(hypothesis, turn=0.0, mirrored=False, late=0.0)
 
 
 # --- where the sensor is in the vehicle, and how late it is ----------------------------------------------
@@ -334,36 +325,29 @@ def mounting_of(trials: Trials, hypothesis: Hypothesis) -> Mounting | None:
     `a - R b - t + (J t) yaw + (I - R) l`, in first order of the yaw and exactly in the lever arm l.
     """
     motion, frame = trials.motion(hypothesis), hypothesis.frame
-    values, sigmas = np.zeros(3), np.full(3, np.inf)
+    values = np.zeros(3)
     for _ in range(MOUNTING_STEPS):
-        turned = rotation(values[0]) @ frame
         seen = motion + lever(motion, values[1:])
-        off, variances, rows = _matches(trials, turned, seen)
+        off, variances, rows = _matches(trials, rotation(values[0]) @ frame, seen)
         if len(rows) < LEAST_MATCHES:
             return None
-        columns = _columns(motion[rows], values[1:])
+        by_arm = [-lever(motion[rows], unit)[:, :2] for unit in np.eye(2)]
+        columns = np.stack([left_of(seen[rows, :2]), *by_arm], axis=2)
         normal = np.einsum("nki,nkj->ij", columns, columns)
         if np.linalg.cond(normal) > WORST_CONDITION:
             return None
         values = values - np.linalg.solve(normal, np.einsum("nki,nk->i", columns, off))
-        sigmas = _sigmas(columns, off, rows, normal)
-    scatter = float(np.median(np.hypot(*off.T)))
-    return Mounting(values, sigmas, scatter, float(np.median(np.sqrt(variances * MEDIAN_SQUARE))))
+    scores, inverse = np.zeros((len(motion), 3)), np.linalg.inv(normal)
+    np.add.at(scores, rows, np.einsum("nki,nk->ni", columns, off))  # a pair's matches are one observation
+    sigmas = np.sqrt(np.diag(inverse @ (scores.T @ scores) @ inverse))
+    claimed = np.median(np.sqrt(variances * MEDIAN_SQUARE))
+    return Mounting(values, sigmas, float(np.median(np.hypot(*off.T))), float(claimed))
 
 
 def lever(motion: Array, arm: Array) -> Array:
     """Return what a lever arm (2,) adds to motions (P, 3): a sensor there moves by `t + (R - I) l`."""
     c, s = np.cos(motion[:, 2]) - 1.0, np.sin(motion[:, 2])
     return np.column_stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1], np.zeros(len(motion))])
-
-
-def _columns(motion: Array, arm: Array) -> Array:
-    seen = motion + lever(motion, arm)
-    columns = np.zeros((len(motion), 2, 3))
-    columns[:, 0, 0], columns[:, 1, 0] = -seen[:, 1], seen[:, 0]
-    for k, unit in enumerate(np.eye(2)):
-        columns[:, :, 1 + k] = -lever(motion, unit)[:, :2]
-    return columns
 
 
 def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array, IntArray]:
@@ -377,14 +361,6 @@ def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array,
     after = forth[rows, before]
     off = pairs.before[rows, before] @ frame.T - pairs.laid(frame, motion)[rows, after]
     return off, pairs.variances[rows, before, after], rows
-
-
-def _sigmas(columns: Array, off: Array, rows: IntArray, normal: Array) -> Array:
-    """Return the standard deviations (3,), for which the matches of one pair count as one observation."""
-    scores = np.zeros((int(rows.max()) + 1, 3))
-    np.add.at(scores, rows, np.einsum("nki,nk->ni", columns, off))
-    inverse = np.linalg.inv(normal)
-    return np.asarray(np.sqrt(np.diag(inverse @ (scores.T @ scores) @ inverse)))
 
 
 def best_lateness(trials: Trials, best: Trial) -> Trial:

@@ -11,29 +11,16 @@ from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry, covariances_of, cycles_of
-from pathspace_graph.io.parsing import Table, read_table, shown
+from pathspace_graph.io.parsing import read_table, shown
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN, label_from_name
 from pathspace_graph.lengths import scaled
 from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
 
 from . import hypotheses
+from .diagnosis import noise_hints
 from .hint import Hint, because, told
-from .hypotheses import (
-    AS_WRITTEN,
-    DEGREE,
-    GAPS,
-    LEAST_SHARE,
-    Hypothesis,
-    Mounting,
-    Pairs,
-    Trial,
-    Trials,
-    far_better,
-    motions,
-    pairs_of,
-)
-from .noise import noise_hints
+from .hypotheses import AS_WRITTEN, DEGREE, Hypothesis, Mounting, Pairs, Trial, Trials, far_better
 
 LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is said
 OVERLAP: Final = 0.5  # share of its detections that another cycle sees, from which they are compared
@@ -59,19 +46,6 @@ UNEXPLAINED: Final = 0.15  # share of the detections that the best motion must e
 LINE_RATIO: Final = 0.1  # ratio of the variations of two coordinates below which detections lie on a line
 TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size in s
 LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # units of positions by their size in m
-SPEEDS: Final = {  # what a unit of the speeds (m/s) means
-    1.0 / 3.6: "are in km/h, not in m/s",
-    0.44704: "are in miles per hour, not in m/s",
-    0.514444: "are in knots, not in m/s",
-    1e-2: "are in cm/s, not in m/s",
-    1e-3: "are in mm/s, not in m/s",
-    3.6: "were divided by 3.6 although they were in m/s",
-    1e3: "were divided by 1000 although they were in m/s",
-}
-RATES: Final = {  # what a unit of the yaw rate (rad/s) means
-    DEGREE: "is in degrees per second, not in rad/s",
-    1.0 / DEGREE: "was turned from degrees to radians although it was in rad/s",
-}
 FRAMES: Final = {  # what a turn of the sensor (degrees), mirrored or not, means
     (180.0, False): "the sensor's frame has x to the rear and y to the right",
     (-90.0, False): "the sensor's frame has x to the right and y ahead",
@@ -102,7 +76,7 @@ def _hints(log: Log) -> list[Hint]:
         return found + of_clocks
     log, of_positions = positions_in_metres(log)
     found += of_positions
-    pairs = pairs_of(log.cycles)
+    pairs = hypotheses.pairs_of(log.cycles)
     if pairs is None:
         return found + beyond_any_vehicle(log.odometry)
     found += _by_motion(Trials(log, telling_pairs(log, pairs)))
@@ -131,12 +105,8 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
         step = _median(np.abs(np.diff(t)))
         fitting = [one for one in TIMES if SHORTEST_STEP <= step * one <= LONGEST_STEP]
         if step > LONGEST_STEP and fitting:
-            factors[file] = fitting[0]
-            found.append(
-                told("unit of stamps", file=file, step=step, unit=TIMES[fitting[0]], factor=fitting[0])
-            )
-    if not found:
-        return log, []
+            unit = factors[file] = fitting[0]
+            found.append(told("unit of stamps", file=file, step=step, unit=TIMES[unit], factor=unit))
     of_odometry, of_cycles = (factors.get(file, 1.0) for file in (ODOMETRY_FILE, DETECTIONS_FILE))
     odometry = replace(log.odometry, t=log.odometry.t * of_odometry)
     cycles = tuple(replace(cycle, t=cycle.t * of_cycles) for cycle in log.cycles)
@@ -171,7 +141,7 @@ def beyond_any_vehicle(odometry: Odometry) -> list[Hint]:
     speed = float(np.quantile(np.hypot(odometry.twist[:, 0], odometry.twist[:, 1]), 0.9))
     rate = float(np.quantile(np.abs(odometry.twist[:, 2]), 0.9))
     found = [told("too fast", speed=speed)] if speed > FASTEST else []
-    return found + ([told("turns too fast", rate=rate)] if rate > FASTEST_TURN else [])
+    return [*found, told("turns too fast", rate=rate)] if rate > FASTEST_TURN else found
 
 
 def _stamps(log: Log) -> dict[str, Array]:
@@ -192,8 +162,8 @@ def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
     like the next. Where the odometry is impossible anyway, the pairs are those that follow each other.
     """
     if beyond_any_vehicle(log.odometry):
-        return pairs.chosen(pairs.gap <= GAPS[1])
-    motion = motions(log.odometry.t, AS_WRITTEN.poses(log.odometry), pairs.begin, pairs.end)
+        return pairs.chosen(pairs.gap <= hypotheses.GAPS[1])
+    motion = hypotheses.motions(log.odometry.t, AS_WRITTEN.poses(log.odometry), pairs.begin, pairs.end)
     return pairs.chosen(pairs.overlap(motion) >= OVERLAP)
 
 
@@ -201,10 +171,10 @@ def _by_motion(trials: Trials) -> list[Hint]:
     if len(trials.pairs) == 0:
         return beyond_any_vehicle(trials.log.odometry)
     best, found = _meant(trials)
-    if best.hypothesis.content == "nothing" or (found and is_a_line(trials.pairs)):
+    if best.hypothesis.content == "nothing" or (found and camera(trials.pairs)):
         return found
     late, of_clocks = _late(trials, best)
-    if best.share < LEAST_SHARE and late is best:
+    if best.share < hypotheses.LEAST_SHARE and late is best:
         return found + (_unexplained(trials, best) if not found else [])
     mounting = hypotheses.mounting_of(trials, late.hypothesis)
     found += of_clocks
@@ -219,8 +189,9 @@ def _meant(trials: Trials) -> tuple[Trial, list[Hint]]:
     figures = far_better(best, trials.as_written)
     if figures is None:
         return trials.as_written, beyond_any_vehicle(trials.log.odometry)
-    if is_a_line(trials.pairs):
-        return trials.as_written, [_optical(trials.pairs)]
+    in_line = camera(trials.pairs)
+    if in_line:
+        return trials.as_written, in_line
     return best, _of_frame(best, trials, figures) + _of_odometry(best.hypothesis, figures)
 
 
@@ -246,12 +217,10 @@ def _of_frame(best: Trial, trials: Trials, figures: dict[str, float]) -> list[Hi
 
 
 def _mended(frame: Hypothesis) -> str:
-    matrix = frame.frame
-    if np.allclose(matrix, np.round(matrix), atol=1e-9):
-        signs = {1: "", -1: "-"}
-        rows = np.round(matrix)
-        terms = [f"{signs[int(row[k])]}{'xy'[k]}" for row in rows for k in np.flatnonzero(row)]
-        return f"put {terms[0]} into column x and {terms[1]} into column y"
+    rows = np.round(frame.frame)
+    if np.allclose(frame.frame, rows, atol=1e-9):
+        x, y = (f"{'-' if row.sum() < 0.0 else ''}{'xy'[np.abs(row).argmax()]}" for row in rows)
+        return f"put {x} into column x and {y} into column y"
     mirror = "negate column y, then " if frame.mirrored else ""
     return f"{mirror}turn the detections by {_angle(frame.turn)}"
 
@@ -268,9 +237,13 @@ def _of_odometry(meaning: Hypothesis, figures: dict[str, float]) -> list[Hint]:
         return [told("nothing", **figures)]
     found = [] if meaning.content == "twist" else [told(meaning.content, **figures)]
     if meaning.speed != 1.0:
-        found.append(told("unit of speeds", what=SPEEDS[meaning.speed], factor=meaning.speed, **figures))
+        found.append(
+            told("unit of speeds", what=hypotheses.SPEEDS[meaning.speed], factor=meaning.speed, **figures)
+        )
     if meaning.rate != 1.0:
-        found.append(told("unit of yaw rate", what=RATES[meaning.rate], factor=meaning.rate, **figures))
+        found.append(
+            told("unit of yaw rate", what=hypotheses.RATES[meaning.rate], factor=meaning.rate, **figures)
+        )
     return found
 
 
@@ -280,8 +253,7 @@ def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
     if figures is None:
         return best, []
     seconds = late.hypothesis.late
-    way = "late" if seconds > 0.0 else "early"
-    return late, [told("late", seconds=abs(seconds), way=way, **figures)]
+    return late, [told("late", seconds=abs(seconds), way="late" if seconds > 0.0 else "early", **figures)]
 
 
 def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
@@ -301,8 +273,8 @@ def _placed(mounting: Mounting) -> list[Hint]:
     if length < ARM or sigma > ARM_SIGMA * length:
         return []
     ahead, left = mounting.values[1:].tolist()
-    place = f"{abs(ahead):.1f} m {'ahead' if ahead > 0.0 else 'behind'} and {abs(left):.1f} m to the "
-    place += "left" if left > 0.0 else "right"
+    along, aside = "ahead" if ahead > 0.0 else "behind", "left" if left > 0.0 else "right"
+    place = f"{abs(ahead):.1f} m {along} and {abs(left):.1f} m to the {aside}"
     return [told("place", place=place, ahead=ahead, left=left)]
 
 
@@ -327,25 +299,21 @@ def _labelled(trials: Trials, best: Trial) -> list[Hint]:
 
 def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
     pairs = trials.pairs
-    motion = trials.motion(best.hypothesis)
-    ranges = np.nanmedian(np.hypot(pairs.before[..., 0], pairs.before[..., 1]))
-    near = np.hypot(motion[:, 0], motion[:, 1]) < NEAR * ranges
-    near &= np.abs(motion[:, 2]) < NEAR
-    near &= pairs.count >= MANY
+    motion, size = trials.motion(best.hypothesis), np.hypot(pairs.before[..., 0], pairs.before[..., 1])
+    near = np.hypot(motion[:, 0], motion[:, 1]) < NEAR * np.nanmedian(size)
+    near &= (np.abs(motion[:, 2]) < NEAR) & (pairs.count >= MANY)
     share = float(best.explained[near].mean()) if near.sum() >= LEAST_NEAR else 1.0
     if share > UNEXPLAINED:
         return []
-    return [_optical(pairs)] if is_a_line(pairs) else [told("unexplained", share=share)]
+    return camera(pairs) or [told("unexplained", share=share)]
 
 
-def is_a_line(pairs: Pairs) -> bool:
+def camera(pairs: Pairs) -> list[Hint]:
+    """Return a hint where the detections lie on a line, as in the frame of a camera."""
     spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
-    return bool(spread.min() < LINE_RATIO * spread.max())
-
-
-def _optical(pairs: Pairs) -> Hint:
-    spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
-    return told("camera", thin="xy"[int(spread.argmin())], least=spread.min(), most=spread.max())
+    if spread.min() >= LINE_RATIO * spread.max():
+        return []
+    return [told("camera", thin="xy"[int(spread.argmin())], least=spread.min(), most=spread.max())]
 
 
 MOST: Final = 1e20  # largest number that is read, to say what it means
@@ -370,19 +338,15 @@ def refused_hints(folder: Path) -> list[Hint]:
     """Return the hints about a log that was refused; there are none where it cannot even be parsed."""
     try:
         odometry = read_table(folder / ODOMETRY_FILE, ("t", "vx", "vy", "wz"))
-        detections = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))
-        return hints(_unchecked(odometry, detections))
+        table = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))
+        twists = Odometry(odometry.numbers("t", MOST), odometry.stack(("vx", "vy", "wz"), MOST))
+        stamps, points = table.numbers("t", MOST), table.stack(("x", "y"), MOST)
+        covariances = covariances_of(*(table.numbers(name, MOST) for name in ("xx", "xy", "yy")))
     except InputError:
         return []
-
-
-def _unchecked(odometry: Table, detections: Table) -> Log:
-    twists = Odometry(odometry.numbers("t", MOST), odometry.stack(("vx", "vy", "wz"), MOST))
-    stamps, points = detections.numbers("t", MOST), detections.stack(("x", "y"), MOST)
-    covariances = covariances_of(*(detections.numbers(name, MOST) for name in ("xx", "xy", "yy")))
-    labels = np.array([label_from_name(name) for name in detections.columns["label"]], dtype=int)
+    labels = np.array([label_from_name(name) for name in table.columns["label"]], dtype=int)
     cycles = cycles_of(stamps, points, covariances, labels)
-    return Log(twists, cycles, np.ones(3), odometry_stated=False, detections_stated=False)
+    return hints(Log(twists, cycles, np.ones(3), odometry_stated=False, detections_stated=False))
 
 
 def _foreign_labels(folder: Path, log: Log) -> list[Hint]:

@@ -83,8 +83,10 @@ def test_what_is_aligned_is_a_minimum_of_odometry_and_correspondences() -> None:
             for sign in (1.0, -1.0):
                 moved = poses.copy()
                 moved[k, axis] += sign * h
-                costs.append(0.5 * (chain.terms(moved, calibration)[0] ** 2).sum())
-            curvature = (costs[0] + costs[1] - (chain.terms(poses, calibration)[0] ** 2).sum()) / h**2
+                costs.append(0.5 * (chain.odometry.terms(slice(None), moved, calibration)[0] ** 2).sum())
+            curvature = (
+                costs[0] + costs[1] - (chain.odometry.terms(slice(None), poses, calibration)[0] ** 2).sum()
+            ) / h**2
             slope = (costs[0] - costs[1]) / (2.0 * h)
             assert abs(slope) < 1e-3 * np.sqrt(curvature)
 

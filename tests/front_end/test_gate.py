@@ -16,7 +16,7 @@ from pathspace_graph import ReadingError
 from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.front_end import gate
-from pathspace_graph.front_end.gate import Admitted, Gate, Newest, admit, read_usable_log
+from pathspace_graph.front_end.gate import Admitted, Gate, Newest, read_usable_log
 from pathspace_graph.io.log import Detections, Odometry, write_log
 from pathspace_graph.settings.online import LimitSettings
 
@@ -52,7 +52,7 @@ def with_entry(array: np.ndarray[Any, Any], index: Any, value: Any) -> np.ndarra
 def through(
     twists: Any = None, cycle: Any = None, newest: Newest = NEWEST, window: tuple[float, ...] = ()
 ) -> Admitted:
-    return admit(twists or odometry(), cycle or detections(), LIMITS, newest, window)
+    return Gate(LIMITS).admit(twists or odometry(), cycle or detections(), newest, window)
 
 
 # --- what is used ----------------------------------------------------------------------------------------
@@ -60,7 +60,7 @@ def through(
 
 def test_a_good_cycle_goes_through_as_it_is_in_arrays_of_its_own() -> None:
     handed, cycle = odometry(), detections()
-    admitted = admit(handed, cycle, LIMITS, NEWEST)
+    admitted = Gate(LIMITS).admit(handed, cycle, NEWEST)
     np.testing.assert_array_equal(admitted.odometry.t, STAMPS)
     np.testing.assert_array_equal(admitted.odometry.twist, TWISTS)
     for name in ("t", "points_vehicle", "covariances", "labels"):
@@ -118,8 +118,8 @@ def test_what_was_in_force_before_the_newest_cycle_is_left_out() -> None:
 
 Bad = tuple[Callable[[], Admitted], str, int | None, str]
 REFUSED: dict[str, Bad] = {
-    "no odometry": (lambda: admit(None, detections(), LIMITS, NEWEST), "odometry", None, "Odometry"),  # type: ignore[arg-type]
-    "no detections": (lambda: admit(odometry(), None, LIMITS, NEWEST), "detections", None, "Detections"),  # type: ignore[arg-type]
+    "no odometry": (lambda: Gate(LIMITS).admit(None, detections(), NEWEST), "odometry", None, "Odometry"),  # type: ignore[arg-type]
+    "no detections": (lambda: Gate(LIMITS).admit(odometry(), None, NEWEST), "detections", None, "Detections"),  # type: ignore[arg-type]
     "a stamp that is none": (lambda: through(cycle=detections(None)), "detections.t", None, "number"),
     "NaN as a stamp": (lambda: through(cycle=detections(np.nan)), "detections.t", None, "found nan"),
     "infinity as a stamp": (lambda: through(cycle=detections(-np.inf)), "detections.t", None, "-inf"),
@@ -271,7 +271,7 @@ def test_an_error_survives_the_way_from_a_worker() -> None:
 def test_what_is_refused_is_a_setting() -> None:
     wide = LimitSettings(speed=2e5, silence=100.0)
     fast = odometry(twists=with_entry(TWISTS, (2, 0), 1e5))
-    assert admit(fast, detections(61.2), wide, NEWEST).odometry.twist[2, 0] == 1e5
+    assert Gate(wide).admit(fast, detections(61.2), NEWEST).odometry.twist[2, 0] == 1e5
 
 
 def test_one_stamp_far_ahead_is_an_error_and_two_that_agree_are_a_vehicle_that_was_silent() -> None:

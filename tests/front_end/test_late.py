@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pathspace_graph import FixedLagMapper, ReadingError
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.factors.se2 import compose, se2_exp, to_map, to_vehicle
-from pathspace_graph.front_end.front_end import LateDetections, at_nearest_pose
+from pathspace_graph.front_end.front_end import at_nearest_pose
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.online import MotionSettings
@@ -27,7 +27,7 @@ def mapper_in_a_bend() -> FixedLagMapper:
     return mapper
 
 
-def seen_at(mapper: FixedLagMapper, t: float, points_map: Array) -> LateDetections:
+def seen_at(mapper: FixedLagMapper, t: float, points_map: Array) -> tuple[Detections, int, Array]:
     pose = compose(mapper.poses[0], se2_exp((t - mapper.smoother.times[0]) * TWIST[None])[0])
     local = to_vehicle(points_map, np.tile(pose, (len(points_map), 1)))
     late = detections(t, local, np.zeros(len(points_map), np.intp))
@@ -37,18 +37,19 @@ def seen_at(mapper: FixedLagMapper, t: float, points_map: Array) -> LateDetectio
 @pytest.mark.parametrize(("t", "cycle"), [(0.13, 1), (0.149, 1), (0.151, 2), (0.19, 2), (0.21, 2)])
 def test_late_detections_are_where_they_are_in_the_map_from_the_nearest_pose(t: float, cycle: int) -> None:
     mapper, points = mapper_in_a_bend(), np.array([[9.0, 2.0], [12.0, -3.0]])
-    late = seen_at(mapper, t, points)
-    assert late.cycle == cycle
-    np.testing.assert_allclose(late.twist, TWIST, atol=1e-6)
+    late, nearest, twist = seen_at(mapper, t, points)
+    assert nearest == cycle
+    np.testing.assert_allclose(twist, TWIST, atol=1e-6)
     poses = np.tile(mapper.poses[cycle], (2, 1))
-    np.testing.assert_allclose(to_map(late.detections.points_vehicle, poses), points, atol=1e-6)
+    np.testing.assert_allclose(to_map(late.points_vehicle, poses), points, atol=1e-6)
 
 
 def test_the_motion_to_the_nearest_pose_adds_its_uncertainty() -> None:
     """The derivative of the moved point by the motion is numeric here."""
     mapper, t = mapper_in_a_bend(), 0.13
     z = np.array([[9.0, 2.0]])
-    late = at_nearest_pose(mapper.smoother, detections(t, z, np.zeros(1, np.intp)), mapper.settings.motion)
+    cycle = detections(t, z, np.zeros(1, np.intp))
+    late, _, _ = at_nearest_pose(mapper.smoother, cycle, mapper.settings.motion)
     moved = se2_exp(0.03 * TWIST[None])[0]
     whitener = mapper.smoother.window.odometry.whiteners[1]
     bend = 0.5 * 0.03 * 0.07 * np.array([5.0, 5.0, 1.5])
@@ -61,7 +62,7 @@ def test_the_motion_to_the_nearest_pose_adds_its_uncertainty() -> None:
     turn = se2_exp(0.03 * TWIST[None])[0, 2]
     R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     expected = R @ (0.01 * np.eye(2)) @ R.T + by @ spread @ by.T
-    np.testing.assert_allclose(late.detections.covariances[0], expected, rtol=1e-5)
+    np.testing.assert_allclose(late.covariances[0], expected, rtol=1e-5)
     assert MotionSettings().accelerations == (5.0, 5.0, 1.5)
 
 

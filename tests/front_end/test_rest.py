@@ -10,8 +10,8 @@ import pytest
 from pathspace_graph.baselines.filters import CkfMapper
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.front_end.front_end import judge_log
-from pathspace_graph.front_end.log_odometry import half_square
-from pathspace_graph.front_end.motion import MotionCheck, Rest, mean_bias
+from pathspace_graph.front_end.log_odometry import half_square, mean_bias
+from pathspace_graph.front_end.motion import MotionCheck, Rest
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement

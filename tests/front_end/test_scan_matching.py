@@ -15,12 +15,12 @@ from pathspace_graph.front_end.scan_matching import (
     MOST_MISFIT,
     REACH,
     REACH_LAST,
+    REACHES,
     REACHES_CHECK,
     SIGMA_CONE,
     RecentDetections,
     match,
     misfit_at,
-    reaches,
 )
 
 from ..scenes.jacobians import numeric_jacobian
@@ -48,7 +48,7 @@ def detected(pose: np.ndarray, cones: np.ndarray = CONES) -> np.ndarray:
 def test_exact_detections_give_the_exact_motion(x: float, y: float, theta: float) -> None:
     pose = np.array([x, y, theta])
     start = np.array([x - 0.4, 0.0, 0.0])
-    found = match(seen_once(), detected(pose), np.full(6, 0.01), start, reaches(8))
+    found = match(seen_once(), detected(pose), np.full(6, 0.01), start, REACHES)
     np.testing.assert_allclose(found.pose, pose, atol=1e-3)
     assert found.matched == 6
     assert found.is_certain
@@ -65,7 +65,7 @@ def test_the_information_is_that_of_one_detection_and_the_mean_of_n(n: int) -> N
     """Each offset has the variance `v (1 + 1/n) + sigma_cone^2`; its derivatives are numeric ones."""
     seen = detected(POSE, ASYMMETRIC)
     recent = seen_once(np.tile(ASYMMETRIC, (n, 1)))
-    found = match(recent, seen, VARIANCES, POSE, reaches(1)[-1:])
+    found = match(recent, seen, VARIANCES, POSE, REACHES[:1])
     jacobian = numeric_jacobian(lambda pose: to_map(seen, np.tile(pose, (len(seen), 1))).ravel(), POSE)
     precision = np.repeat(1.0 / (VARIANCES * (1.0 + 1.0 / n) + SIGMA_CONE**2), 2)
     expected = jacobian.T @ (precision[:, None] * jacobian)
@@ -105,13 +105,13 @@ def test_the_misfit_at_a_pose_is_the_mean_square_of_the_whitened_distances(n: in
 
 def test_a_detection_of_nothing_has_no_say() -> None:
     points = np.vstack([detected(np.array([0.5, 0.0, 0.0])), [[4.0, 0.0]]])
-    found = match(seen_once(), points, np.full(7, 0.01), np.array([0.3, 0.0, 0.0]), reaches(6))
+    found = match(seen_once(), points, np.full(7, 0.01), np.array([0.3, 0.0, 0.0]), REACHES)
     assert found.matched == 6
     np.testing.assert_allclose(found.pose, [0.5, 0.0, 0.0], atol=1e-3)
 
 
 def test_one_cone_holds_no_motion() -> None:
-    found = match(seen_once(CONES[:1]), CONES[:1], np.full(1, 0.01), np.zeros(3), reaches(3))
+    found = match(seen_once(CONES[:1]), CONES[:1], np.full(1, 0.01), np.zeros(3), REACHES)
     assert found.matched == 1
     assert not found.is_certain
 
@@ -119,7 +119,7 @@ def test_one_cone_holds_no_motion() -> None:
 def test_detections_of_one_cone_alone_hold_no_motion_however_many_they_are() -> None:
     """All offsets have the same arm, so that the information is singular."""
     points = np.tile(CONES[:1], (5, 1))
-    found = match(seen_once(CONES[:1]), points, np.full(5, 0.01), np.zeros(3), reaches(6))
+    found = match(seen_once(CONES[:1]), points, np.full(5, 0.01), np.zeros(3), REACHES)
     assert found.matched == 5
     assert np.isfinite(found.pose).all()
     assert not found.is_certain
@@ -149,5 +149,6 @@ def test_a_detection_is_seen_again_where_one_was() -> None:
 
 
 def test_the_reaches_shrink_from_the_first_to_the_last() -> None:
-    np.testing.assert_allclose(reaches(3), [1.0, np.sqrt(0.4), 0.4])
+    np.testing.assert_allclose(REACHES, 0.4 ** np.linspace(0.0, 1.0, 6))
+    assert (REACHES[0], REACHES[-1]) == (REACH, pytest.approx(REACH_LAST))
     assert REACHES_CHECK == (REACH, REACH_LAST)

@@ -14,10 +14,10 @@ from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.sightings import (
     MAX_RANGE,
     MIN_TWISTS,
+    Follower,
     SeenCycle,
     Sightings,
     TwistRecord,
-    follow,
 )
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
@@ -97,6 +97,10 @@ def test_few_twists_say_nothing() -> None:
 
 
 # --- cones that are followed -----------------------------------------------------------------------------
+
+
+def follow(cycles: list[SeenCycle], known: MeasuredNoise) -> Sightings:
+    return Follower(known).follow(cycles)
 
 
 def drive(
@@ -222,4 +226,4 @@ def test_tables_of_sightings_are_cut_and_put_together() -> None:
     again = Sightings.stacked(parts)
     np.testing.assert_array_equal(again.cone, found.cone)
     np.testing.assert_array_equal(again.by_bias, found.by_bias)
-    assert len(follow([], NO_ERRORS).t) == 0
+    assert len(Follower(NO_ERRORS).follow([]).t) == 0

@@ -92,6 +92,6 @@ def oracle_system(log: Log, cycles: int) -> tuple[LandmarkSystem, LandmarkState]
 
 def normal_equations_of(system: LandmarkSystem, state: LandmarkState) -> tuple[Array, Array]:
     """Returns the normal equations of all variables, in the order of their keys."""
-    graph = linear_graph(system.rows(state), state.variables)
+    graph = linear_graph(system.rows(state, system.settings.gate.huber), state.variables)
     hessian, vector = graph.hessian(state.variables.layout.ordering)
     return hessian, vector

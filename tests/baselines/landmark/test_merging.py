@@ -36,9 +36,9 @@ def test_a_landmark_is_in_one_pair_only_which_is_the_best() -> None:
     """2 fits 0 better than 1 does; 3 and 0 are too far apart for their covariance."""
     newer, older, settings = np.array([1, 2, 3]), np.array([0, 0, 0]), LandmarkSettings()
     offset = np.array([[0.3, 0.0], [0.1, 0.0], [0.0, 0.9]])
-    covariances = np.tile(0.01 * np.eye(2), (3, 1, 1))
+    covariances = np.tile(0.02 * np.eye(2), (3, 1, 1))
     np.testing.assert_array_equal(compatible_pairs(newer, older, offset, covariances, settings), [1])
-    wide = 9.0 * covariances[2:] + np.eye(2)
+    wide = 9.0 * 0.01 * np.eye(2)[None] + 1.01 * np.eye(2)
     assert len(compatible_pairs(newer[2:], older[2:], offset[2:], wide, settings)) == 1
 
 
