@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,20 +33,31 @@ LATE: Final = 0.1  # median time (s) of receipt after or before the stamps that 
 
 @dataclass(frozen=True)
 class BagOptions:
-    odometry: str | None  # topic of the odometry
-    detections: str | None  # topic of the detections
-    imu: str | None = None  # topic of the yaw rate, where it is not that of the odometry
-    wheelbase: float | None = None  # wheelbase (m), by which a steering angle gives the yaw rate
-    definitions: Sequence[str] = ()
-    """Files of message definitions, each as `TYPE=FILE` or as a path that ends in `PACKAGE/msg/NAME.msg`."""
-    label_field: str | None = None  # field of the label of a detection; None takes the first that is known
-    from_poses: bool = False  # make the twists from poses, also where the messages have twists
-    received: bool = False  # take the times of receipt as stamps, also where messages have one of their own
-    mounted: bool = False  # the pose of the sensor was stated, so that frames of other names are no surprise
+    """Which messages of a bag are taken, and how."""
+
+    odometry: str | None = None
+    """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives
+    the yaw rate), or with a pose. For CSV a file in the folder, by default odometry.csv."""
+    detections: str | None = None
+    """Topic of the detections in a bag: a point cloud with a field for the label, an array of markers (blue
+    is left, yellow is right), or any message with lists of cones. For CSV a file in the folder, by default
+    detections.csv."""
+    imu: str | None = None
+    """Topic of the yaw rate, sensor_msgs/Imu, whose z axis points up."""
+    wheelbase: float | None = None
+    """Wheelbase (m), by which speed and steering angle give the yaw rate."""
+    definition: tuple[str, ...] = ()
+    """Files of messages that the bag does not define itself, as PACKAGE/msg/NAME=FILE or as a path that ends
+    in PACKAGE/msg/NAME.msg."""
+    label_field: str | None = None
+    """Field of the label of a detection in a bag; `none` means that there are no labels."""
+    from_poses: bool = False
+    """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
+    received: bool = False
+    """Take the times at which messages were received as stamps, also where they have one of their own."""
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
+class Samples(NamedTuple):
     """What was taken of the messages of one topic, in the order of the bag."""
 
     name: str  # topic and type of the messages
@@ -54,8 +65,7 @@ class Samples:
     values: list[Any]  # what was taken of each message
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
+class Motion(NamedTuple):
     """What a message says of the vehicle's motion."""
 
     twist: Array | None  # (3,) twist in m/s, m/s and rad/s, NaN where it is not known
@@ -64,8 +74,11 @@ class Motion:
     body: str  # frame of the twist
 
 
-def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
-    """Return what the topics of a bag have of a drive; an InputError lists the topics that are there."""
+def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool = False) -> Recording:
+    """Return what the topics of a bag have of a drive; an InputError lists the topics that are there.
+
+    Where the sensor's pose was stated (`mounted`), frames of other names are no surprise.
+    """
     notes: Counter[str] = Counter()
 
     def motion(message: Any) -> Motion:
@@ -79,9 +92,9 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
         odometry = bag.samples(options.odometry, "--odometry", motion)
         imu = bag.samples(options.imu, "--imu", yaw_rate_of) if options.imu else None
         detections = bag.samples(options.detections, "--detections", points)
-        static = [] if options.mounted else bag.transforms()
+        static = [] if mounted else bag.transforms()
     t, twists = _twists(odometry, imu, options, notes, path)
-    mounting = None if options.mounted else _mounting(odometry, detections, static, notes, path)
+    mounting = None if mounted else _mounting(odometry, detections, static, notes, path)
     source = {"bag": path.name, "odometry": odometry.name, "detections": detections.name}
     if imu is not None:
         source["imu"] = imu.name
@@ -197,7 +210,7 @@ def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Ba
     if not path.exists():
         raise InputError(path, "expected a bag, found none")
     rosbag1, rosbag2, _ = _rosbags()
-    definitions = _given_definitions(options.definitions)
+    definitions = _given_definitions(options.definition)
     try:
         reader = (rosbag1 if is_ros1(path) else rosbag2).Reader(path)
         reader.open()

@@ -195,7 +195,7 @@ def in_vehicle_frame(
     not positive definite, it is made from range and bearing at the sensor.
     """
     points, covariances = found.points, found.covariances
-    if frames.y_detections == "right":
+    if frames.y == "right":
         points = points * [1.0, -1.0]
         covariances = covariances * np.array([[1.0, -1.0], [-1.0, 1.0]])
     known = positive_definite(covariances) & (not noise.replace_covariances)

@@ -78,12 +78,13 @@ class Frames:
     """Frames in which odometry and detections were recorded."""
 
     mounting: tuple[float, float, float] | None = None
-    """Pose [x, y, yaw] (m, m, rad) of the sensor in the vehicle frame, x forward and y to the left. None
-    takes that of the record, or else the vehicle frame itself."""
-    y_odometry: Side = "left"
-    """Side to which the y axis of the odometry points. With the right one, angles are positive clockwise."""
-    y_detections: Side = "left"
-    """Side to which the y axis of the detections points, before they are moved to the vehicle frame."""
+    """Pose X Y YAW (m, m, rad) of the sensor in the vehicle frame: x forward, y left, yaw counterclockwise.
+    Without it that of a bag's /tf_static is used, where there is one."""
+    y: Side = "left"
+    """Side to which the y axis of the record points. With `right`, angles are positive clockwise, so that y,
+    vy, wz and bearings change their sign."""
+    y_odometry: Side | None = None
+    """Side to which the y axis of the odometry points, where it is another one than `y`."""
 
     def __post_init__(self) -> None:
         if self.mounting is None:
@@ -95,7 +96,7 @@ class Frames:
     @property
     def flip(self) -> NDArray[np.float64]:
         """Return by what a twist [vx, vy, wz] (3,) is multiplied, so that its y axis points to the left."""
-        return np.array([1.0, 1.0, 1.0] if self.y_odometry == "left" else [1.0, -1.0, -1.0])
+        return np.array([1.0, 1.0, 1.0] if (self.y_odometry or self.y) == "left" else [1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class Window:
     range_max: float | None = None
     """Largest distance from the sensor of a detection that counts (m)."""
     time_offset: float = 0.0
-    """Time (s) that is added to the stamps of the detections."""
+    """Time (s) that is added to the stamps of the detections: negative where they are too late."""
     start: float = 0.0
     """Time after the first odometry at which the log begins (s)."""
     end: float = inf

@@ -63,24 +63,20 @@ def shown(value: Any) -> str:
 def check_content(content: Any, file: Path) -> None:
     """Raise an InputError where the content of a file is nested too deep or has too large a whole number."""
     level, seen = [content], set[int]()
-    for _ in range(MAX_DEPTH):
-        values = list(chain.from_iterable(map(_children, level)))
-        for value in values:
+    for _ in range(MAX_DEPTH + 1):
+        for value in level:
             if isinstance(value, int) and abs(value) > MAX_INTEGER:
                 raise InputError(file, f"expected whole numbers up to {MAX_INTEGER}, found {shown(value)}")
         # what an alias names more than once is looked at once
-        inner = {id(value): value for value in values if isinstance(value, dict | list)}
-        level = [value for key, value in inner.items() if key not in seen]
+        inner = {id(value): value for value in level if isinstance(value, dict | list)}
+        parents = [value for key, value in inner.items() if key not in seen]
         seen |= inner.keys()
+        level = [
+            child for own in parents for child in (chain(*own.items()) if isinstance(own, dict) else own)
+        ]
         if not level:
             return
     raise InputError(file, TOO_DEEP)
-
-
-def _children(value: Any) -> Any:
-    if isinstance(value, dict):
-        return chain(value.keys(), value.values())
-    return value if isinstance(value, list) else (value,)
 
 
 # --- files and their formats -----------------------------------------------------------------------------
