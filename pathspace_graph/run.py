@@ -104,7 +104,7 @@ def scale(estimator: OnlineEstimator) -> float:
 
 
 def _ask(estimator: OnlineEstimator, method: str, *arguments: Any) -> Any:
-    """Return the answer of a method that an estimator may have (`docs/extending.md`), None where it has none."""
+    """Return the answer of a method that an estimator may have, or None where it has none."""
     return getattr(estimator, method, lambda *_: None)(*arguments)
 
 

@@ -25,7 +25,7 @@ from pathspace_graph.plausibility.hint import because
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.scale import scale_of
 
-from .online import tell
+from .estimate import tell
 from .simulate import describe
 
 Kind = Literal["bag", "csv", "jsonl", "victoria-park"]

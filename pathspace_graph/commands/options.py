@@ -39,8 +39,7 @@ ESSENTIAL: Final = (
     *("calibration.latency", "calibration.range_scale", "calibration.range_bias"),
 )
 """Settings of the estimators that `--help` explains; the others are in `--help-all`."""
-COLUMN: Final = 38
-"""Column of the short help in which the texts begin."""
+COLUMN: Final = 38  # column of the short help in which the texts begin
 MOST_COLUMNS: Final = 120
 REQUIRED: Final = " (required)"
 

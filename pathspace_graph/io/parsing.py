@@ -70,13 +70,15 @@ def check_content(content: Any, file: Path) -> None:
         # what an alias names more than once is looked at once
         inner = {id(value): value for value in level if isinstance(value, dict | list)}
         parents = [value for key, value in inner.items() if key not in seen]
-        seen |= inner.keys()
-        level = [
-            child for own in parents for child in (chain(*own.items()) if isinstance(own, dict) else own)
-        ]
-        if not level:
+        if not parents:
             return
+        seen |= inner.keys()
+        level = [*chain.from_iterable(map(_children, parents))]
     raise InputError(file, TOO_DEEP)
+
+
+def _children(value: Any) -> Any:
+    return chain(value.keys(), value.values()) if isinstance(value, dict) else value
 
 
 # --- files and their formats -----------------------------------------------------------------------------

@@ -21,8 +21,7 @@ class Positive:
     UNLIMITED: ClassVar[tuple[str, ...]] = ()
     """Numbers that may be infinite, which means that there is no limit."""
 
-    SIGNED: ClassVar[tuple[str, ...]] = ()
-    """Numbers that may have either sign."""
+    SIGNED: ClassVar[tuple[str, ...]] = ()  # numbers that may have either sign
 
     prefix: ClassVar[str]
     """What stands before the names of the settings on the command line."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult, unmapped
 from pathspace_graph.batch.optimizer import Effort
 from pathspace_graph.cli import main
-from pathspace_graph.commands.batch import NOT_CONVERGED
+from pathspace_graph.commands.estimate import NOT_CONVERGED
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.graph.variables import CALIBRATION_KEY
