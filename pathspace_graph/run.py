@@ -1,6 +1,7 @@
 """The interface of estimators, and the loop that feeds a log to an online one cycle by cycle."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass
@@ -247,17 +248,13 @@ def run_online(
 
 class _Run:
     def __init__(
-        self, estimator: OnlineEstimator, snapshot_times: list[float], observers: Sequence[Observer]
+        self, estimator: OnlineEstimator, times: Sequence[float], observers: Sequence[Observer]
     ) -> None:
-        self._estimator = estimator
-        self._observers = observers
+        self._estimator, self._observers = estimator, observers
         self._observing = self._waited = 0.0
-        self._snapshot_times = snapshot_times
-        self._snapshots: list[Map] = []
-        self._laps = LapCounter()
-        self._lap_maps: list[tuple[int, Map]] = []
-        self._poses: list[Array] = []
-        self._records: list[CycleRecord] = []
+        self._snapshot_times, self._snapshots = deque(times), list[Map]()
+        self._laps, self._lap_maps = LapCounter(), list[tuple[int, Map]]()
+        self._poses, self._records = list[Array](), list[CycleRecord]()
 
     def cycle(self, odometry: Odometry, detections: Detections) -> None:
         self._take_snapshots(before=detections.t)
@@ -307,9 +304,8 @@ class _Run:
         )
 
     def _take_snapshots(self, before: float) -> None:
-        while len(self._snapshots) < len(self._snapshot_times):
-            if self._snapshot_times[len(self._snapshots)] >= before:
-                return
+        while self._snapshot_times and self._snapshot_times[0] < before:
+            self._snapshot_times.popleft()
             self._snapshots.append(self._estimator.map())
 
 

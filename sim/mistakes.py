@@ -15,6 +15,7 @@ from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT
 
 from .curves import FloatArray
+from .vehicle import integrate
 
 Mistake = Callable[[Log], Log]
 
@@ -70,21 +71,15 @@ def bearings_as_degrees(log: Log) -> Log:
     """Return the log with detections made of bearings in degrees that were taken for radians."""
 
     def wrong(points: FloatArray) -> FloatArray:
-        bearings = np.arctan2(points[:, 1], points[:, 0]) / DEGREE
-        rays = np.column_stack([np.cos(bearings), np.sin(bearings)])
-        return np.asarray(np.hypot(*points.T)[:, None] * rays)
+        ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0]) / DEGREE
+        return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
     return with_points(log, wrong)
 
 
 def dead_reckoned(log: Log) -> FloatArray:
     """Return poses (N, 3) at the odometry's stamps, by the odometry alone."""
-    twist, dt = log.odometry.twist, np.diff(log.odometry.t)
-    heading = np.append(0.0, np.cumsum(twist[:-1, 2] * dt))
-    middle = heading[:-1] + 0.5 * twist[:-1, 2] * dt
-    c, s = np.cos(middle), np.sin(middle)
-    steps = np.column_stack([c * twist[:-1, 0] - s * twist[:-1, 1], s * twist[:-1, 0] + c * twist[:-1, 1]])
-    return np.column_stack([np.vstack([np.zeros(2), np.cumsum(steps * dt[:, None], axis=0)]), heading])
+    return integrate(log.odometry.twist[:-1], np.diff(log.odometry.t))
 
 
 def speeds_in_the_map(log: Log) -> Log:

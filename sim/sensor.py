@@ -8,7 +8,7 @@ from numpy.random import Generator
 from scipy.signal import lfilter
 
 from pathspace_graph.errors import SettingsError, check_numbers
-from pathspace_graph.io.log import Detections, covariances_of
+from pathspace_graph.io.log import Detections, polar_covariances
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from .curves import FloatArray, IntArray
@@ -224,9 +224,6 @@ def _cartesian(
     ranges: FloatArray, bearings: FloatArray, settings: SensorSettings
 ) -> tuple[FloatArray, FloatArray]:
     """Return points (m, 2) and covariances `R(b) diag(s_r^2, (r s_b)^2) R(b)^T`, vehicle frame."""
-    cos, sin = np.cos(bearings), np.sin(bearings)
+    points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
     along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
-    xx = cos**2 * along + sin**2 * across
-    yy = sin**2 * along + cos**2 * across
-    xy = cos * sin * (along - across)
-    return np.column_stack([ranges * cos, ranges * sin]), covariances_of(xx, xy, yy)
+    return points, polar_covariances(bearings, along, across)

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from pathspace_graph.errors import InputError
 from pathspace_graph.io import parsing as limits
 from pathspace_graph.io.parsing import Table, parse_yaml, read_table, read_text, shown
-from pathspace_graph.labels import BIG_ORANGE, POINTS, UNKNOWN, label_from_name
+from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
 from .curves import FloatArray, along_polyline, arc_lengths, direction, left_normals, ring, unit
@@ -120,14 +120,11 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     ]
     others = [_pacsim_cones(path, data.get("unknown"), "track.unknown"), *rows]
     other, kinds = (np.concatenate(parts) for parts in zip(*others, strict=True))
-    orange = (BIG_ORANGE if "big" in kind else SMALL_ORANGE for kind in kinds.tolist())
-    labels = np.array(
-        [one if ORANGE in kind else UNKNOWN for one, kind in zip(orange, kinds, strict=True)], int
-    )
-    no_boundary = np.isin(labels, POINTS) | (np.arange(len(labels)) < len(others[0][0]))
+    big, orange = (np.char.find(kinds, word) >= 0 for word in ("big", ORANGE))
+    labels = np.where(orange, np.where(big, BIG_ORANGE, SMALL_ORANGE), UNKNOWN)
+    no_boundary = orange | (np.arange(len(labels)) < len(others[0][0]))
     left, right = (
-        _without_repeats(points[[ORANGE not in kind for kind in kinds.tolist()]], closed)
-        for points, kinds in rows
+        _without_repeats(points[np.char.find(kinds, ORANGE) < 0], closed) for points, kinds in rows
     )
     start = np.append(position, orientation[2])
     track = Track(left, right, other[no_boundary], closed, start, path.stem, labels[no_boundary])
@@ -136,12 +133,11 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
 
 
 def _with_hidden(track: Track, hidden: FloatArray) -> Track:
-    line = track.centre_line
     left, right = (
         row[~(row[:, None] == hidden).all(axis=2).any(axis=1)] for row in (track.left, track.right)
     )
-    s = np.arange(0.0, line.length, WIDTH_STEP)
-    return replace(track, left=left, right=right, path=line.points(s))
+    s = np.arange(0.0, track.centre_line.length, WIDTH_STEP)
+    return replace(track, left=left, right=right, path=track.centre_line.points(s))
 
 
 def _pacsim_cones(path: Path, cones: object, key: str) -> tuple[FloatArray, NDArray[np.str_]]:
@@ -188,12 +184,12 @@ def _list(path: Path, value: object, key: str) -> list[Any]:
 def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
     """Return the first `size` numbers of a list, all within the limit of coordinates."""
     try:
-        if not isinstance(value, list) or len(value) < size:
-            raise ValueError
         # YAML 1.1 takes 1e-5 for a word, so words are given a chance to be numbers
-        vector = np.array([float(number) for number in value[:size]])
+        vector = np.array([float(number) for number in value[:size]] if isinstance(value, list) else [])
     except (TypeError, ValueError):
-        raise InputError(path, f"expected {size} numbers at {key}, found {shown(value)}") from None
+        vector = np.zeros(0)
+    if len(vector) < size:
+        raise InputError(path, f"expected {size} numbers at {key}, found {shown(value)}")
     if not np.isfinite(vector).all():
         raise InputError(path, f"expected finite numbers at {key}, found {shown(value)}")
     if np.abs(vector).max() > limits.MAX_COORDINATE:

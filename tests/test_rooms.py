@@ -61,7 +61,7 @@ ARROWS: dict[str, set[str]] = {
     "eval": BELOW_EVAL | {"eval.metrics", "eval.experiment", "eval.benchmark"},
     "eval.view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
     "commands": BELOW_EVAL
-    | {"convert"}
+    | {"convert", "frames"}
     | {"eval"}
     | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark", "view")},
     "frames": {"io"},

@@ -90,7 +90,7 @@ class Compare:
 class Demo:
     """Simulate a track and map it online: the paper's table beside the landmark graph's, and a picture."""
 
-    out: Path = field(default_factory=lambda: Path("pathspace-demo"))
+    out: Path = Path("pathspace-demo")
     """Folder for log, map and picture; an earlier demo there is kept as a numbered backup."""
     seed: int = 8
     """Seed of the track and of all noise; by default one whose first lap is typical."""

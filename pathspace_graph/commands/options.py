@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import redirect_stderr
 from dataclasses import MISSING as NO_DEFAULT
-from dataclasses import Field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
@@ -64,7 +64,6 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
         _set_help(command)
         arguments = ["--help"]
     default, arguments = _start(command, arguments)
-    _check_options(command, arguments)
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
@@ -93,6 +92,8 @@ def _start(command: type[Any], arguments: list[str]) -> tuple[Any, list[str]]:
     if not _estimates(command):
         start = getattr(command, "start", None)
         return start(arguments) if start else None, arguments
+    for option in (word.partition("=")[0] for word in arguments if word.startswith("--")):
+        check_gone(option.removeprefix("--").replace("-", "_"), option)
     words = [part for word in arguments for part in word.split("=", word.startswith(f"{SETTINGS}="))]
     if SETTINGS not in words:
         return None, arguments
@@ -100,23 +101,8 @@ def _start(command: type[Any], arguments: list[str]) -> tuple[Any, list[str]]:
     before, given, after = words[:at], words[at + 1 : at + 2], words[at + 2 :]
     if not given or given[0].startswith("--") or SETTINGS in after:
         raise SettingsError(f"{SETTINGS}: expected one file, found {'two' if SETTINGS in after else 'none'}")
-    required = {entry.name: tyro.MISSING for entry in fields(command) if _is_required(entry)}
-    settings = read_settings(Path(given[0]), MapperSettings())
-    return command(**required, settings=settings), before + after
-
-
-def _is_required(entry: Field[Any]) -> bool:
-    return entry.default is NO_DEFAULT and entry.default_factory is NO_DEFAULT
-
-
-def _check_options(command: type[Any], arguments: list[str]) -> None:
-    """Raise a SettingsError for an option of the estimators that is gone."""
-    known = leaves(MapperSettings())
-    for word in arguments if _estimates(command) else ():
-        option = word.partition("=")[0]
-        name = option.removeprefix("--").replace("-", "_")
-        if option.startswith("--") and name not in known:
-            check_gone(name, option)
+    required = {option.name: tyro.MISSING for option in _options(command) if option.default is NO_DEFAULT}
+    return command(**required, settings=read_settings(Path(given[0]), MapperSettings())), before + after
 
 
 # --- completion ------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Dotted fields of a tree of settings, such as `spline.degree`, and overrides of them, also from a file."""
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -14,14 +14,9 @@ T = TypeVar("T")
 Overrides = Mapping[str, Any]  # new values by dotted field
 
 
-def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:
+def leaves(settings: Any) -> dict[str, Any]:
     """Return the value of every dotted field of a settings dataclass, in order."""
-    found: dict[str, Any] = {}
-    for entry in fields(settings):
-        value = getattr(settings, entry.name)
-        name = f"{prefix}{entry.name}"
-        found |= leaves(value, f"{name}.") if is_dataclass(value) else {name: value}
-    return found
+    return flatten(asdict(settings))
 
 
 def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -9,9 +9,10 @@ import json
 import re
 import stat
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from io import StringIO
 from itertools import chain
 from pathlib import Path
@@ -132,12 +133,16 @@ def _parsing(file: Path, kind: str) -> Iterator[None]:
         raise InputError(file, f"expected {kind}: {told}", int(line[1]) if line else None) from None
 
 
-def parse_json(text: str, file: Path) -> Any:
-    """Return the content of JSON; an InputError names the file and the row."""
-    with _parsing(file, "JSON"):
-        content = json.loads(text)
+def _parsed(kind: str, load: Callable[[str], Any], text: str, file: Path) -> Any:
+    with _parsing(file, kind):
+        content = load(text)
     check_content(content, file)
     return content
+
+
+def parse_json(text: str, file: Path) -> Any:
+    """Return the content of JSON; an InputError names the file and the row."""
+    return _parsed("JSON", json.loads, text, file)
 
 
 def read_json(file: Path, expected: str) -> Any:
@@ -147,9 +152,7 @@ def read_json(file: Path, expected: str) -> Any:
 
 def parse_toml(text: str, file: Path) -> dict[str, Any]:
     """Return the content of TOML; an InputError names the file and, where it is known, the row."""
-    with _parsing(file, "TOML"):
-        content = tomllib.loads(text)
-    check_content(content, file)
+    content: dict[str, Any] = _parsed("TOML", tomllib.loads, text, file)
     return content
 
 
@@ -171,9 +174,7 @@ def parse_yaml(text: str, file: Path) -> Any:
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MAX_DEPTH:
                 raise InputError(file, TOO_DEEP, _row(event.start_mark))
-        content = yaml.load(text, Loader=_Loader)
-    check_content(content, file)
-    return content
+    return _parsed("YAML", partial(yaml.load, Loader=_Loader), text, file)
 
 
 def _row(mark: Any) -> int | None:
