@@ -12,7 +12,7 @@ from pathspace_graph.console import note, progress, say
 from pathspace_graph.convert.bag import BagOptions, read_bag
 from pathspace_graph.convert.recording import Recording, to_log, windowed
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Window
-from pathspace_graph.convert.text_files import Columns, Units, read_csv, read_json_lines
+from pathspace_graph.convert.text_files import read_csv, read_json_lines
 from pathspace_graph.convert.victoria_park import read_victoria_park
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError
 from pathspace_graph.front_end.front_end import measure_log
@@ -112,12 +112,8 @@ class Convert:
         if self.kind == "jsonl":
             return read_json_lines(source, rule)
         if self.kind == "csv":
-            odometry, detections = (
-                self.topics.odometry or ODOMETRY_FILE,
-                self.topics.detections or DETECTIONS_FILE,
-            )
-            columns, units = Columns(self.columns), Units(self.units)
-            return read_csv(source / odometry, source / detections, columns, units, rule)
+            files = self.topics.odometry or ODOMETRY_FILE, self.topics.detections or DETECTIONS_FILE
+            return read_csv(source / files[0], source / files[1], rule, self.columns, self.units)
         return read_bag(source, self.topics, rule, mounted=self.frames.mounting is not None)
 
 

@@ -137,10 +137,8 @@ def completion(program: str, commands: Mapping[str, type[Any]], common: Iterable
 class Option(NamedTuple):
     """An option of a command, as tyro makes it of a field."""
 
-    name: str
-    """Dotted name, or that of a place."""
-    group: tuple[str, str]
-    """Name and text of the group that it is in; two empty ones for an option of the command itself."""
+    name: str  # dotted, or that of a place
+    group: tuple[str, str]  # name and text of the group; two empty ones for an option of the command itself
     text: str
     hint: Any
     default: Any

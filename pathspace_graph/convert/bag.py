@@ -234,32 +234,18 @@ class Bag:
     notes: Counter[str]
 
     def samples(self, topic: str | None, option: str, take: Callable[[Any], Any]) -> Samples:
-        """Return what to `take` of the messages of a topic; a message may be large, and is not kept."""
+        """Return what to `take` of the messages of a topic; a message may be large, and is not kept.
+
+        They have header stamps where most have one, else the times of receipt: the clocks may differ.
+        """
         connections = self._connections(topic)
         if not connections:
             found = "found none" if topic is None else f"found {topic}"
             raise self._error(f"{option}: expected a topic of the bag, {found}")
+        name = f"{topic} ({connections[0].msgtype})"
         received, stamps, values = self._read(connections, take, option)
         if not values:
             raise self._error(f"{option}: expected messages of {topic}, found none")
-        return self._stamped(f"{topic} ({connections[0].msgtype})", stamps, received, values)
-
-    def transforms(self) -> list[Any]:
-        """Return the `TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
-        connections = self._connections(STATIC)
-        if not connections:
-            return []
-        _, _, messages = self._read(connections, lambda message: list(message.transforms), "transforms")
-        return [one for message in messages for one in message]
-
-    def _stamped(
-        self, name: str, stamps: list[float | None], received: list[float], values: list[Any]
-    ) -> Samples:
-        """Return samples with header stamps where most have one, else with the times of receipt.
-
-        Both are not mixed, since they may be of different clocks.
-        """
-        topic = name.split(maxsplit=1)[0]
         stamped = [] if self.received else [k for k, stamp in enumerate(stamps) if stamp is not None]
         if 2 * len(stamped) <= len(stamps):
             self.notes[f"messages of {topic} have the time at which they were received"] += len(values)
@@ -271,6 +257,14 @@ class Bag:
             told = f"messages of {topic} were received {late:.3g} s after their stamps, in the median"
             self.notes[f"{told} (--received takes the times of receipt)"] += len(stamped)
         return Samples(name, t, [values[k] for k in stamped])
+
+    def transforms(self) -> list[Any]:
+        """Return the `TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
+        connections = self._connections(STATIC)
+        if not connections:
+            return []
+        _, _, messages = self._read(connections, lambda message: list(message.transforms), "transforms")
+        return [one for message in messages for one in message]
 
     def _connections(self, topic: str | None) -> list[Any]:
         return [entry for entry in self.reader.connections if entry.topic == topic]
@@ -291,9 +285,7 @@ class Bag:
         """Return the times of receipt, the stamps and what was taken of all messages of a topic."""
         store, kind = self._store(connections[0]), connections[0].msgtype
         decode = store.deserialize_ros1 if is_ros1(self.path) else store.deserialize_cdr
-        received: list[float] = []
-        stamps: list[float | None] = []
-        values: list[Any] = []
+        received, stamps, values = list[float](), list[float | None](), list[Any]()
         try:
             for _, time, data in self.reader.messages(connections):
                 message = decode(data, kind)
