@@ -16,7 +16,7 @@ from pathspace_graph.io.parsing import Table, parse_yaml, read_table, read_text,
 from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
-from .curves import FloatArray, along_polyline, arc_lengths, direction, left_normals, ring, unit
+from .curves import FloatArray, arc_lengths, direction, left_normals, resample, ring, unit
 from .driving_order import driving_order
 from .track import Track
 
@@ -283,10 +283,11 @@ def _tum(path: Path, _: Table) -> Track:
     spline = CubicSpline(knots, circuit[:, :2], bc_type="periodic")
     s = np.linspace(0.0, knots[-1], math.ceil(knots[-1] / WIDTH_STEP), endpoint=False)
     points, tangents = np.asarray(spline(s)), unit(np.asarray(spline(s, 1)))
-    right, left = (
-        _spaced(points + side * left_normals(tangents) * np.interp(s, knots, circuit[:, k])[:, None])
+    edges = (
+        points + side * left_normals(tangents) * np.interp(s, knots, circuit[:, k])[:, None]
         for side, k in ((-1.0, 2), (1.0, 3))
     )
+    right, left = (resample(edge, CONE_SPACING, closed=True)[0] for edge in edges)
     start = np.append(circuit[0, :2], math.atan2(tangents[0, 1], tangents[0, 0]))
     return Track(left, right, np.zeros((0, 2)), True, start, path.stem)
 
@@ -307,13 +308,6 @@ def _tum_circuit(path: Path) -> FloatArray:
     if len(circuit) < MIN_CONES:
         raise InputError(path, f"expected at least {MIN_CONES} points, found {len(circuit)}")
     return ring(circuit)
-
-
-def _spaced(boundary: FloatArray) -> FloatArray:
-    polyline = ring(boundary)
-    s = arc_lengths(polyline)
-    at = np.linspace(0.0, s[-1], math.ceil(s[-1] / CONE_SPACING), endpoint=False)
-    return along_polyline(at, s, polyline)
 
 
 YAML: Final = (".yaml", ".yml")
