@@ -35,9 +35,10 @@ SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json"
 
 @dataclass(frozen=True, kw_only=True)
 class Convert:
-    """Write a ROS bag, CSV files, JSON lines or a known data set as a log, in order of time and in the
-    vehicle frame, and say what was left out, and why. A folder of several records becomes a folder of
-    logs."""
+    """Write a ROS bag, CSV files, JSON lines or a known data set as a log, and say what was left out.
+
+    A log is in order of time and in the vehicle frame. A folder of several records becomes a folder of logs.
+    """
 
     source: Positional[Path | None] = None
     """Bag (a file, or a folder with metadata.yaml), folder of CSV files, file of JSON lines, or a folder of

@@ -153,11 +153,11 @@ def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
         covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
     if file.has("label"):
         labels = rule.of_all(np.array(file.table.columns[file.column("label")]))
-    stamps, first, cycle = np.unique(t, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    groups = np.split(np.argsort(cycle, kind="stable"), np.cumsum(np.bincount(cycle))[:-1])
-    cycles = [groups[index] for index in order]
-    return stamps[order], [Points(points[own], covariances[own], labels[own]) for own in cycles]
+    cycles: dict[float, list[int]] = {}
+    for row, stamp in enumerate(t.tolist()):
+        cycles.setdefault(stamp, []).append(row)
+    scans = [Points(points[own], covariances[own], labels[own]) for own in cycles.values()]
+    return np.array([*cycles]), scans
 
 
 def _points(file: _File) -> Array:
