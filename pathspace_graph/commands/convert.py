@@ -49,6 +49,8 @@ class Convert:
     """Kind of the record."""
     topics: Annotated[BagOptions, arg(name="")] = field(default_factory=BagOptions)
     """Messages of a bag."""
+    label_field: str | None = None
+    """Field of the label of a detection in a bag; `none` means that there are no labels."""
     labels: tuple[str, ...] = ()
     """Values of the labels: left=0 right=1 is the default. Words are read as well, blue_cone as left and
     yellow as right; anything else is unknown."""
@@ -95,7 +97,7 @@ class Convert:
 
     def _convert(self, source: Path | None, out: Path) -> None:
         check_target(out, LOG_FILE)
-        rule = LabelRule(self.labels)
+        rule = LabelRule(self.labels, self.label_field)
         with progress("converting"):
             record = windowed(self._read(source, rule), self.window)
             file = source or Path(self.kind)

@@ -49,8 +49,6 @@ class BagOptions:
     definition: tuple[str, ...] = ()
     """Files of messages that the bag does not define itself, as PACKAGE/msg/NAME=FILE or as a path that ends
     in PACKAGE/msg/NAME.msg."""
-    label_field: str | None = None
-    """Field of the label of a detection in a bag; `none` means that there are no labels."""
     from_poses: bool = False
     """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
     received: bool = False
@@ -86,7 +84,7 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
         return Motion(twist, pose_of(message), frame_of(message), frame_of(message, "child_frame_id"))
 
     def points(message: Any) -> tuple[str, Points]:
-        return frame_of(message), points_of(message, rule, options.label_field)
+        return frame_of(message), points_of(message, rule)
 
     with opened(path, options, notes) as bag:
         odometry = bag.samples(options.odometry, "--odometry", motion)

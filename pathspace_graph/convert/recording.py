@@ -170,8 +170,7 @@ def _cycles(
 
 
 def join(scans: list[Points]) -> Points:
-    parts = zip(*((scan.points, scan.covariances, scan.labels) for scan in scans), strict=True)
-    return scans[0] if len(scans) == 1 else Points(*map(np.concatenate, parts))
+    return scans[0] if len(scans) == 1 else Points(*map(np.concatenate, zip(*scans, strict=True)))
 
 
 def usable(points: Points, notes: Counter[str]) -> Points:
@@ -237,15 +236,8 @@ class MessageStream:
     without a stamp has the time at which it was received.
     """
 
-    def __init__(
-        self,
-        frames: Frames | None = None,
-        noise: NoiseSettings | None = None,
-        rule: LabelRule | None = None,
-        label_field: str | None = None,
-    ) -> None:
-        self.frames, self.noise = frames or Frames(), noise or NoiseSettings()
-        self.rule, self.label_field = rule or LabelRule(), label_field
+    def __init__(self, frames: Frames | None = None) -> None:
+        self.frames, self.noise, self.rule = frames or Frames(), NoiseSettings(), LabelRule()
         self.refused: Counter[str] = Counter()  # number of messages for each reason
         self._twists: deque[tuple[float, list[float]]] = deque(maxlen=MAX_BUFFERED)
         self._first = np.inf  # the stamp (s) of the first twist
@@ -271,7 +263,7 @@ class MessageStream:
         A late cycle comes without twists. They are kept until the caller says by `use` that it was taken.
         """
         try:
-            points = usable(points_of(message, self.rule, self.label_field), self.refused)
+            points = usable(points_of(message, self.rule), self.refused)
             t = stamp_of(message) or received
             if not self._first <= t < np.inf:
                 raise ValueError("detections: expected a stamp not before that of the first odometry")

@@ -15,6 +15,9 @@ from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
 
 Side = Literal["left", "right"]  # side of the x axis to which the y axis points
+LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
+"""Fields of a message that may hold the label of a detection, the first one that is there."""
+NO_LABEL: Final = "none"  # name of a label field that says there are no labels
 DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
 SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
 SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)  # (m, m/m, rad) where nothing is known
@@ -126,10 +129,12 @@ class LabelRule:
     """The labels of numbers, words and colours, and a count of the values that were met.
 
     `left=0 right=1 right=7` gives labels to values. Any other word is read by its parts: `blue_cone`,
-    `yellow-cone`, `b`, `large_orange_cone`. A text may stand in the field `data` of a message.
+    `yellow-cone`, `b`, `large_orange_cone`. A text may stand in the field `data` of a message. The value
+    of a message is in its `field`, or the first of LABEL_FIELDS that it has.
     """
 
-    def __init__(self, pairs: Sequence[str] = ()) -> None:
+    def __init__(self, pairs: Sequence[str] = (), field: str | None = None) -> None:
+        self.fields = (field,) if field else LABEL_FIELDS
         self._labels: dict[str, int] = {}
         self.met: Counter[tuple[str, int]] = Counter()
         """Times that each value was met, by its text and the label it was taken for."""

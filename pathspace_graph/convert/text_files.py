@@ -69,7 +69,7 @@ def read_csv(
 
 def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
     """Return columns by kind of file and quantity, with a minus where the sign changes."""
-    named = {}
+    named: dict[tuple[str, str], str] = {}
     for pair in pairs:
         key, equals, name = pair.partition("=")
         if not equals or not name.removeprefix("-"):
