@@ -18,8 +18,9 @@ import docstring_parser
 import tyro
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.overrides import check_gone, leaves, read_settings
+from pathspace_graph.io.overrides import leaves, read_settings
 from pathspace_graph.io.parsing import MAX_INTEGER, shown
+from pathspace_graph.settings.checked import check_gone
 from pathspace_graph.settings.mapper import MapperSettings
 
 HELP: Final = ("-h", "--help")

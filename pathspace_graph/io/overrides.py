@@ -8,7 +8,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_json, parse_toml, read_text, shown
-from pathspace_graph.settings.checked import in_words, is_of, successor
+from pathspace_graph.settings.checked import check_gone, in_words, is_of
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]  # new values by dotted field
@@ -37,13 +37,6 @@ def override(settings: T, overrides: Overrides, where: str) -> T:
             check_name(name, known, f"{where}: expected a known setting" if where else "expected a setting")
         settings = _set(settings, name.split("."), value, f"{before}{name}")
     return settings
-
-
-def check_gone(name: str, said: str) -> None:
-    """Raise a SettingsError for a setting that is gone, which tells what took its place."""
-    place = successor(name)
-    if place is not None:
-        raise SettingsError(f"{said}: expected a setting, found one that is gone: {place}")
 
 
 def read_settings(file: Path, settings: T) -> T:
