@@ -153,8 +153,7 @@ def _mapping(value: Any, memo: Memo) -> Any:
 
 def _graph(value: Any, _: Memo) -> Any:
     found = type(value)()
-    for i in range(value.size()):
-        found.push_back(value.at(i))
+    found.push_back(value)
     return found
 
 

@@ -22,11 +22,11 @@ TERMINATED: Final = 143
 LEVELS: Final = {"-q": "QUIET", "--quiet": "QUIET", "-v": "VERBOSE", "--verbose": "VERBOSE"}
 """Options that every command takes, each with its level of `console.Verbosity`."""
 COMMANDS: Final = {
-    "demo": ("demo", "Demo", "maps a generated track online, and shows a table, a map and its picture"),
+    "demo": ("compare", "Demo", "maps a generated track online, and shows a table, a map and its picture"),
     "simulate": ("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
     "convert": ("convert", "Convert", "writes a ROS bag, CSV files or a known data set as a log"),
-    "online": ("online", "Online", "maps a log online, cycle by cycle"),
-    "batch": ("batch", "Batch", "optimizes a whole log at once, as the ground reference"),
+    "online": ("estimate", "Online", "maps a log online, cycle by cycle"),
+    "batch": ("estimate", "Batch", "optimizes a whole log at once, as the ground reference"),
     "compare": ("compare", "Compare", "runs every estimator on one log or many, and gives the paper's table"),
     "ablate": ("studies", "Ablate", "runs a study of estimators and settings over many drives"),
     "faults": ("studies", "FaultSuite", "measures what each fault of a car costs, and what is said of it"),

@@ -61,12 +61,6 @@ BATCH: Final[dict[str, MakeBatch]] = {
 """Makers of batch estimators, in the same way."""
 
 
-def _check(name: str, known: Mapping[str, Any], kind: str) -> None:
-    if name not in known:
-        names = ", ".join(sorted(known))
-        raise SettingsError(f"--estimator: expected a known {kind} estimator ({names}), found '{name}'")
-
-
 def check_online(name: str) -> None:
     """Raise a SettingsError that names the known estimators, unless the name is one of them."""
     _check(name, ONLINE, "online")
@@ -75,6 +69,12 @@ def check_online(name: str) -> None:
 def check_batch(name: str) -> None:
     """Raise a SettingsError that names the known estimators, unless the name is one of them."""
     _check(name, BATCH, "batch")
+
+
+def _check(name: str, known: Mapping[str, Any], kind: str) -> None:
+    if name not in known:
+        names = ", ".join(sorted(known))
+        raise SettingsError(f"--estimator: expected a known {kind} estimator ({names}), found '{name}'")
 
 
 def for_map(name: str, kind: MapKind) -> str:

@@ -11,21 +11,17 @@ BIG_ORANGE: Final = 4
 NAMES: Final = ("left", "right", "unknown", "orange", "big_orange")
 """Words of the file format, indexed by label."""
 
+LABELS: Final = {name: label for label, name in enumerate(NAMES)}
+
 BOUNDARIES: Final = (LEFT, RIGHT)
 
 POINTS: Final = (ORANGE, BIG_ORANGE)
 """Cones with these labels bound no road: they stand at gates, and along lanes that lead to a track."""
 
 _CODES: Final = {
-    "left": LEFT,
-    "blue": LEFT,
-    "right": RIGHT,
-    "yellow": RIGHT,
-    "orange": ORANGE,
-    "small_orange": ORANGE,
-    "big_orange": BIG_ORANGE,
-    "large_orange": BIG_ORANGE,
-    "orange_big": BIG_ORANGE,
+    **LABELS,
+    **{"blue": LEFT, "yellow": RIGHT, "small_orange": ORANGE},
+    **{"large_orange": BIG_ORANGE, "orange_big": BIG_ORANGE},
 }
 
 

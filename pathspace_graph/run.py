@@ -1,6 +1,7 @@
 """The interface of estimators, and the loop that feeds a log to an online one cycle by cycle."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass
@@ -103,10 +104,9 @@ def scale(estimator: OnlineEstimator) -> float:
     return float(getattr(estimator, "scale", 1.0))
 
 
-def outline(estimator: OnlineEstimator) -> Map:
-    """Return the present map, without covariances where the estimator can give it so."""
-    track: Map = estimator.outline() if hasattr(estimator, "outline") else estimator.map()
-    return track
+def _ask(estimator: OnlineEstimator, method: str, *arguments: Any) -> Any:
+    """Return the answer of a method that an estimator may have, or None where it has none."""
+    return getattr(estimator, method, lambda *_: None)(*arguments)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,8 @@ class ObservedCycle:
     @cached_property
     def outline(self) -> Map:
         """Return the map as it stands, without covariances where the estimator can give it so."""
-        return outline(self.estimator)
+        track: Map | None = _ask(self.estimator, "outline")
+        return self.estimator.map() if track is None else track
 
     @cached_property
     def map(self) -> Map:
@@ -164,15 +165,14 @@ class ObservedCycle:
     @cached_property
     def readings(self) -> Readings | None:
         """Return which detections were used; None where the estimator does not say it."""
-        readings: Readings | None = getattr(self.estimator, "readings", lambda: None)()
+        readings: Readings | None = _ask(self.estimator, "readings")
         return readings
 
     @cached_property
     def window(self) -> Array:
         """Return the poses (P, 3) in the window, the oldest first; a filter has none."""
-        estimator = self.estimator
-        poses: Array = estimator.window_poses() if hasattr(estimator, "window_poses") else np.zeros((0, 3))
-        return poses
+        poses: Array | None = _ask(self.estimator, "window_poses")
+        return np.zeros((0, 3)) if poses is None else poses
 
 
 Observer = Callable[[ObservedCycle], None]
@@ -211,10 +211,8 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
 
 def timed_wait(estimator: OnlineEstimator) -> float:
     """Wait for what the next update may take from another process; return the wall time (s) of that."""
-    if not hasattr(estimator, "wait"):
-        return 0.0
     begin = time.perf_counter()
-    estimator.wait()
+    _ask(estimator, "wait")
     return time.perf_counter() - begin
 
 
@@ -233,23 +231,15 @@ def run_online(
     name: str = "fixed-lag",
     snapshot_times: Sequence[float] | Array = (),
     observers: Sequence[Observer] = (),
-    on_cycle: Callable[[CycleRecord], None] | None = None,
-    observer: Callable[[CycleResult, Map], None] | None = None,
 ) -> RunResult:
     """Feed a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
 
     Maps are kept as they stood at the `snapshot_times` (s, ascending). The `observers` are shown each cycle,
-    outside of its time; `on_cycle` takes its record only, `observer` its result and the map's outline. BLAS
-    has one thread, and results of another process are waited for between cycles.
+    outside of its time. BLAS has one thread, and results of another process are waited for between cycles.
     """
     check_type("log", log, Log)
     check_type("estimator", estimator, OnlineEstimator)
-    shown = [*observers]
-    if on_cycle is not None:
-        shown.append(lambda cycle: on_cycle(cycle.record))
-    if observer is not None:
-        shown.append(lambda cycle: observer(cycle.result, cycle.outline))
-    run = _Run(estimator, [float(t) for t in snapshot_times], shown)
+    run = _Run(estimator, [float(t) for t in snapshot_times], observers)
     with threadpool_limits(limits=1):
         for odometry, detections in split_odometry(log):
             run.cycle(odometry, detections)
@@ -258,17 +248,13 @@ def run_online(
 
 class _Run:
     def __init__(
-        self, estimator: OnlineEstimator, snapshot_times: list[float], observers: Sequence[Observer]
+        self, estimator: OnlineEstimator, times: Sequence[float], observers: Sequence[Observer]
     ) -> None:
-        self._estimator = estimator
-        self._observers = observers
+        self._estimator, self._observers = estimator, observers
         self._observing = self._waited = 0.0
-        self._snapshot_times = snapshot_times
-        self._snapshots: list[Map] = []
-        self._laps = LapCounter()
-        self._lap_maps: list[tuple[int, Map]] = []
-        self._poses: list[Array] = []
-        self._records: list[CycleRecord] = []
+        self._snapshot_times, self._snapshots = deque(times), list[Map]()
+        self._laps, self._lap_maps = LapCounter(), list[tuple[int, Map]]()
+        self._poses, self._records = list[Array](), list[CycleRecord]()
 
     def cycle(self, odometry: Odometry, detections: Detections) -> None:
         self._take_snapshots(before=detections.t)
@@ -295,7 +281,8 @@ class _Run:
             self._lap_maps.append((self._laps.lap, track))
         t = np.array([record.t for record in records])
         trajectory = np.array(self._poses).reshape(-1, 3)
-        smoothed = estimator.smoothed(t) if hasattr(estimator, "smoothed") else np.full(3, np.nan)
+        smoothed = _ask(estimator, "smoothed", t)
+        smoothed = np.full(3, np.nan) if smoothed is None else smoothed
         is_smoothed = np.isfinite(smoothed)
         return RunResult(
             estimator=name,
@@ -307,19 +294,18 @@ class _Run:
             laps=self._laps.completed,
             lap_maps=tuple(self._lap_maps),
             snapshots=tuple(self._snapshots),
-            vehicle=estimator.vehicle_state() if records and hasattr(estimator, "vehicle_state") else None,
+            vehicle=_ask(estimator, "vehicle_state") if records else None,
             observing=self._observing,
-            batches=estimator.batches() if hasattr(estimator, "batches") else None,
+            batches=_ask(estimator, "batches"),
             waited=self._waited,
-            noise=estimator.noise_used() if hasattr(estimator, "noise_used") else None,
+            noise=_ask(estimator, "noise_used"),
             scale=scale(estimator),
             smoothed=np.where(is_smoothed, smoothed, trajectory) if is_smoothed.any() else None,
         )
 
     def _take_snapshots(self, before: float) -> None:
-        while len(self._snapshots) < len(self._snapshot_times):
-            if self._snapshot_times[len(self._snapshots)] >= before:
-                return
+        while self._snapshot_times and self._snapshot_times[0] < before:
+            self._snapshot_times.popleft()
             self._snapshots.append(self._estimator.map())
 
 

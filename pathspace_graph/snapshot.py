@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import fields, is_dataclass
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from hashlib import sha256
 from inspect import unwrap
 from io import BytesIO
@@ -40,6 +40,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors import linear as linear_arrays
+from pathspace_graph.graph.gaussian import factors_of, graph_of
 from pathspace_graph.graph.variables import sizes
 from pathspace_graph.io.files import atomic_file
 from pathspace_graph.io.parsing import parse_json, read_bytes, shown
@@ -153,15 +154,11 @@ def layout(kind: type) -> dict[str, str]:
     return names | {one.name: str(one.type) for one in (fields(kind) if is_dataclass(kind) else ())}
 
 
-def _factors(graph: Any) -> list[Any]:
-    return [graph.at(i) for i in range(graph.size())]
-
-
-def _graph(kind: Callable[[], Any], *factors: Any) -> Any:
-    graph = kind()
-    for factor in factors:
-        graph.push_back(factor)
-    return graph
+def _bayes_net(*conditionals: gtsam.GaussianConditional) -> gtsam.GaussianBayesNet:
+    net = gtsam.GaussianBayesNet()
+    for conditional in conditionals:
+        net.push_back(conditional)
+    return net
 
 
 def _jacobian(factor: gtsam.JacobianFactor) -> tuple[Any, ...]:
@@ -187,8 +184,8 @@ TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]
     KDTree: (lambda tree: (np.array(tree.data),), KDTree),
     Recovery: (lambda recovery: (recovery.failures,), Recovery),
     Future: (lambda _: (), lambda: None),  # what a process is about to give is asked for again
-    gtsam.GaussianFactorGraph: (_factors, partial(_graph, gtsam.GaussianFactorGraph)),
-    gtsam.GaussianBayesNet: (_factors, partial(_graph, gtsam.GaussianBayesNet)),
+    gtsam.GaussianFactorGraph: (factors_of, graph_of),
+    gtsam.GaussianBayesNet: (factors_of, _bayes_net),
     gtsam.GaussianConditional: (
         _conditional,
         lambda keys, matrix, frontals: linear_arrays.conditional_of(keys, sizes(keys), frontals, matrix),

@@ -93,7 +93,7 @@ def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: Flo
     """
     rungs = match_rows(left, right, closed, near)
     middles = (left[rungs[:, 0]] + right[rungs[:, 1]]) / 2
-    curve, rung_of = _resample(middles, STEP, closed)
+    curve, rung_of = resample(middles, STEP, closed)
     curve = _smooth(curve, closed)
     index = rungs[np.rint(rung_of).astype(int) % len(rungs)].T
 
@@ -108,7 +108,7 @@ def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: Flo
 
 def along_path(points: FloatArray, cones: FloatArray, closed: bool) -> CentreLine:
     """Return the smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
-    curve = _smooth(_resample(points, STEP, closed)[0], closed)
+    curve = _smooth(resample(points, STEP, closed)[0], closed)
     return _as_spline(curve, np.asarray(KDTree(cones).query(curve)[0]), closed)
 
 
@@ -145,7 +145,7 @@ def _match(left: FloatArray, right: FloatArray) -> tuple[float, IntArray]:
     return float(total[-1, -1]), np.array(pairs[::-1])
 
 
-def _resample(points: FloatArray, step: float, closed: bool) -> tuple[FloatArray, FloatArray]:
+def resample(points: FloatArray, step: float, closed: bool) -> tuple[FloatArray, FloatArray]:
     """Return points (n, 2) about `step` apart along a polyline, and their fractional indices in it (n,)."""
     polyline = ring(points) if closed else points
     s = arc_lengths(polyline)
@@ -180,7 +180,7 @@ def _row_distances(curve: FloatArray, row: FloatArray, index: IntArray, closed: 
 
 
 def _as_spline(curve: FloatArray, clearance: FloatArray, closed: bool) -> CentreLine:
-    knots, index = _resample(curve, KNOT_STEP, closed)
+    knots, index = resample(curve, KNOT_STEP, closed)
     at_knots = np.interp(index, np.arange(len(curve)), clearance)
     if closed:
         knots, at_knots = ring(knots), np.append(at_knots, at_knots[0])

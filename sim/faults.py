@@ -1,5 +1,6 @@
 """The faults of a real car that white noise does not have, off by default, and what they do to a drive."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -165,36 +166,27 @@ def colours(track: Track, wrong_way: bool) -> IntArray:
     return np.where(changed, LEFT + RIGHT - labels, labels)
 
 
-class FaultySensor:
-    """A `ConeSensor` that is mounted badly, and that fails at times."""
+def faulty(
+    sensor: ConeSensor, sides: IntArray, driven: Drive, lap: float, faults: SensorFaults, rng: Generator
+) -> Callable[[float, FloatArray], tuple[Detections, IntArray]]:
+    """Return how a sensor detects that is mounted badly, and that fails at times.
 
-    def __init__(
-        self,
-        sensor: ConeSensor,
-        sides: IntArray,
-        driven: Drive,
-        lap: float,
-        faults: SensorFaults,
-        rng: Generator,
-    ) -> None:
-        self._sensor, self._faults, self._rng = sensor, faults, rng
-        self._dropout = time_at(driven, faults.dropout_at * lap)
-        begin = faults.blind_at * lap
-        self._blind = (time_at(driven, begin), time_at(driven, begin + faults.blind))
-        self._unseen = np.flatnonzero(sides == NAMES.index(faults.blind_side))
+    It makes a cycle, and the true cone of each detection, of the stamp (s) and the pose then.
+    """
+    dropout, begin = time_at(driven, faults.dropout_at * lap), faults.blind_at * lap
+    blind = (time_at(driven, begin), time_at(driven, begin + faults.blind))
+    unseen = np.flatnonzero(sides == NAMES.index(faults.blind_side))
 
-    def detect(self, t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
-        """Return a cycle from the pose at the time of the image, and the true cone of each detection."""
-        faults = self._faults
-        detections, cones = self._sensor.detect(
-            t, mounted(pose, faults), faults.range_scale, faults.range_bias
-        )
-        lost = self._rng.random(len(cones)) < faults.colourless
+    def detect(t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
+        detections, cones = sensor.detect(t, mounted(pose, faults), faults.range_scale, faults.range_bias)
+        lost = rng.random(len(cones)) < faults.colourless
         detections = replace(detections, labels=np.where(lost, UNKNOWN, detections.labels))
-        kept = np.full(len(cones), not self._dropout <= t < self._dropout + faults.dropout)
-        if self._blind[0] <= t < self._blind[1]:
-            kept &= ~np.isin(cones, self._unseen) | (cones == FALSE_POSITIVE)
+        kept = np.full(len(cones), not dropout <= t < dropout + faults.dropout)
+        if blind[0] <= t < blind[1]:
+            kept &= ~np.isin(cones, unseen) | (cones == FALSE_POSITIVE)
         return detections.where(kept), cones[kept]
+
+    return detect
 
 
 def mounted(pose: FloatArray, faults: SensorFaults) -> FloatArray:

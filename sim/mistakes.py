@@ -15,6 +15,7 @@ from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT
 
 from .curves import FloatArray
+from .vehicle import integrate
 
 Mistake = Callable[[Log], Log]
 
@@ -34,7 +35,11 @@ def with_covariances(log: Log, change: Callable[[FloatArray], FloatArray]) -> Lo
 
 
 def with_twists(log: Log, factors: FloatArray | tuple[float, float, float]) -> Log:
-    return replace(log, odometry=replace(log.odometry, twist=log.odometry.twist * factors))
+    return with_twists_of(log, log.odometry.twist * factors)
+
+
+def with_twists_of(log: Log, twist: FloatArray) -> Log:
+    return replace(log, odometry=replace(log.odometry, twist=twist))
 
 
 def with_stamps(log: Log, odometry: float = 1.0, detections: float = 1.0) -> Log:
@@ -54,14 +59,6 @@ def in_frame(log: Log, turn: float = 0.0, ahead: float = 0.0, left: float = 0.0)
     return turned(with_points(log, lambda points: points - [ahead, left]), np.array([[c, -s], [s, c]]))
 
 
-def y_to_the_right(log: Log) -> Log:
-    return turned(log, np.diag([1.0, -1.0]))
-
-
-def swapped(log: Log) -> Log:
-    return turned(log, np.array([[0.0, 1.0], [1.0, 0.0]]))
-
-
 def camera(log: Log, height: float = 0.6, sigma: float = 0.02) -> Log:
     """Return the log with x to the right and y down of a camera at a height (m); z ahead is lost."""
     rng = np.random.default_rng(0)
@@ -74,32 +71,21 @@ def bearings_as_degrees(log: Log) -> Log:
     """Return the log with detections made of bearings in degrees that were taken for radians."""
 
     def wrong(points: FloatArray) -> FloatArray:
-        bearings = np.arctan2(points[:, 1], points[:, 0]) / DEGREE
-        rays = np.column_stack([np.cos(bearings), np.sin(bearings)])
-        return np.asarray(np.hypot(*points.T)[:, None] * rays)
+        ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0]) / DEGREE
+        return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
     return with_points(log, wrong)
 
 
 def dead_reckoned(log: Log) -> FloatArray:
     """Return poses (N, 3) at the odometry's stamps, by the odometry alone."""
-    twist, dt = log.odometry.twist, np.diff(log.odometry.t)
-    heading = np.append(0.0, np.cumsum(twist[:-1, 2] * dt))
-    middle = heading[:-1] + 0.5 * twist[:-1, 2] * dt
-    c, s = np.cos(middle), np.sin(middle)
-    steps = np.column_stack([c * twist[:-1, 0] - s * twist[:-1, 1], s * twist[:-1, 0] + c * twist[:-1, 1]])
-    return np.column_stack([np.vstack([np.zeros(2), np.cumsum(steps * dt[:, None], axis=0)]), heading])
-
-
-def pose_as_twist(log: Log) -> Log:
-    return replace(log, odometry=replace(log.odometry, twist=dead_reckoned(log)))
+    return integrate(log.odometry.twist[:-1], np.diff(log.odometry.t))
 
 
 def speeds_in_the_map(log: Log) -> Log:
-    c, s = np.cos(dead_reckoned(log)[:, 2]), np.sin(dead_reckoned(log)[:, 2])
-    vx, vy, wz = log.odometry.twist.T
-    twist = np.column_stack([c * vx - s * vy, s * vx + c * vy, wz])
-    return replace(log, odometry=replace(log.odometry, twist=twist))
+    heading, (vx, vy, wz) = dead_reckoned(log)[:, 2], log.odometry.twist.T
+    c, s = np.cos(heading), np.sin(heading)
+    return with_twists_of(log, np.column_stack([c * vx - s * vy, s * vx + c * vy, wz]))
 
 
 def detections_in_the_map(log: Log) -> Log:
@@ -121,15 +107,13 @@ def late(log: Log, seconds: float) -> Log:
     return replace(log, cycles=tuple(c for c in log.cycles if first <= c.t <= last), truth=truth)
 
 
-def all_left(log: Log) -> Log:
-    return with_cycles(log, lambda cycle: {"labels": np.full(len(cycle.labels), LEFT)})
-
-
 def in_millimetres(log: Log) -> Log:
     """Return the log with all lengths in mm: positions, covariances and speeds."""
     log = with_covariances(with_points(log, lambda points: 1e3 * points), lambda K: 1e6 * K)
     return with_twists(log, (1e3, 1e3, 1.0))
 
+
+y_to_the_right: Final = partial(turned, to_vehicle=np.diag([1.0, -1.0]))
 
 MISTAKES: Final[dict[str, Mistake]] = {
     "positions in millimetres": partial(with_points, change=lambda points: 1e3 * points),
@@ -147,19 +131,21 @@ MISTAKES: Final[dict[str, Mistake]] = {
     "sensor frame: turned by 30 degrees": partial(in_frame, turn=30.0 * DEGREE),
     "sensor frame: turned by 10 degrees": partial(in_frame, turn=-10.0 * DEGREE),
     "sensor frame: camera, z ahead": camera,
-    "sensor frame: x and y swapped": swapped,
+    "sensor frame: x and y swapped": partial(turned, to_vehicle=np.array([[0.0, 1.0], [1.0, 0.0]])),
     "sensor frame: 2 m ahead": partial(in_frame, ahead=2.0),
     "positions in centimetres": partial(with_points, change=lambda points: 1e2 * points),
     "speeds in km/h": partial(with_twists, factors=(3.6, 3.6, 1.0)),
     "yaw rate to the right": partial(with_twists, factors=(1.0, 1.0, -1.0)),
     "stamps in milliseconds": partial(with_stamps, odometry=1e3, detections=1e3),
-    "odometry is a pose": pose_as_twist,
+    "odometry is a pose": lambda log: with_twists_of(log, dead_reckoned(log)),
     "speeds in the map frame": speeds_in_the_map,
     "detections in the map frame": detections_in_the_map,
     "detections 1 s late": partial(late, seconds=1.0),
     "covariances in mm^2": partial(with_covariances, change=lambda K: 1e6 * K),
     "covariances of zero": partial(with_covariances, change=lambda K: 0.0 * K),
-    "all labels left": all_left,
+    "all labels left": partial(
+        with_cycles, change=lambda cycle: {"labels": np.full(len(cycle.labels), LEFT)}
+    ),
     "y to the right, yaw rate in degrees": lambda log: with_twists(
         y_to_the_right(log), (1.0, 1.0, 1.0 / DEGREE)
     ),

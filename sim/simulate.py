@@ -1,8 +1,8 @@
 """A drive on a track: track, vehicle and sensors give a log with truth; and sensors of a real car by name."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.random import Generator
@@ -12,7 +12,7 @@ from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth
 from pathspace_graph.lengths import scaled
 
 from .curves import FloatArray, IntArray
-from .faults import Faults, FaultySensor, SensorFaults, colours, measure_odometry, put_down, turned_round
+from .faults import Faults, SensorFaults, colours, faulty, measure_odometry, put_down, turned_round
 from .sensor import ConeSensor, OdometryNoise, SensorSettings
 from .track import Track, to_map_frame
 from .vehicle import Drive, VehicleSettings, drive, integrate
@@ -96,11 +96,11 @@ def _perceive(
 ) -> tuple[list[Detections], IntArray]:
     faults, rate, lap = settings.faults, settings.sensor.rate, track.centre_line.length
     cones = ConeSensor(track.cones, colours(track, faults.vehicle.wrong_way), settings.sensor, sensor_rng)
-    sensor = FaultySensor(cones, track.cone_labels, driven, lap, faults.sensor, colour_rng)
+    detect = faulty(cones, track.cone_labels, driven, lap, faults.sensor, colour_rng)
     stamps = np.arange(int(driven.t[-1] * rate) + 1) / rate
     stamps = stamps[stamps - faults.sensor.latency <= driven.t[-1]]
     poses = _poses_at(driven, np.maximum(stamps - faults.sensor.latency, 0.0))
-    seen = [sensor.detect(t, pose) for t, pose in zip(stamps.tolist(), poses, strict=True)]
+    seen = [detect(t, pose) for t, pose in zip(stamps.tolist(), poses, strict=True)]
     seen = [cycle for cycle in seen if len(cycle[1])]
     associations = np.concatenate([np.zeros(0, dtype=int), *(own for _, own in seen)])
     return [detections for detections, _ in seen], associations
@@ -177,19 +177,11 @@ INS_RATE: Final = 40.0  # rate of the INS (Hz)
 PLAIN: Final = "plain"  # name of the preset that changes nothing
 
 
-def _camera(settings: SimulationSettings) -> SimulationSettings:
-    return replace(settings, sensor=CAMERA, faults=replace(settings.faults, sensor=CAMERA_FAULTS))
-
-
-def _ins(settings: SimulationSettings) -> SimulationSettings:
-    return replace(settings, odometry=INS, vehicle=replace(settings.vehicle, rate=INS_RATE))
-
-
-PRESETS: Final[dict[str, dict[str, Callable[[SimulationSettings], SimulationSettings]]]] = {
-    "sensor": {PLAIN: lambda settings: settings, "camera": _camera},
-    "odometry": {PLAIN: lambda settings: settings, "ins": _ins},
+PRESETS: Final[dict[str, dict[str, dict[str, Any]]]] = {
+    "sensor": {PLAIN: {}, "camera": {"sensor": CAMERA, "faults": Faults(sensor=CAMERA_FAULTS)}},
+    "odometry": {PLAIN: {}, "ins": {"odometry": INS, "vehicle": VehicleSettings(rate=INS_RATE)}},
 }
-"""Presets by group of settings and name."""
+"""Settings that differ from the defaults, by group and name of the preset."""
 
 
 def preset(names: Mapping[str, str]) -> SimulationSettings:
@@ -197,5 +189,5 @@ def preset(names: Mapping[str, str]) -> SimulationSettings:
     settings = SimulationSettings()
     for group, name in names.items():
         check_name(name, PRESETS[group], f"{group}: expected a known preset")
-        settings = PRESETS[group][name](settings)
+        settings = replace(settings, **PRESETS[group][name])
     return settings

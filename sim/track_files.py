@@ -13,10 +13,10 @@ from scipy.interpolate import CubicSpline
 from pathspace_graph.errors import InputError
 from pathspace_graph.io import parsing as limits
 from pathspace_graph.io.parsing import Table, parse_yaml, read_table, read_text, shown
-from pathspace_graph.labels import BIG_ORANGE, POINTS, UNKNOWN, label_from_name
+from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
-from .curves import FloatArray, along_polyline, arc_lengths, direction, left_normals, ring, unit
+from .curves import FloatArray, arc_lengths, direction, left_normals, resample, ring, unit
 from .driving_order import driving_order
 from .track import Track
 
@@ -120,14 +120,11 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     ]
     others = [_pacsim_cones(path, data.get("unknown"), "track.unknown"), *rows]
     other, kinds = (np.concatenate(parts) for parts in zip(*others, strict=True))
-    orange = (BIG_ORANGE if "big" in kind else SMALL_ORANGE for kind in kinds.tolist())
-    labels = np.array(
-        [one if ORANGE in kind else UNKNOWN for one, kind in zip(orange, kinds, strict=True)], int
-    )
-    no_boundary = np.isin(labels, POINTS) | (np.arange(len(labels)) < len(others[0][0]))
+    big, orange = (np.char.find(kinds, word) >= 0 for word in ("big", ORANGE))
+    labels = np.where(orange, np.where(big, BIG_ORANGE, SMALL_ORANGE), UNKNOWN)
+    no_boundary = orange | (np.arange(len(labels)) < len(others[0][0]))
     left, right = (
-        _without_repeats(points[[ORANGE not in kind for kind in kinds.tolist()]], closed)
-        for points, kinds in rows
+        _without_repeats(points[np.char.find(kinds, ORANGE) < 0], closed) for points, kinds in rows
     )
     start = np.append(position, orientation[2])
     track = Track(left, right, other[no_boundary], closed, start, path.stem, labels[no_boundary])
@@ -136,12 +133,11 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
 
 
 def _with_hidden(track: Track, hidden: FloatArray) -> Track:
-    line = track.centre_line
     left, right = (
         row[~(row[:, None] == hidden).all(axis=2).any(axis=1)] for row in (track.left, track.right)
     )
-    s = np.arange(0.0, line.length, WIDTH_STEP)
-    return replace(track, left=left, right=right, path=line.points(s))
+    s = np.arange(0.0, track.centre_line.length, WIDTH_STEP)
+    return replace(track, left=left, right=right, path=track.centre_line.points(s))
 
 
 def _pacsim_cones(path: Path, cones: object, key: str) -> tuple[FloatArray, NDArray[np.str_]]:
@@ -188,12 +184,12 @@ def _list(path: Path, value: object, key: str) -> list[Any]:
 def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
     """Return the first `size` numbers of a list, all within the limit of coordinates."""
     try:
-        if not isinstance(value, list) or len(value) < size:
-            raise ValueError
         # YAML 1.1 takes 1e-5 for a word, so words are given a chance to be numbers
-        vector = np.array([float(number) for number in value[:size]])
+        vector = np.array([float(number) for number in value[:size]] if isinstance(value, list) else [])
     except (TypeError, ValueError):
-        raise InputError(path, f"expected {size} numbers at {key}, found {shown(value)}") from None
+        vector = np.zeros(0)
+    if len(vector) < size:
+        raise InputError(path, f"expected {size} numbers at {key}, found {shown(value)}")
     if not np.isfinite(vector).all():
         raise InputError(path, f"expected finite numbers at {key}, found {shown(value)}")
     if np.abs(vector).max() > limits.MAX_COORDINATE:
@@ -287,10 +283,11 @@ def _tum(path: Path, _: Table) -> Track:
     spline = CubicSpline(knots, circuit[:, :2], bc_type="periodic")
     s = np.linspace(0.0, knots[-1], math.ceil(knots[-1] / WIDTH_STEP), endpoint=False)
     points, tangents = np.asarray(spline(s)), unit(np.asarray(spline(s, 1)))
-    right, left = (
-        _spaced(points + side * left_normals(tangents) * np.interp(s, knots, circuit[:, k])[:, None])
+    edges = (
+        points + side * left_normals(tangents) * np.interp(s, knots, circuit[:, k])[:, None]
         for side, k in ((-1.0, 2), (1.0, 3))
     )
+    right, left = (resample(edge, CONE_SPACING, closed=True)[0] for edge in edges)
     start = np.append(circuit[0, :2], math.atan2(tangents[0, 1], tangents[0, 0]))
     return Track(left, right, np.zeros((0, 2)), True, start, path.stem)
 
@@ -311,13 +308,6 @@ def _tum_circuit(path: Path) -> FloatArray:
     if len(circuit) < MIN_CONES:
         raise InputError(path, f"expected at least {MIN_CONES} points, found {len(circuit)}")
     return ring(circuit)
-
-
-def _spaced(boundary: FloatArray) -> FloatArray:
-    polyline = ring(boundary)
-    s = arc_lengths(polyline)
-    at = np.linspace(0.0, s[-1], math.ceil(s[-1] / CONE_SPACING), endpoint=False)
-    return along_polyline(at, s, polyline)
 
 
 YAML: Final = (".yaml", ".yml")

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
-from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.errors import SettingsError
 
 from . import curves
 from .curves import FloatArray, arc_lengths, left_normals, ring, unit
@@ -21,6 +21,12 @@ STRAIGHT_RADIUS: Final = 150.0  # radius above which a stretch is straight (m)
 CORNER_RADIUS: Final = 8.0  # radius at which cones stand twice as close as on straights (m)
 CORNER_BLUR: Final = 2.0  # sigma (m) by which corners draw cones closer before and after
 MIN_CONE_GAP: Final = 1.0  # least distance of cones along a row (m)
+CONE_GAP_MAX: Final = 5.0  # greatest one (m); they stand closer in corners
+STRAIGHT_MAX: Final = 80.0  # greatest length of a straight (m)
+HAIRPIN_DIAMETER: Final = 9.0  # least outside diameter of a corner (m)
+HAIRPIN_INWARD: Final = 0.3  # probability that a hairpin of the layout points to its inside
+SLALOM_PROBABILITY: Final = 0.35  # that a straight that is long enough becomes a slalom
+CHICANE_PROBABILITY: Final = 0.3  # that it becomes a chicane
 
 
 @dataclass(frozen=True)
@@ -31,40 +37,28 @@ class TrackGeneratorSettings:
     """Least and greatest length of the centre line (m); the rules allow 200 to 500."""
     width: tuple[float, float] = (3.2, 4.2)
     """Least and greatest distance of the boundaries, constant along a track (m); the rules ask for 3."""
-    hairpin_diameter: float = 9.0
-    """Least outside diameter of a corner (m)."""
-    straight_max: float = 80.0
-    """Greatest length of a straight (m)."""
     cones: int = 200
     """Cones of both boundaries together, as nearly as the gaps allow."""
-    cone_gap_max: float = 5.0
-    """Greatest gap between cones of a row (m); they stand closer in corners."""
     separation: float = 1.5
     """Least distance of boundaries of different stretches (m)."""
     corners: tuple[int, int] = (5, 9)
     """Least and greatest number of corners of the layout that the elements are put into."""
     hairpins: tuple[int, int] = (0, 3)
     """Least and greatest number of hairpins put into the layout, whose corners may be hairpins as well."""
-    hairpin_inward: float = 0.3
-    """Probability that such a hairpin points to the inside of the layout."""
-    slalom_probability: float = 0.35
-    """Probability that a straight that is long enough becomes a slalom."""
-    chicane_probability: float = 0.3
-    """Probability that a straight that is long enough becomes a chicane."""
 
     def __post_init__(self) -> None:
         for name in ("lap_length", "width", "corners", "hairpins"):
             low, high = getattr(self, name)
             if not 0 <= low <= high:
                 raise SettingsError(f"generator.{name}: expected 0 <= least <= greatest, found {low, high}")
-        probabilities = ("hairpin_inward", "slalom_probability", "chicane_probability")
-        check_numbers(self, "generator", probabilities, "a number in [0, 1]")
         if self.corners[0] < 3:
             raise SettingsError(f"generator.corners: expected at least 3, found {self.corners[0]}")
-        if self.hairpin_diameter <= self.width[1]:
-            raise SettingsError(f"generator.hairpin_diameter: expected more than {self.width[1]} (the width)")
-        if self.cone_gap_max <= MIN_CONE_GAP or self.cones < 2 * self.corners[0]:
-            raise SettingsError("generator.cones: expected enough cones, and gaps above 1 m")
+        if self.width[1] >= HAIRPIN_DIAMETER:
+            raise SettingsError(
+                f"generator.width: expected less than {HAIRPIN_DIAMETER:g}, found {self.width}"
+            )
+        if self.cones < (least := 2 * self.corners[0]):
+            raise SettingsError(f"generator.cones: expected at least {least}, found {self.cones}")
 
 
 def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = None) -> Track:
@@ -73,7 +67,7 @@ def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = Non
     for _ in range(MAX_ATTEMPTS):
         width = rng.uniform(*settings.width)
         layout = _layout(width, settings, rng)
-        curve = None if layout is None else _curve(layout, settings, rng)
+        curve = None if layout is None else _curve(layout, rng)
         if curve is not None and _keeps_rules(curve, width, settings):
             return _with_cones(curve, width, settings, rng)
     raise SettingsError(f"generator: no track kept the rules in {MAX_ATTEMPTS} attempts: {settings}")
@@ -86,8 +80,8 @@ class _Layout(NamedTuple):
     radii: FloatArray
 
 
-def _least_radius(width: float, settings: TrackGeneratorSettings) -> float:
-    return (settings.hairpin_diameter - width) / 2
+def _least_radius(width: float) -> float:
+    return (HAIRPIN_DIAMETER - width) / 2
 
 
 def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _Layout | None:
@@ -102,11 +96,11 @@ def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _
     perimeter = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
     # rounding the corners shortens the lap by about a tenth
     corners *= (rng.uniform(*settings.lap_length) * 1.1 - 2 * legs.sum()) / perimeter
-    least = _least_radius(width, settings)
+    least = _least_radius(width)
     radii = least + rng.gamma(2.0, 4.0, count)
     layout: _Layout | None = _Layout(corners, radii)
     for leg in legs:
-        inward = rng.random() < settings.hairpin_inward
+        inward = rng.random() < HAIRPIN_INWARD
         if layout is not None:
             layout = _with_hairpin(layout, float(-leg if inward else leg), least, rng)
     if layout is None:
@@ -152,7 +146,7 @@ def _turns(corners: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(cross, np.sum(before * after, axis=1)))
 
 
-def _curve(layout: _Layout, settings: TrackGeneratorSettings, rng: Generator) -> FloatArray:
+def _curve(layout: _Layout, rng: Generator) -> FloatArray:
     """Return samples (n, 2) of the centre line: straights and their elements, joined by eased arcs."""
     (corners, radii), turns = layout, _turns(layout.corners)
     tangent = radii * np.tan(np.abs(turns) / 2)
@@ -162,7 +156,7 @@ def _curve(layout: _Layout, settings: TrackGeneratorSettings, rng: Generator) ->
         side = corners[following] - corners[k]
         direction = side / np.linalg.norm(side)
         end = corners[following] - direction * tangent[following]
-        pieces.append(_straight(corners[k] + direction * tangent[k], end, settings, rng))
+        pieces.append(_straight(corners[k] + direction * tangent[k], end, rng))
         pieces.append(_arc(end, direction, radii[following], turns[following]))
     curve = _evenly(np.vstack(pieces))
     return np.asarray(gaussian_filter1d(curve, curves.SMOOTHING / curves.STEP, axis=0, mode="wrap"))
@@ -176,9 +170,7 @@ def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -
     return np.asarray(begin + radius * (forward * direction + sideways * normal))
 
 
-def _straight(
-    begin: FloatArray, end: FloatArray, settings: TrackGeneratorSettings, rng: Generator
-) -> FloatArray:
+def _straight(begin: FloatArray, end: FloatArray, rng: Generator) -> FloatArray:
     """Return samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
     length = float(np.linalg.norm(end - begin))
     if length < curves.STEP:
@@ -186,9 +178,9 @@ def _straight(
     along = np.arange(0.0, length, curves.STEP)
     direction = (end - begin) / length
     dice, offset = rng.random(), np.zeros_like(along)
-    if dice < settings.slalom_probability:
+    if dice < SLALOM_PROBABILITY:
         offset = _slalom(along, length, rng)
-    elif dice - settings.slalom_probability < settings.chicane_probability:
+    elif dice - SLALOM_PROBABILITY < CHICANE_PROBABILITY:
         offset = _chicane(along, length, rng)
     return begin + along[:, None] * direction + offset[:, None] * left_normals(direction)
 
@@ -233,8 +225,8 @@ def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettin
     bend = np.abs(_curvature(curve))
     return bool(
         settings.lap_length[0] <= arc_lengths(ring(curve))[-1] <= settings.lap_length[1]
-        and bend.max() * _least_radius(width, settings) <= 1
-        and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * curves.STEP <= settings.straight_max
+        and bend.max() * _least_radius(width) <= 1
+        and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * curves.STEP <= STRAIGHT_MAX
         and _is_separate(curve, width + settings.separation)
     )
 
@@ -272,21 +264,21 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
     )
     rows = [curve + side * normals * width / 2 for side in (1.0, -1.0)]
     gap = _straight_gap(rows, crowding, settings)
-    left, right = (_place_cones(row, _density(gap, crowding, settings), rng) for row in rows)
+    left, right = (_place_cones(row, _density(gap, crowding), rng) for row in rows)
     start = np.append(curve[0], np.arctan2(along[0, 1], along[0, 0]))
     return Track(left, right, np.zeros((0, 2)), True, start, "generated")
 
 
-def _density(gap: float, crowding: FloatArray, settings: TrackGeneratorSettings) -> FloatArray:
-    return 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, settings.cone_gap_max)
+def _density(gap: float, crowding: FloatArray) -> FloatArray:
+    return 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, CONE_GAP_MAX)
 
 
 def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackGeneratorSettings) -> float:
     def excess(gap: float) -> float:
-        density = _density(gap, crowding, settings)
+        density = _density(gap, crowding)
         return float(sum(_cumulative(row, density)[-1] for row in rows)) - settings.cones
 
-    widest = settings.cone_gap_max * float(crowding.max())
+    widest = CONE_GAP_MAX * float(crowding.max())
     if excess(widest) >= 0:
         return widest
     if excess(MIN_CONE_GAP) <= 0:

@@ -78,7 +78,7 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
     return Drive(t, integrate(twists[:-1], 1.0 / settings.rate), twists)
 
 
-def integrate(twists: FloatArray, dt: float) -> FloatArray:
+def integrate(twists: FloatArray, dt: float | FloatArray) -> FloatArray:
     """Integrate body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from 0 by SE(2)'s exp."""
     theta = np.concatenate([[0.0], np.cumsum(twists[:, 2] * dt)])
     a, b = _exponential(twists[:, 2] * dt)

@@ -15,7 +15,7 @@ MOST_FILES = 15
 EXTRAS = {"distributed", "rerun", "rosbags"}
 """Optional packages, which are imported only where they are needed."""
 
-LATE = {"commands.online": {"eval.view.recording"}, "factors.kernels": {"factors._kernels"}}
+LATE = {"commands.estimate": {"eval.view.recording"}, "factors.kernels": {"factors._kernels"}}
 LATE["io.brief"] = {"eval.figures.map_plot", "frames"}
 """Modules that are imported by name when needed: matplotlib is slow, and kernels may not be built."""
 ASKED = {"io.brief"}
@@ -61,7 +61,7 @@ ARROWS: dict[str, set[str]] = {
     "eval": BELOW_EVAL | {"eval.metrics", "eval.experiment", "eval.benchmark"},
     "eval.view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
     "commands": BELOW_EVAL
-    | {"convert"}
+    | {"convert", "frames"}
     | {"eval"}
     | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark", "view")},
     "frames": {"io"},
@@ -158,7 +158,7 @@ ASSIGNED = {
     "batch.mapper": {"system.settings", "system.chain"},
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
-    "commands.online": {"column.justify"},  # of rich
+    "commands.estimate": {"column.justify"},  # of rich
     "eval.view.animation": {"self.writer.fig"},  # of matplotlib
     "front_end.motion": {"self._rest.sigma"},
     "front_end.sides": {"near.judged"},

@@ -15,9 +15,8 @@ from threadpoolctl import threadpool_info
 
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
-from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.labels import LEFT
-from pathspace_graph.run import CycleResult, ObservedCycle, outline, run_online, split_odometry
+from pathspace_graph.run import CycleResult, ObservedCycle, run_online, split_odometry
 
 
 def detections(t: float) -> Detections:
@@ -238,7 +237,10 @@ def test_an_outline_is_preferred_to_a_map() -> None:
         def outline(self) -> Map:
             return Map(True, {})
 
-    assert outline(Outlining()).closed and not outline(Counting()).closed
+    log, closed = make_log(np.array([0.0]), np.array([0.1])), []
+    for estimator in (Outlining(), Counting()):
+        run_online(log, estimator, observers=[lambda cycle: closed.append(cycle.outline.closed)])
+    assert closed == [True, False]
 
 
 def test_blas_has_one_thread_while_it_runs() -> None:
@@ -256,18 +258,3 @@ class Forbidden:
 def test_the_truth_is_not_read() -> None:
     log = replace(make_log(np.array([0.0]), np.arange(5) / 10), truth=Forbidden())
     assert len(run_online(log, Counting()).cycles) == 5
-
-
-def test_a_record_and_an_outline_are_shown_by_their_own_names() -> None:
-    """`on_cycle` and `observer` are the simple forms of an observer."""
-    log = make_log(np.arange(0.0, 1.0, 0.1), np.arange(0.2, 1.0, 0.2))
-    records: list[CycleRecord] = []
-    outlines: list[tuple[float, Map]] = []
-    result = run_online(
-        log,
-        Counting(),
-        on_cycle=records.append,
-        observer=lambda cycle, outline: outlines.append((cycle.t, outline)),
-    )
-    assert tuple(records) == result.cycles
-    assert [t for t, _ in outlines] == [cycle.t for cycle in log.cycles]

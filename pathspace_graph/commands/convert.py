@@ -2,9 +2,8 @@
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from math import inf
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -12,13 +11,13 @@ from tyro.conf import Positional, arg
 from pathspace_graph.console import note, progress, say
 from pathspace_graph.convert.bag import BagOptions, read_bag
 from pathspace_graph.convert.recording import Recording, to_log, windowed
-from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Side, Window
-from pathspace_graph.convert.text_files import Columns, Units, read_csv, read_json_lines
+from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Window
+from pathspace_graph.convert.text_files import read_csv, read_json_lines
 from pathspace_graph.convert.victoria_park import read_victoria_park
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.io.files import check_target
-from pathspace_graph.io.log import LOG_FILE, Log, write_log
+from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, write_log
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import measured_line
@@ -26,20 +25,20 @@ from pathspace_graph.plausibility.hint import because
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.scale import scale_of
 
-from .online import tell
+from .estimate import tell
 from .simulate import describe
 
 Kind = Literal["bag", "csv", "jsonl", "victoria-park"]
-ODOMETRY_FILE: Final = "odometry.csv"
 SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}
 """Endings of records in a folder of several."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convert:
-    """Write a ROS bag, CSV files, JSON lines or a known data set as a log, in order of time and in the
-    vehicle frame, and say what was left out, and why. A folder of several records becomes a folder of
-    logs."""
+    """Write a ROS bag, CSV files, JSON lines or a known data set as a log, and say what was left out.
+
+    A log is in order of time and in the vehicle frame. A folder of several records becomes a folder of logs.
+    """
 
     source: Positional[Path | None] = None
     """Bag (a file, or a folder with metadata.yaml), folder of CSV files, file of JSON lines, or a folder of
@@ -48,20 +47,8 @@ class Convert:
     """Folder of the log; an earlier log there is kept as a numbered backup."""
     kind: Annotated[Kind, arg(name="from")] = "bag"
     """Kind of the record."""
-    odometry: str | None = None
-    """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives
-    the yaw rate), or with a pose. For CSV a file in the folder, by default odometry.csv."""
-    detections: str | None = None
-    """Topic of the detections in a bag: a point cloud with a field for the label, an array of markers (blue
-    is left, yellow is right), or any message with lists of cones. For CSV a file in the folder, by default
-    detections.csv."""
-    imu: str | None = None
-    """Topic of the yaw rate, sensor_msgs/Imu, whose z axis points up."""
-    wheelbase: float | None = None
-    """Wheelbase (m), by which speed and steering angle give the yaw rate."""
-    definition: tuple[str, ...] = ()
-    """Files of messages that the bag does not define itself, as PACKAGE/msg/NAME=FILE or as a path that ends
-    in PACKAGE/msg/NAME.msg."""
+    topics: Annotated[BagOptions, arg(name="")] = field(default_factory=BagOptions)
+    """Messages of a bag."""
     label_field: str | None = None
     """Field of the label of a detection in a bag; `none` means that there are no labels."""
     labels: tuple[str, ...] = ()
@@ -74,26 +61,10 @@ class Convert:
     units: tuple[str, ...] = ()
     """Units of the CSV files: length=mm angle=deg time=ns, also speed=km/h and yaw_rate=deg/s, which
     otherwise follow length and angle. Without them it is m, rad and s."""
-    mounting: tuple[float, float, float] | None = None
-    """Pose X Y YAW (m, m, rad) of the sensor in the vehicle frame: x forward, y left, yaw counterclockwise.
-    Without it that of a bag's /tf_static is used, where there is one."""
-    y: Side = "left"
-    """Side to which the y axis of the record points. With `right`, angles are positive clockwise, so that y,
-    vy, wz and bearings change their sign."""
-    y_odometry: Side | None = None
-    """Side to which the y axis of the odometry points, where it is another one than `y`."""
-    from_poses: bool = False
-    """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
-    received: bool = False
-    """Take the times at which messages were received as stamps, also where they have one of their own."""
-    range_max: float | None = None
-    """Largest distance from the sensor of a detection that counts (m)."""
-    time_offset: float = 0.0
-    """Time (s) that is added to the stamps of the detections: negative where they are too late."""
-    start: float = 0.0
-    """Time after the first odometry at which the log begins (s)."""
-    end: float = inf
-    """Time after the first odometry at which the log ends (s)."""
+    frames: Annotated[Frames, arg(name="")] = field(default_factory=Frames)
+    """Frames of the record."""
+    window: Annotated[Window, arg(name="")] = field(default_factory=Window)
+    """Part of the record that counts."""
     noise: Annotated[NoiseSettings, arg(name="")] = field(default_factory=NoiseSettings)
     """Noise that the record does not state."""
 
@@ -118,7 +89,7 @@ class Convert:
         if folder is None or not folder.is_dir() or (folder / "metadata.yaml").exists():
             return []
         if self.kind == "csv":
-            file = self.odometry or ODOMETRY_FILE
+            file = self.topics.odometry or ODOMETRY_FILE
             return [] if (folder / file).exists() else sorted(one.parent for one in folder.glob(f"*/{file}"))
         known = [one for one in folder.iterdir() if one.suffix in SUFFIXES.get(self.kind, ())]
         bags = [one.parent for one in folder.glob("*/metadata.yaml")] if self.kind == "bag" else []
@@ -126,13 +97,11 @@ class Convert:
 
     def _convert(self, source: Path | None, out: Path) -> None:
         check_target(out, LOG_FILE)
-        frames = Frames(self.mounting, self.y_odometry or self.y, self.y)
-        rule = LabelRule(self.labels)
-        window = Window(self.range_max, self.time_offset, self.start, self.end)
+        rule = LabelRule(self.labels, self.label_field)
         with progress("converting"):
-            record = windowed(self._read(source, rule), window)
+            record = windowed(self._read(source, rule), self.window)
             file = source or Path(self.kind)
-            log = with_measured_noise(to_log(record, frames, self.noise, file))
+            log = with_measured_noise(to_log(record, self.frames, self.noise, file))
             write_checked(log, out, file)
         report(record.notes, rule, log, out)
         tell(hints(log))
@@ -146,15 +115,9 @@ class Convert:
         if self.kind == "jsonl":
             return read_json_lines(source, rule)
         if self.kind == "csv":
-            odometry, detections = self.odometry or ODOMETRY_FILE, self.detections or "detections.csv"
-            columns, units = Columns(self.columns), Units(self.units)
-            return read_csv(source / odometry, source / detections, columns, units, rule)
-        return read_bag(source, self._bag_options(), rule)
-
-    def _bag_options(self) -> BagOptions:
-        names = ("odometry", "detections", "imu", "wheelbase", "label_field", "from_poses", "received")
-        same: dict[str, Any] = {name: getattr(self, name) for name in names}
-        return BagOptions(definitions=self.definition, mounted=self.mounting is not None, **same)
+            files = self.topics.odometry or ODOMETRY_FILE, self.topics.detections or DETECTIONS_FILE
+            return read_csv(source / files[0], source / files[1], rule, self.columns, self.units)
+        return read_bag(source, self.topics, rule, mounted=self.frames.mounting is not None)
 
 
 def with_measured_noise(log: Log) -> Log:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import redirect_stderr
 from dataclasses import MISSING as NO_DEFAULT
-from dataclasses import Field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import wrap
@@ -18,8 +18,9 @@ import docstring_parser
 import tyro
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.overrides import check_gone, leaves, read_settings
+from pathspace_graph.io.overrides import leaves, read_settings
 from pathspace_graph.io.parsing import MAX_INTEGER, shown
+from pathspace_graph.settings.checked import check_gone
 from pathspace_graph.settings.mapper import MapperSettings
 
 HELP: Final = ("-h", "--help")
@@ -39,8 +40,7 @@ ESSENTIAL: Final = (
     *("calibration.latency", "calibration.range_scale", "calibration.range_bias"),
 )
 """Settings of the estimators that `--help` explains; the others are in `--help-all`."""
-COLUMN: Final = 38
-"""Column of the short help in which the texts begin."""
+COLUMN: Final = 38  # column of the short help in which the texts begin
 MOST_COLUMNS: Final = 120
 REQUIRED: Final = " (required)"
 
@@ -65,7 +65,6 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
         _set_help(command)
         arguments = ["--help"]
     default, arguments = _start(command, arguments)
-    _check_options(command, arguments)
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
@@ -94,6 +93,8 @@ def _start(command: type[Any], arguments: list[str]) -> tuple[Any, list[str]]:
     if not _estimates(command):
         start = getattr(command, "start", None)
         return start(arguments) if start else None, arguments
+    for option in (word.partition("=")[0] for word in arguments if word.startswith("--")):
+        check_gone(option.removeprefix("--").replace("-", "_"), option)
     words = [part for word in arguments for part in word.split("=", word.startswith(f"{SETTINGS}="))]
     if SETTINGS not in words:
         return None, arguments
@@ -101,23 +102,8 @@ def _start(command: type[Any], arguments: list[str]) -> tuple[Any, list[str]]:
     before, given, after = words[:at], words[at + 1 : at + 2], words[at + 2 :]
     if not given or given[0].startswith("--") or SETTINGS in after:
         raise SettingsError(f"{SETTINGS}: expected one file, found {'two' if SETTINGS in after else 'none'}")
-    required = {entry.name: tyro.MISSING for entry in fields(command) if _is_required(entry)}
-    settings = read_settings(Path(given[0]), MapperSettings())
-    return command(**required, settings=settings), before + after
-
-
-def _is_required(entry: Field[Any]) -> bool:
-    return entry.default is NO_DEFAULT and entry.default_factory is NO_DEFAULT
-
-
-def _check_options(command: type[Any], arguments: list[str]) -> None:
-    """Raise a SettingsError for an option of the estimators that is gone."""
-    known = leaves(MapperSettings())
-    for word in arguments if _estimates(command) else ():
-        option = word.partition("=")[0]
-        name = option.removeprefix("--").replace("-", "_")
-        if option.startswith("--") and name not in known:
-            check_gone(name, option)
+    required = {option.name: tyro.MISSING for option in _options(command) if option.default is NO_DEFAULT}
+    return command(**required, settings=read_settings(Path(given[0]), MapperSettings())), before + after
 
 
 # --- completion ------------------------------------------------------------------------------------------
@@ -152,10 +138,8 @@ def completion(program: str, commands: Mapping[str, type[Any]], common: Iterable
 class Option(NamedTuple):
     """An option of a command, as tyro makes it of a field."""
 
-    name: str
-    """Dotted name, or that of a place."""
-    group: tuple[str, str]
-    """Name and text of the group that it is in; two empty ones for an option of the command itself."""
+    name: str  # dotted, or that of a place
+    group: tuple[str, str]  # name and text of the group; two empty ones for an option of the command itself
     text: str
     hint: Any
     default: Any

@@ -13,6 +13,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.figures.isolated import FIGURES, MARKER, write_figures
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import check_plot_file, save_plot
+from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
@@ -21,7 +22,6 @@ from pathspace_graph.io.results import (
     CYCLES_FILE,
     SMOOTHED_FILE,
     TRAJECTORY_FILE,
-    read_health,
     read_trajectory,
 )
 
@@ -50,8 +50,8 @@ class Plot:
         log = None if self.log is None else read_log(self.log)
         files = (self.map / name for name in (TRAJECTORY_FILE, SMOOTHED_FILE))
         trajectory, smoothed = (read_trajectory(file)[1] if file.exists() else None for file in files)
-        cycles = self.map / CYCLES_FILE
-        health = read_health(cycles) if cycles.exists() else []
+        cycles = read_cycles(self.map) if (self.map / CYCLES_FILE).exists() else {}
+        health = [*cycles.get("health", [])]
         look: dict[str, Any] = {"health": health, "band_scale": self.band_scale, "title": self.title}
         save_plot(plot_map(track, log=log, trajectory=trajectory, smoothed=smoothed, **look), self.out)
 

@@ -25,10 +25,8 @@ from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figure
 from pathspace_graph.io.files import check_target, write_json, write_manifest, write_text
 from pathspace_graph.settings.mapper import MapperSettings
 
-FIGURES: Final = Path("docs") / FILE
-"""File of the figures, from the root of the project."""
-CELLS_FAILED: Final = 3
-"""Exit code of a study that is written, but some of whose cells failed."""
+FIGURES: Final = Path("docs") / FILE  # file of the figures, from the root of the project
+CELLS_FAILED: Final = 3  # exit code of a study that is written, but some of whose cells failed
 
 
 @dataclass(frozen=True, kw_only=True)

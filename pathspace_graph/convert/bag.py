@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,20 +33,29 @@ LATE: Final = 0.1  # median time (s) of receipt after or before the stamps that 
 
 @dataclass(frozen=True)
 class BagOptions:
-    odometry: str | None  # topic of the odometry
-    detections: str | None  # topic of the detections
-    imu: str | None = None  # topic of the yaw rate, where it is not that of the odometry
-    wheelbase: float | None = None  # wheelbase (m), by which a steering angle gives the yaw rate
-    definitions: Sequence[str] = ()
-    """Files of message definitions, each as `TYPE=FILE` or as a path that ends in `PACKAGE/msg/NAME.msg`."""
-    label_field: str | None = None  # field of the label of a detection; None takes the first that is known
-    from_poses: bool = False  # make the twists from poses, also where the messages have twists
-    received: bool = False  # take the times of receipt as stamps, also where messages have one of their own
-    mounted: bool = False  # the pose of the sensor was stated, so that frames of other names are no surprise
+    """Which messages of a bag are taken, and how."""
+
+    odometry: str | None = None
+    """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives
+    the yaw rate), or with a pose. For CSV a file in the folder, by default odometry.csv."""
+    detections: str | None = None
+    """Topic of the detections in a bag: a point cloud with a field for the label, an array of markers (blue
+    is left, yellow is right), or any message with lists of cones. For CSV a file in the folder, by default
+    detections.csv."""
+    imu: str | None = None
+    """Topic of the yaw rate, sensor_msgs/Imu, whose z axis points up."""
+    wheelbase: float | None = None
+    """Wheelbase (m), by which speed and steering angle give the yaw rate."""
+    definition: tuple[str, ...] = ()
+    """Files of messages that the bag does not define itself, as PACKAGE/msg/NAME=FILE or as a path that ends
+    in PACKAGE/msg/NAME.msg."""
+    from_poses: bool = False
+    """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
+    received: bool = False
+    """Take the times at which messages were received as stamps, also where they have one of their own."""
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
+class Samples(NamedTuple):
     """What was taken of the messages of one topic, in the order of the bag."""
 
     name: str  # topic and type of the messages
@@ -54,8 +63,7 @@ class Samples:
     values: list[Any]  # what was taken of each message
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
+class Motion(NamedTuple):
     """What a message says of the vehicle's motion."""
 
     twist: Array | None  # (3,) twist in m/s, m/s and rad/s, NaN where it is not known
@@ -64,8 +72,11 @@ class Motion:
     body: str  # frame of the twist
 
 
-def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
-    """Return what the topics of a bag have of a drive; an InputError lists the topics that are there."""
+def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool = False) -> Recording:
+    """Return what the topics of a bag have of a drive; an InputError lists the topics that are there.
+
+    Where the sensor's pose was stated (`mounted`), frames of other names are no surprise.
+    """
     notes: Counter[str] = Counter()
 
     def motion(message: Any) -> Motion:
@@ -73,15 +84,15 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule) -> Recording:
         return Motion(twist, pose_of(message), frame_of(message), frame_of(message, "child_frame_id"))
 
     def points(message: Any) -> tuple[str, Points]:
-        return frame_of(message), points_of(message, rule, options.label_field)
+        return frame_of(message), points_of(message, rule)
 
     with opened(path, options, notes) as bag:
         odometry = bag.samples(options.odometry, "--odometry", motion)
         imu = bag.samples(options.imu, "--imu", yaw_rate_of) if options.imu else None
         detections = bag.samples(options.detections, "--detections", points)
-        static = [] if options.mounted else bag.transforms()
+        static = [] if mounted else bag.transforms()
     t, twists = _twists(odometry, imu, options, notes, path)
-    mounting = None if options.mounted else _mounting(odometry, detections, static, notes, path)
+    mounting = None if mounted else _mounting(odometry, detections, static, notes, path)
     source = {"bag": path.name, "odometry": odometry.name, "detections": detections.name}
     if imu is not None:
         source["imu"] = imu.name
@@ -197,7 +208,7 @@ def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Ba
     if not path.exists():
         raise InputError(path, "expected a bag, found none")
     rosbag1, rosbag2, _ = _rosbags()
-    definitions = _given_definitions(options.definitions)
+    definitions = _given_definitions(options.definition)
     try:
         reader = (rosbag1 if is_ros1(path) else rosbag2).Reader(path)
         reader.open()
@@ -221,32 +232,18 @@ class Bag:
     notes: Counter[str]
 
     def samples(self, topic: str | None, option: str, take: Callable[[Any], Any]) -> Samples:
-        """Return what to `take` of the messages of a topic; a message may be large, and is not kept."""
+        """Return what to `take` of the messages of a topic; a message may be large, and is not kept.
+
+        They have header stamps where most have one, else the times of receipt: the clocks may differ.
+        """
         connections = self._connections(topic)
         if not connections:
             found = "found none" if topic is None else f"found {topic}"
             raise self._error(f"{option}: expected a topic of the bag, {found}")
+        name = f"{topic} ({connections[0].msgtype})"
         received, stamps, values = self._read(connections, take, option)
         if not values:
             raise self._error(f"{option}: expected messages of {topic}, found none")
-        return self._stamped(f"{topic} ({connections[0].msgtype})", stamps, received, values)
-
-    def transforms(self) -> list[Any]:
-        """Return the `TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
-        connections = self._connections(STATIC)
-        if not connections:
-            return []
-        _, _, messages = self._read(connections, lambda message: list(message.transforms), "transforms")
-        return [one for message in messages for one in message]
-
-    def _stamped(
-        self, name: str, stamps: list[float | None], received: list[float], values: list[Any]
-    ) -> Samples:
-        """Return samples with header stamps where most have one, else with the times of receipt.
-
-        Both are not mixed, since they may be of different clocks.
-        """
-        topic = name.split(maxsplit=1)[0]
         stamped = [] if self.received else [k for k, stamp in enumerate(stamps) if stamp is not None]
         if 2 * len(stamped) <= len(stamps):
             self.notes[f"messages of {topic} have the time at which they were received"] += len(values)
@@ -258,6 +255,14 @@ class Bag:
             told = f"messages of {topic} were received {late:.3g} s after their stamps, in the median"
             self.notes[f"{told} (--received takes the times of receipt)"] += len(stamped)
         return Samples(name, t, [values[k] for k in stamped])
+
+    def transforms(self) -> list[Any]:
+        """Return the `TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
+        connections = self._connections(STATIC)
+        if not connections:
+            return []
+        _, _, messages = self._read(connections, lambda message: list(message.transforms), "transforms")
+        return [one for message in messages for one in message]
 
     def _connections(self, topic: str | None) -> list[Any]:
         return [entry for entry in self.reader.connections if entry.topic == topic]
@@ -278,9 +283,7 @@ class Bag:
         """Return the times of receipt, the stamps and what was taken of all messages of a topic."""
         store, kind = self._store(connections[0]), connections[0].msgtype
         decode = store.deserialize_ros1 if is_ros1(self.path) else store.deserialize_cdr
-        received: list[float] = []
-        stamps: list[float | None] = []
-        values: list[Any] = []
+        received, stamps, values = list[float](), list[float | None](), list[Any]()
         try:
             for _, time, data in self.reader.messages(connections):
                 message = decode(data, kind)

@@ -1,9 +1,9 @@
 """ROS messages as arrays by their fields, so that those of `rosbags` and of `rclpy` are read alike."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from numbers import Real
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +13,13 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.log import covariances_of
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
-from .settings import LabelRule
+from .settings import LABEL_FIELDS, NO_LABEL, LabelRule
 
 LIST_NAMES: Final = {
     **{"big_orange": BIG_ORANGE, "orange": ORANGE},
     **{"blue": LEFT, "left": LEFT, "yellow": RIGHT, "right": RIGHT},
 }
 """Labels of the cones in a list with such a word in its name."""
-LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
-"""Fields that may hold the label of a detection, the first one that is there."""
-NO_LABEL: Final = "none"  # name of a label field that says there are no labels
 CLOUD_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # by `datatype`
 POINT_MARKERS: Final = (1, 2, 3, 10)  # types of markers that are one point: cube, sphere, cylinder, mesh
 LIST_MARKERS: Final = (6, 7, 8)  # types of markers that are lists of points: cubes, spheres, points
@@ -36,8 +33,7 @@ class MessageError(PathspaceError):
     """A message is not of a kind that can be read; the text says what was expected and what was found."""
 
 
-@dataclass(frozen=True, eq=False)
-class Points:
+class Points(NamedTuple):
     """Detected points of one message, in the frame of its sensor."""
 
     points: Array  # (m, 2) points in m
@@ -120,18 +116,18 @@ def yaw_of(quaternion: Any) -> float:
     return float(np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
 
 
-def points_of(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:
+def points_of(message: Any, rule: LabelRule) -> Points:
     """Return the points of a cloud, an array of markers, or a message with lists of cones or numbers."""
     if hasattr(message, "point_step"):
-        return cloud_points(message, rule, label_field)
+        return cloud_points(message, rule)
     if hasattr(message, "x") and hasattr(message, "y"):
-        return array_points(message, rule, label_field)
+        return array_points(message, rule)
     if hasattr(message, "markers"):
         return marker_points(message, rule)
-    return cone_points(message, rule, label_field)
+    return cone_points(message, rule)
 
 
-def cloud_points(cloud: Any, rule: LabelRule, label_field: str | None = None) -> Points:
+def cloud_points(cloud: Any, rule: LabelRule) -> Points:
     """Return the points of a `PointCloud2` by its fields `x`, `y`, the label and, if any, xx, xy, yy."""
     columns = _cloud_columns(cloud)
     points = np.column_stack([columns["x"], columns["y"]]).astype(float)
@@ -139,11 +135,10 @@ def cloud_points(cloud: Any, rule: LabelRule, label_field: str | None = None) ->
     if {"xx", "xy", "yy"} <= columns.keys():
         covariances = covariances_of(*(columns[entry].astype(float) for entry in ("xx", "xy", "yy")))
     labels = np.full(len(points), UNKNOWN)
-    if label_field != NO_LABEL:
-        asked = (label_field,) if label_field else LABEL_FIELDS
-        name = next((name for name in asked if name in columns), None)
+    if rule.fields != (NO_LABEL,):
+        name = next((name for name in rule.fields if name in columns), None)
         if name is None:
-            wanted = f"'{label_field}'" if label_field else f"one of {', '.join(LABEL_FIELDS)}"
+            wanted = f"one of {', '.join(rule.fields)}" if len(rule.fields) > 1 else f"'{rule.fields[0]}'"
             found = f"found {', '.join(columns)} (--label-field names it, `{NO_LABEL}` does without)"
             raise MessageError(f"expected a point cloud with labels in the field {wanted}, {found}")
         labels = rule.of_all(columns[name])
@@ -173,10 +168,9 @@ def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
     return {name: points[name] for name in known}
 
 
-def array_points(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:
+def array_points(message: Any, rule: LabelRule) -> Points:
     """Return the points of a message with an array for each of `x`, `y` and, if it has one, the label."""
-    asked = (label_field,) if label_field else LABEL_FIELDS
-    names = ["x", "y", *[name for name in asked if hasattr(message, name)][:1]]
+    names = ["x", "y", *[name for name in rule.fields if hasattr(message, name)][:1]]
     x, y, *values = (np.atleast_1d(getattr(message, name)) for name in names)
     lengths = [len(x), len(y), *map(len, values)]
     if len(set(lengths)) > 1:
@@ -211,7 +205,7 @@ def _of_marker(marker: Any, rule: LabelRule) -> Iterator[tuple[float, float, int
         yield place.x + c * point.x - s * point.y, place.y + s * point.x + c * point.y, rule.of(colour)
 
 
-def cone_points(message: Any, rule: LabelRule, label_field: str | None = None) -> Points:
+def cone_points(message: Any, rule: LabelRule) -> Points:
     """Return the cones in all lists of a message, as in `ConeArrayWithCovariance` and `Detection3DArray`.
 
     A list whose name has a word of `LIST_NAMES` in it gives all its cones that label. In other lists a cone
@@ -224,7 +218,7 @@ def cone_points(message: Any, rule: LabelRule, label_field: str | None = None) -
     cones = [(name, cone) for name, listed in lists.items() for cone in listed]
     points = np.array([_position(cone) for _, cone in cones], dtype=float).reshape(-1, 2)
     covariances = np.array([_covariance(cone) for _, cone in cones], dtype=float).reshape(-1, 2, 2)
-    labels = [_cone_label(name, cone, rule, label_field) for name, cone in cones]
+    labels = [_cone_label(name, cone, rule) for name, cone in cones]
     return Points(points, covariances, np.array(labels, dtype=int))
 
 
@@ -258,11 +252,11 @@ def _covariance(cone: Any) -> Array:
     return np.full((2, 2), np.nan) if side is None else entries.reshape(side, side)[:2, :2]
 
 
-def _cone_label(name: str, cone: Any, rule: LabelRule, label_field: str | None) -> int:
+def _cone_label(name: str, cone: Any, rule: LabelRule) -> int:
     for word, label in LIST_NAMES.items():
         if word in name.lower():
             return label
-    value = _label_value(cone, (label_field,) if label_field else LABEL_FIELDS)
+    value = _label_value(cone, rule.fields)
     return UNKNOWN if value is None else rule.of(value)
 
 

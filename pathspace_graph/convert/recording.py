@@ -16,7 +16,7 @@ from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
-from pathspace_graph.io.log import Detections, Log, Odometry, Truth, covariances_of
+from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .messages import Points, points_of, stamp_of, twist_of
@@ -27,9 +27,7 @@ ASSUMED: Final = "detections had no covariance that can be used, and were given 
 """Note of covariances that the record does not have."""
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
 SHARED_STAMP: Final = "messages with detections have the stamp of another one, and are one cycle with it"
-MIN_RANGE_OF_BEARING: Final = (
-    1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at the sensor
-)
+MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +89,7 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
 
     A record without a usable twist, or without a detection in its time, is an InputError of the `file`.
     """
-    if frames.mounting is None and record.mounting is not None:
-        frames = replace(frames, mounting=record.mounting)
+    frames = replace(frames, mounting=frames.mounting or record.mounting)
     odometry = _odometry(record, frames, file)
     cycles = _cycles(record, odometry, frames, noise, file)
     stated = SIGMA_ODOMETRY if record.odometry_sigma is None else record.odometry_sigma
@@ -162,27 +159,25 @@ def _cycles(
         notes[SHARED_STAMP] += bool(scans)
         scans.append(points)
     if not found and notes[OUTSIDE]:
-        expected = (
-            f"expected detections in the time of the odometry, {begin:.9g} s to {end - logs.MAX_HOLD:.9g} s"
+        span = f"{begin:.9g} s to {end - logs.MAX_HOLD:.9g} s"
+        stamps = f"from {t.min():.9g} s to {t.max():.9g} s: do both have the same clock?"
+        raise InputError(
+            file, f"expected detections in the time of the odometry, {span}, found them {stamps}"
         )
-        stamps = f"from {t.min():.9g} s to {t.max():.9g} s"
-        raise InputError(file, f"{expected}, found them {stamps}: do both have the same clock?")
     if not found:
         raise InputError(file, f"expected detections that can be used, found {len(t)} messages without any")
     return tuple(in_vehicle_frame(stamp, join(scans), frames, noise, notes) for stamp, scans in found.items())
 
 
 def join(scans: list[Points]) -> Points:
-    parts = zip(*((scan.points, scan.covariances, scan.labels) for scan in scans), strict=True)
-    return scans[0] if len(scans) == 1 else Points(*map(np.concatenate, parts))
+    return scans[0] if len(scans) == 1 else Points(*map(np.concatenate, zip(*scans, strict=True)))
 
 
 def usable(points: Points, notes: Counter[str]) -> Points:
-    finite = np.asarray(np.isfinite(points.points).all(axis=1))
-    inside = ~finite | (np.abs(points.points) <= MAX_RANGE).all(axis=1)
+    finite = np.isfinite(points.points).all(axis=1)
+    good = np.asarray((np.abs(points.points) <= MAX_RANGE).all(axis=1))
     notes["detections that are not finite were left out"] += int((~finite).sum())
-    notes[f"detections farther than {MAX_RANGE:g} m were left out"] += int((~inside).sum())
-    good = finite & inside
+    notes[f"detections farther than {MAX_RANGE:g} m were left out"] += int((finite & ~good).sum())
     return points.where(good)
 
 
@@ -194,10 +189,8 @@ def in_vehicle_frame(
     A point `q` with covariance `K` is at `R(yaw) q + (x, y)` with `R K R^T`. Where a covariance is missing or
     not positive definite, it is made from range and bearing at the sensor.
     """
-    points, covariances = found.points, found.covariances
-    if frames.y_detections == "right":
-        points = points * [1.0, -1.0]
-        covariances = covariances * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    side = np.array([1.0, 1.0 if frames.y == "left" else -1.0])
+    points, covariances = found.points * side, found.covariances * np.outer(side, side)
     known = positive_definite(covariances) & (not noise.replace_covariances)
     notes[ASSUMED] += int((~known).sum())
     covariances = np.where(known[:, None, None], covariances, default_covariances(points, noise))
@@ -228,10 +221,7 @@ def default_covariances(points: Array, noise: NoiseSettings) -> Array:
     begin, growth, bearing = noise.sigmas
     along = (begin + growth * ranges) ** 2
     across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * bearing) ** 2
-    c, s = np.cos(bearings), np.sin(bearings)
-    xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
-    xy = c * s * (along - across)
-    return covariances_of(xx, xy, yy)
+    return logs.polar_covariances(bearings, along, across)
 
 
 MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle, the newest ones
@@ -246,15 +236,8 @@ class MessageStream:
     without a stamp has the time at which it was received.
     """
 
-    def __init__(
-        self,
-        frames: Frames | None = None,
-        noise: NoiseSettings | None = None,
-        rule: LabelRule | None = None,
-        label_field: str | None = None,
-    ) -> None:
-        self.frames, self.noise = frames or Frames(), noise or NoiseSettings()
-        self.rule, self.label_field = rule or LabelRule(), label_field
+    def __init__(self, frames: Frames | None = None) -> None:
+        self.frames, self.noise, self.rule = frames or Frames(), NoiseSettings(), LabelRule()
         self.refused: Counter[str] = Counter()  # number of messages for each reason
         self._twists: deque[tuple[float, list[float]]] = deque(maxlen=MAX_BUFFERED)
         self._first = np.inf  # the stamp (s) of the first twist
@@ -280,7 +263,7 @@ class MessageStream:
         A late cycle comes without twists. They are kept until the caller says by `use` that it was taken.
         """
         try:
-            points = usable(points_of(message, self.rule, self.label_field), self.refused)
+            points = usable(points_of(message, self.rule), self.refused)
             t = stamp_of(message) or received
             if not self._first <= t < np.inf:
                 raise ValueError("detections: expected a stamp not before that of the first odometry")

@@ -15,6 +15,9 @@ from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
 
 Side = Literal["left", "right"]  # side of the x axis to which the y axis points
+LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
+"""Fields of a message that may hold the label of a detection, the first one that is there."""
+NO_LABEL: Final = "none"  # name of a label field that says there are no labels
 DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
 SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
 SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)  # (m, m/m, rad) where nothing is known
@@ -78,12 +81,13 @@ class Frames:
     """Frames in which odometry and detections were recorded."""
 
     mounting: tuple[float, float, float] | None = None
-    """Pose [x, y, yaw] (m, m, rad) of the sensor in the vehicle frame, x forward and y to the left. None
-    takes that of the record, or else the vehicle frame itself."""
-    y_odometry: Side = "left"
-    """Side to which the y axis of the odometry points. With the right one, angles are positive clockwise."""
-    y_detections: Side = "left"
-    """Side to which the y axis of the detections points, before they are moved to the vehicle frame."""
+    """Pose X Y YAW (m, m, rad) of the sensor in the vehicle frame: x forward, y left, yaw counterclockwise.
+    Without it that of a bag's /tf_static is used, where there is one."""
+    y: Side = "left"
+    """Side to which the y axis of the record points. With `right`, angles are positive clockwise, so that y,
+    vy, wz and bearings change their sign."""
+    y_odometry: Side | None = None
+    """Side to which the y axis of the odometry points, where it is another one than `y`."""
 
     def __post_init__(self) -> None:
         if self.mounting is None:
@@ -95,7 +99,7 @@ class Frames:
     @property
     def flip(self) -> NDArray[np.float64]:
         """Return by what a twist [vx, vy, wz] (3,) is multiplied, so that its y axis points to the left."""
-        return np.array([1.0, 1.0, 1.0] if self.y_odometry == "left" else [1.0, -1.0, -1.0])
+        return np.array([1.0, 1.0, 1.0] if (self.y_odometry or self.y) == "left" else [1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,7 @@ class Window:
     range_max: float | None = None
     """Largest distance from the sensor of a detection that counts (m)."""
     time_offset: float = 0.0
-    """Time (s) that is added to the stamps of the detections."""
+    """Time (s) that is added to the stamps of the detections: negative where they are too late."""
     start: float = 0.0
     """Time after the first odometry at which the log begins (s)."""
     end: float = inf
@@ -125,10 +129,12 @@ class LabelRule:
     """The labels of numbers, words and colours, and a count of the values that were met.
 
     `left=0 right=1 right=7` gives labels to values. Any other word is read by its parts: `blue_cone`,
-    `yellow-cone`, `b`, `large_orange_cone`. A text may stand in the field `data` of a message.
+    `yellow-cone`, `b`, `large_orange_cone`. A text may stand in the field `data` of a message. The value
+    of a message is in its `field`, or the first of LABEL_FIELDS that it has.
     """
 
-    def __init__(self, pairs: Sequence[str] = ()) -> None:
+    def __init__(self, pairs: Sequence[str] = (), field: str | None = None) -> None:
+        self.fields = (field,) if field else LABEL_FIELDS
         self._labels: dict[str, int] = {}
         self.met: Counter[tuple[str, int]] = Counter()
         """Times that each value was met, by its text and the label it was taken for."""

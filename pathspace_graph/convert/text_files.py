@@ -45,55 +45,54 @@ MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong un
 MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong unit of time
 
 
-class Columns:
-    """Columns of the quantities, by default their own names: `vx=speed`, `y=-cone_y`, `odometry.t=stamp`."""
+def read_csv(
+    odometry: Path, detections: Path, rule: LabelRule, columns: Sequence[str] = (), units: Sequence[str] = ()
+) -> Recording:
+    """Return what two CSV files have of a drive; an InputError names file, row and column.
 
-    def __init__(self, pairs: Sequence[str] = ()) -> None:
-        self.named: dict[tuple[str, str], str] = {}  # by kind and quantity, a minus changing the sign
-        for pair in pairs:
-            key, equals, name = pair.partition("=")
-            if not equals or not name.removeprefix("-"):
-                raise SettingsError(f"--columns: expected QUANTITY=COLUMN, found '{pair}'")
-            only, _, key = key.rpartition(".")
-            known = [key for kind, keys in QUANTITIES.items() if only in ("", kind) for key in keys]
-            expected = f"expected one of {', '.join(dict.fromkeys(known))} in '{pair}'"
-            check_name(key, known, f"--columns: {expected}")
-            for kind in [only] if only else QUANTITIES:
-                self.named[kind, key] = name
-
-
-class Units:
-    """Units of the quantities: `length=mm angle=deg time=ns`; a `speed` and a `yaw_rate` follow these."""
-
-    def __init__(self, pairs: Sequence[str] = ()) -> None:
-        self.names = {"time": "s", "length": "m", "angle": "rad"}
-        for pair in pairs:
-            quantity, equals, unit = pair.partition("=")
-            check_name(quantity, UNITS, f"--units: expected one of {', '.join(UNITS)} in '{pair}'")
-            known = UNITS[quantity]
-            if not equals or unit not in known:
-                expected = f"expected {quantity}= one of {', '.join(known)}"
-                raise SettingsError(f"--units: {expected}, found '{pair}'")
-            self.names[quantity] = unit
-        length, angle = self.names["length"], self.names["angle"]
-        self.names = {"speed": f"{length}/s", "yaw_rate": f"{angle}/s", **self.names}
-
-    def __str__(self) -> str:
-        return ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(self.names.items()))
-
-
-def read_csv(odometry: Path, detections: Path, columns: Columns, units: Units, rule: LabelRule) -> Recording:
-    """Return what two CSV files have of a drive; an InputError names file, row and column."""
+    Quantities are in columns of their own names, unless `columns` says `vx=speed`, `y=-cone_y` or
+    `odometry.t=stamp`, and in SI units, unless `units` says `length=mm angle=deg time=ns`.
+    """
+    named, used = _named(columns), _units(units)
     twists, found = (
-        _File(kind, read_table(file, ()), columns, units)
+        _File(kind, read_table(file, ()), named, used)
         for kind, file in ((ODOMETRY, odometry), (DETECTIONS, detections))
     )
     t = twists.stamps()
     vx, wz = twists.numbers("vx"), twists.numbers("wz")
     vy = twists.numbers("vy") if twists.has("vy") else np.zeros(len(t))
     scan_t, scans = _scans(found, rule)
-    source = {"odometry": odometry.name, "detections": detections.name, "units": str(units)}
+    in_words = ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(used.items()))
+    source = {"odometry": odometry.name, "detections": detections.name, "units": in_words}
     return Recording(t, np.column_stack([vx, vy, wz]), scan_t, scans, source)
+
+
+def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
+    """Return columns by kind of file and quantity, with a minus where the sign changes."""
+    named: dict[tuple[str, str], str] = {}
+    for pair in pairs:
+        key, equals, name = pair.partition("=")
+        if not equals or not name.removeprefix("-"):
+            raise SettingsError(f"--columns: expected QUANTITY=COLUMN, found '{pair}'")
+        only, _, key = key.rpartition(".")
+        known = [key for kind, keys in QUANTITIES.items() if only in ("", kind) for key in keys]
+        expected = f"expected one of {', '.join(dict.fromkeys(known))} in '{pair}'"
+        check_name(key, known, f"--columns: {expected}")
+        named |= {(kind, key): name for kind in ([only] if only else QUANTITIES)}
+    return named
+
+
+def _units(pairs: Sequence[str]) -> dict[str, str]:
+    """Return the units of the quantities; those of a `speed` and a `yaw_rate` follow the others."""
+    names = {"time": "s", "length": "m", "angle": "rad"}
+    for pair in pairs:
+        quantity, equals, unit = pair.partition("=")
+        check_name(quantity, UNITS, f"--units: expected one of {', '.join(UNITS)} in '{pair}'")
+        if not equals or unit not in UNITS[quantity]:
+            expected = f"expected {quantity}= one of {', '.join(UNITS[quantity])}"
+            raise SettingsError(f"--units: {expected}, found '{pair}'")
+        names[quantity] = unit
+    return {"speed": f"{names['length']}/s", "yaw_rate": f"{names['angle']}/s", **names}
 
 
 @dataclass(frozen=True)
@@ -102,8 +101,8 @@ class _File:
 
     kind: str
     table: Table
-    columns: Columns
-    units: Units
+    named: dict[tuple[str, str], str]
+    units: dict[str, str]
 
     def __post_init__(self) -> None:
         if not len(self.table):
@@ -111,10 +110,10 @@ class _File:
 
     def has(self, key: str) -> bool:
         """Return whether the file has the column of a quantity; one that was named must be there."""
-        return (self.kind, key) in self.columns.named or key in self.table.columns
+        return (self.kind, key) in self.named or key in self.table.columns
 
     def column(self, key: str) -> str:
-        column = self.columns.named.get((self.kind, key), key).removeprefix("-")
+        column = self.named.get((self.kind, key), key).removeprefix("-")
         if column not in self.table.columns:
             expected = f"expected a column '{column}' for {key} (--columns {key}=NAME)"
             found = f"found the columns {', '.join(self.table.columns)}"
@@ -124,14 +123,14 @@ class _File:
     def numbers(self, key: str, power: int = 1) -> Array:
         """Return a column (rows,) in the SI unit, or in its square where `power` is 2."""
         quantity = QUANTITIES[self.kind][key]
-        factor = UNITS[quantity][self.units.names[quantity]] ** power
-        if self.columns.named.get((self.kind, key), "").startswith("-"):
+        factor = UNITS[quantity][self.units[quantity]] ** power
+        if self.named.get((self.kind, key), "").startswith("-"):
             factor = -factor
         return np.asarray(factor * self.table.numbers(self.column(key), LARGEST))
 
     def stamps(self) -> Array:
         """Return the stamps (rows,) in s, whose unit has to be plausible."""
-        t, unit, name = self.numbers("t"), self.units.names["time"], self.column("t")
+        t, unit, name = self.numbers("t"), self.units["time"], self.column("t")
         self.table.require(
             np.abs(t) <= MAX_STAMP,
             f"expected stamps of at most {MAX_STAMP:g} s in column '{name}', found more: is their unit not "
@@ -154,20 +153,20 @@ def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
         covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
     if file.has("label"):
         labels = rule.of_all(np.array(file.table.columns[file.column("label")]))
-    stamps, first, cycle = np.unique(t, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    groups = np.split(np.argsort(cycle, kind="stable"), np.cumsum(np.bincount(cycle))[:-1])
-    cycles = [groups[index] for index in order]
-    return stamps[order], [Points(points[own], covariances[own], labels[own]) for own in cycles]
+    cycles: dict[float, list[int]] = {}
+    for row, stamp in enumerate(t.tolist()):
+        cycles.setdefault(stamp, []).append(row)
+    scans = [Points(points[own], covariances[own], labels[own]) for own in cycles.values()]
+    return np.array([*cycles]), scans
 
 
 def _points(file: _File) -> Array:
-    if file.has("x") and (DETECTIONS, "range") not in file.columns.named:
+    if file.has("x") and (DETECTIONS, "range") not in file.named:
         return np.column_stack([file.numbers("x"), file.numbers("y")])
     if not file.has("range"):
         file.column("x")  # raises: neither x and y nor range and bearing are there
     ranges, bearings = file.numbers("range"), file.numbers("bearing")
-    name, unit = file.column("bearing"), file.units.names["angle"]
+    name, unit = file.column("bearing"), file.units["angle"]
     file.table.require(
         np.abs(bearings) <= MAX_BEARING,
         f"expected bearings of at most a whole turn in column '{name}', found more: is their unit not {unit} "

@@ -1,7 +1,6 @@
 """A map in the formats of planners and other tools: CSV, GeoJSON (RFC 7946) and Lanelet2."""
 
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import count, pairwise
@@ -10,7 +9,6 @@ from typing import Any, Final
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
@@ -21,18 +19,19 @@ from pathspace_graph.spline.centre_line import find_line
 from pathspace_graph.spline.planning import speed_profile
 
 from .files import to_plain
+from .log import COLUMNS, TRUTH_CONES_FILE
 from .map import Map, MapBoundary, PointBoundary, SplineBoundary
+from .parsing import write_table
 
-CENTRE_LINE_HEADER: Final = "# x_m,y_m,w_tr_right_m,w_tr_left_m"  # of TUM's raceline format
-PROFILE_HEADER: Final = "# s_m,x_m,y_m,psi_rad,kappa_radpm,vx_mps,ax_mps2"  # of TUM's trajectories
-POINTS_HEADER: Final = "x,y,label"  # header of a table of points, as that of a log's true cones
+CENTRE_LINE: Final = ("# x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # columns of TUM's raceline format
+PROFILE: Final = ("# s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2")  # of its trajectories
 _FEWEST_INTERVALS: Final = 4  # least number of intervals of a sampled boundary
 
 
 def write_centre_line(file: Path, track: Map, step: float) -> None:
     """Write the centre line in TUM's raceline format, `step` (m) apart; a loop ends before its start."""
     line = track.centre_line(step)
-    _write_rows(file, CENTRE_LINE_HEADER, line.points, line.width_right, line.width_left)
+    write_table(file, CENTRE_LINE, line.points, line.width_right, line.width_left)
 
 
 def write_profile(
@@ -56,17 +55,15 @@ def write_profile(
             f"expected a start speed of at most {profile.speed[0]:.3g} m/s on this line, found {start:g}"
         )
     curve = line.arc_length, line.points, line.heading, line.curvature
-    _write_rows(file, PROFILE_HEADER, *curve, profile.speed, profile.acceleration)
+    write_table(file, PROFILE, *curve, profile.speed, profile.acceleration)
 
 
 def write_points(file: Path, track: Map, step: float) -> None:
     """Write boundaries as points (m), `step` (m) apart, or as their landmarks, and orange cones."""
-    points = [
-        f"{x!r},{y!r},{NAMES[label]}"
-        for label, boundary in sorted([*track.boundaries.items(), *track.points.items()])
-        for x, y in boundary_points(boundary, step).tolist()
-    ]
-    _write_lines(file, [POINTS_HEADER, *points])
+    rows = sorted([*track.boundaries.items(), *track.points.items()])
+    points = [boundary_points(boundary, step) for _, boundary in rows]
+    labels = [NAMES[label] for (label, _), own in zip(rows, points, strict=True) for _ in own]
+    write_table(file, COLUMNS[TRUTH_CONES_FILE], np.concatenate([np.zeros((0, 2)), *points]), labels)
 
 
 def boundary_points(boundary: MapBoundary, step: float) -> Array:
@@ -79,15 +76,6 @@ def sampled(spline: BSpline, step: float) -> Array:
     length = spline.length()
     at = np.linspace(0.0, length, max(round(length / step), _FEWEST_INTERVALS) + 1)
     return spline.evaluate(spline.parameters_at(at[:-1] if spline.periodic else at))
-
-
-def _write_rows(file: Path, header: str, *columns: NDArray[Any]) -> None:
-    rows = np.column_stack(columns).tolist()
-    _write_lines(file, [header, *(",".join(map(repr, row)) for row in rows)])
-
-
-def _write_lines(file: Path, lines: Iterable[str]) -> None:
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
 # --- latitude and longitude ------------------------------------------------------------------------------
@@ -198,8 +186,8 @@ def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> Non
         properties |= {name: getattr(line, attribute) for name, attribute in _PROPERTIES}
         features.append(feature("LineString", line.points, line.closed, properties))
     origin = {"latitude_deg": plane.latitude, "longitude_deg": plane.longitude, "heading_deg": plane.heading}
-    content = {"type": "FeatureCollection", "origin": origin, "features": features}
-    _write_lines(file, [json.dumps(to_plain(content), allow_nan=False)])
+    content = to_plain({"type": "FeatureCollection", "origin": origin, "features": features})
+    file.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8", newline="\n")
 
 
 # --- Lanelet2 --------------------------------------------------------------------------------------------

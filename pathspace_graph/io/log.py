@@ -265,8 +265,7 @@ def _read_odometry(table: Table) -> Odometry:
 
 def _increasing_times(table: Table) -> Array:
     t = table.numbers("t")
-    good = np.append(True, np.diff(t) > 0) if len(t) else np.ones(0, dtype=bool)
-    table.require(good, "expected a time later than the row before")
+    table.require(np.append(True, np.diff(t) > 0)[: len(t)], "expected a time later than the row before")
     return t
 
 
@@ -302,6 +301,13 @@ def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
     return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
 
 
+def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
+    """Return `R(b) diag(along, across) R(b)^T` (m, 2, 2) of variances (m,) along rays and across them."""
+    c, s = np.cos(bearings), np.sin(bearings)
+    xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
+    return covariances_of(xx, c * s * (along - across), yy)
+
+
 def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
     """Return which covariances (m,) are positive definite, by their entries."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -315,18 +321,18 @@ def _labels(table: Table) -> IntArray:
 
 def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) -> Truth | None:
     names = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE)
-    poses, cones, associations = (
-        _table(folder, name) if (folder / name).exists() else None for name in names
-    )
-    if not errors and poses is None and cones is None and associations is None:
+    known = {name for name in names if (folder / name).exists()}
+    if not errors and not known:
         return None
-    points = np.zeros((0, 2)) if cones is None else cones.stack(("x", "y"))
+    none = {name: Table(folder / name, {column: [] for column in COLUMNS[name]}, []) for name in names}
+    poses, cones, associations = (_table(folder, name) if name in known else none[name] for name in names)
+    points, is_known = cones.stack(("x", "y")), TRUTH_ASSOCIATIONS_FILE in known
     return Truth(
-        np.zeros(0) if poses is None else _increasing_times(poses),
-        np.zeros((0, 3)) if poses is None else poses.stack(("x", "y", "theta")),
+        _increasing_times(poses),
+        poses.stack(("x", "y", "theta")),
         points,
-        np.zeros(0, dtype=int) if cones is None else _labels(cones),
-        None if associations is None else _associations(associations, detection_count, len(points)),
+        _labels(cones),
+        _associations(associations, detection_count, len(points)) if is_known else None,
         **errors,
     )
 
@@ -362,7 +368,7 @@ def _columns(log: Log) -> dict[str, tuple[Any, ...]]:
     columns: dict[str, tuple[Any, ...]] = {
         ODOMETRY_FILE: (log.odometry.t, log.odometry.twist),
         DETECTIONS_FILE: (
-            [float(cycle.t) for cycle in cycles for _ in cycle.labels],
+            [cycle.t for cycle in cycles for _ in cycle.labels],
             np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in cycles)]),
             [NAMES[label] for cycle in cycles for label in cycle.labels],
             covariances[:, [0, 0, 1], [0, 1, 1]],

@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, POINTS, RIGHT
+from pathspace_graph.labels import BOUNDARIES, LABELS, LEFT, NAMES, POINTS, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
@@ -76,10 +76,9 @@ class Boundaries(Mapping[Any, MapBoundary]):
 
     def __init__(self, boundaries: Mapping[Any, MapBoundary]) -> None:
         self._by_label: dict[int, MapBoundary] = dict(boundaries)
-        self._by_name = {NAMES[label]: boundary for label, boundary in self._by_label.items()}
 
     def __getitem__(self, label: Any) -> MapBoundary:
-        return self._by_name[label] if isinstance(label, str) else self._by_label[label]
+        return self._by_label[LABELS.get(label, label)]
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._by_label)
@@ -246,12 +245,13 @@ def _boundary(entry: _Object) -> MapBoundary:
 
 
 def _points(top: _Object) -> dict[int, PointBoundary]:
-    names, found, listed = {NAMES[label]: label for label in POINTS}, {}, top.object("points")
+    found, listed = {}, top.object("points")
     for name in listed.entries:
         cones = _boundary(listed.object(name))
-        if name not in names or not isinstance(cones, PointBoundary):
-            raise listed.error("", f"expected points of {', '.join(names)}, found {shown(name)}")
-        found[names[name]] = cones
+        if LABELS.get(name) not in POINTS or not isinstance(cones, PointBoundary):
+            expected = ", ".join(NAMES[label] for label in POINTS)
+            raise listed.error("", f"expected points of {expected}, found {shown(name)}")
+        found[LABELS[name]] = cones
     return found
 
 

@@ -1,27 +1,22 @@
 """Dotted fields of a tree of settings, such as `spline.degree`, and overrides of them, also from a file."""
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_json, parse_toml, read_text, shown
-from pathspace_graph.settings.checked import in_words, is_of, successor
+from pathspace_graph.settings.checked import check_gone, in_words, is_of
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]  # new values by dotted field
 
 
-def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:
+def leaves(settings: Any) -> dict[str, Any]:
     """Return the value of every dotted field of a settings dataclass, in order."""
-    found: dict[str, Any] = {}
-    for entry in fields(settings):
-        value = getattr(settings, entry.name)
-        name = f"{prefix}{entry.name}"
-        found |= leaves(value, f"{name}.") if is_dataclass(value) else {name: value}
-    return found
+    return flatten(asdict(settings))
 
 
 def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -42,13 +37,6 @@ def override(settings: T, overrides: Overrides, where: str) -> T:
             check_name(name, known, f"{where}: expected a known setting" if where else "expected a setting")
         settings = _set(settings, name.split("."), value, f"{before}{name}")
     return settings
-
-
-def check_gone(name: str, said: str) -> None:
-    """Raise a SettingsError for a setting that is gone, which tells what took its place."""
-    place = successor(name)
-    if place is not None:
-        raise SettingsError(f"{said}: expected a setting, found one that is gone: {place}")
 
 
 def read_settings(file: Path, settings: T) -> T:

@@ -9,9 +9,10 @@ import json
 import re
 import stat
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from io import StringIO
 from itertools import chain
 from pathlib import Path
@@ -63,24 +64,22 @@ def shown(value: Any) -> str:
 def check_content(content: Any, file: Path) -> None:
     """Raise an InputError where the content of a file is nested too deep or has too large a whole number."""
     level, seen = [content], set[int]()
-    for _ in range(MAX_DEPTH):
-        values = list(chain.from_iterable(map(_children, level)))
-        for value in values:
+    for _ in range(MAX_DEPTH + 1):
+        for value in level:
             if isinstance(value, int) and abs(value) > MAX_INTEGER:
                 raise InputError(file, f"expected whole numbers up to {MAX_INTEGER}, found {shown(value)}")
         # what an alias names more than once is looked at once
-        inner = {id(value): value for value in values if isinstance(value, dict | list)}
-        level = [value for key, value in inner.items() if key not in seen]
-        seen |= inner.keys()
-        if not level:
+        inner = {id(value): value for value in level if isinstance(value, dict | list)}
+        parents = [value for key, value in inner.items() if key not in seen]
+        if not parents:
             return
+        seen |= inner.keys()
+        level = [*chain.from_iterable(map(_children, parents))]
     raise InputError(file, TOO_DEEP)
 
 
 def _children(value: Any) -> Any:
-    if isinstance(value, dict):
-        return chain(value.keys(), value.values())
-    return value if isinstance(value, list) else (value,)
+    return chain(value.keys(), value.values()) if isinstance(value, dict) else value
 
 
 # --- files and their formats -----------------------------------------------------------------------------
@@ -134,12 +133,16 @@ def _parsing(file: Path, kind: str) -> Iterator[None]:
         raise InputError(file, f"expected {kind}: {told}", int(line[1]) if line else None) from None
 
 
-def parse_json(text: str, file: Path) -> Any:
-    """Return the content of JSON; an InputError names the file and the row."""
-    with _parsing(file, "JSON"):
-        content = json.loads(text)
+def _parsed(kind: str, load: Callable[[str], Any], text: str, file: Path) -> Any:
+    with _parsing(file, kind):
+        content = load(text)
     check_content(content, file)
     return content
+
+
+def parse_json(text: str, file: Path) -> Any:
+    """Return the content of JSON; an InputError names the file and the row."""
+    return _parsed("JSON", json.loads, text, file)
 
 
 def read_json(file: Path, expected: str) -> Any:
@@ -149,9 +152,7 @@ def read_json(file: Path, expected: str) -> Any:
 
 def parse_toml(text: str, file: Path) -> dict[str, Any]:
     """Return the content of TOML; an InputError names the file and, where it is known, the row."""
-    with _parsing(file, "TOML"):
-        content = tomllib.loads(text)
-    check_content(content, file)
+    content: dict[str, Any] = _parsed("TOML", tomllib.loads, text, file)
     return content
 
 
@@ -173,9 +174,7 @@ def parse_yaml(text: str, file: Path) -> Any:
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MAX_DEPTH:
                 raise InputError(file, TOO_DEEP, _row(event.start_mark))
-        content = yaml.load(text, Loader=_Loader)
-    check_content(content, file)
-    return content
+    return _parsed("YAML", partial(yaml.load, Loader=_Loader), text, file)
 
 
 def _row(mark: Any) -> int | None:

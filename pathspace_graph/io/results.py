@@ -26,7 +26,7 @@ from .files import atomic_folder, write_json
 from .log import CALIBRATION
 from .manifest import verified
 from .map import MAP_FILE, Map, map_to_json
-from .parsing import MAX_COORDINATE, MAX_STAMP, is_plain, read_table, read_text, shown, write_table
+from .parsing import MAX_COORDINATE, MAX_STAMP, is_plain, read_text, shown, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -273,9 +273,3 @@ def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, An
         columns = [[getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS]
         write_table(temporary / CYCLES_FILE, CYCLE_COLUMNS, *columns)
         write_json(temporary / "summary.json", summary)
-
-
-def read_health(file: Path) -> list[str]:
-    """Return the health of each cycle by the file of cycles; the list is empty if it does not say it."""
-    with verified(file.parent, file.name):
-        return list(read_table(file, ("cycle",)).columns.get("health", []))

@@ -10,10 +10,8 @@ from typing import ClassVar, Final, Literal, Self
 
 from .checked import Positive
 
-WIDE_ODOMETRY: Final = 10.0
-"""Standard deviations of the odometry's wide priors by those of a calibrated one."""
-WIDE_SENSOR: Final = 20.0
-"""Standard deviations of the sensor's wide priors by those of a calibrated one."""
+WIDE_ODOMETRY: Final = 10.0  # standard deviations of the odometry's wide priors by those of a calibrated one
+WIDE_SENSOR: Final = 20.0  # standard deviations of the sensor's wide priors by those of a calibrated one
 
 
 @dataclass(frozen=True)

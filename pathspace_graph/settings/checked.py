@@ -21,8 +21,7 @@ class Positive:
     UNLIMITED: ClassVar[tuple[str, ...]] = ()
     """Numbers that may be infinite, which means that there is no limit."""
 
-    SIGNED: ClassVar[tuple[str, ...]] = ()
-    """Numbers that may have either sign."""
+    SIGNED: ClassVar[tuple[str, ...]] = ()  # numbers that may have either sign
 
     prefix: ClassVar[str]
     """What stands before the names of the settings on the command line."""
@@ -147,15 +146,15 @@ finding: interval 0.5, memory 60.0, readings 200, min_readings 40, step 2.0, lea
 mending: sightings 6, cones 3, beside 0.5, row 11.0, settle 1.5, most 20, memory 30.0, interval 0.5,
  attempts 8, explained 0.5, sample 0.25
 """
-"""A line for each group: `group: name value, name >new.name`, that is, a constant's value or a new name."""
+"""A line for each group: `group: name value, ...`, with the value that a constant has now."""
 
 
-def successor(name: str) -> str | None:
-    """Return what took the place of a dotted setting that is gone, in words; None where it isn't gone."""
+def check_gone(name: str, said: str) -> None:
+    """Raise a SettingsError for a dotted setting that is gone, with the value of its constant."""
     for line in GONE.replace("\n ", " ").strip().splitlines():
         group, _, entries = line.partition(": ")
         for entry in entries.split(", "):
-            old, _, place = entry.partition(" ")
+            old, _, value = entry.partition(" ")
             if name == f"{group}.{old}".lstrip("."):
-                return f"{place[1:]} now" if place.startswith(">") else f"a constant now ({place})"
-    return None
+                found = f"found one that is gone: a constant now ({value})"
+                raise SettingsError(f"{said}: expected a setting, {found}")

@@ -51,16 +51,11 @@ class SplineSettings(Positive):
     """Newton steps that refine each foot point in a Gauss-Newton step."""
 
     min_size: ClassVar[int] = 8  # least number of control points of a closed boundary
-    sigma_simplify: ClassVar[float] = 0.1
-    """Standard deviation of a control point's move by simplification, m; it loosens the prior."""
-    confirmed_margin: ClassVar[float] = 0.5
-    """Length past the last cone it was grown through up to which an open curve is believed, m."""
-    search_step: ClassVar[float] = 1.0
-    """Step of the grid on which a global search for foot points begins, m along the curve."""
-    fit_smoothness: ClassVar[float] = 0.1
-    """Weight of second differences where new control points are fitted to tentative tracks."""
-    fit_held: ClassVar[int] = 4
-    """Points at the end of the known curve that the same fit passes, so that the curve keeps its shape."""
+    sigma_simplify: ClassVar[float] = 0.1  # m, of a control point's move by simplification: a looser prior
+    confirmed_margin: ClassVar[float] = 0.5  # m past its last cone up to which an open curve is believed
+    search_step: ClassVar[float] = 1.0  # m along the curve, of the grid of a global search for foot points
+    fit_smoothness: ClassVar[float] = 0.1  # weight of second differences in the fit to tentative tracks
+    fit_held: ClassVar[int] = 4  # points of the known curve's end that this fit passes, to keep its shape
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,15 +91,10 @@ class GateSettings(Positive):
     """Farthest place on a curve that a detection may belong to, m ahead of the vehicle along the curve."""
 
     view_behind: ClassVar[float] = 4.0  # farthest such place behind the vehicle, m
-    chi_unknown: ClassVar[float] = (
-        1.5  # gate of unknown colour, own sigmas: cones of a start line would bend it
-    )
-    sigma_floor: ClassVar[float] = 0.1
-    """Standard deviation of errors that the model does not know, added in the gate, m."""
+    chi_unknown: ClassVar[float] = 1.5  # gate of unknown colour, own sigmas: a start line would bend curves
+    sigma_floor: ClassVar[float] = 0.1  # m, of errors that the model does not know, added in the gate
     rough: ClassVar[float] = 3.0  # distance from a curve beyond which no detection is associated with it, m
-    station_step: ClassVar[float] = (
-        1.5  # way of a cycle beyond which the pose's foot point is searched for, m
-    )
+    station_step: ClassVar[float] = 1.5  # m in a cycle, beyond which the pose's foot point is searched for
     station_ahead: ClassVar[float] = 8.0
     station_behind: ClassVar[float] = 3.0
     """How far that search goes ahead of the last foot point, and back, m along the curve."""

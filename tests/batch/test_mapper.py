@@ -17,7 +17,7 @@ from pathspace_graph.batch.mapper import BatchMapper, BatchResult, unmapped
 from pathspace_graph.batch.optimizer import Convergence, Effort, Optimizer
 from pathspace_graph.batch.system import Evaluation
 from pathspace_graph.cli import main
-from pathspace_graph.commands.batch import NOT_CONVERGED
+from pathspace_graph.commands.estimate import NOT_CONVERGED
 from pathspace_graph.errors import SolveError
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.reference import gap

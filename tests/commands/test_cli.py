@@ -15,7 +15,7 @@ from scipy.interpolate import BSpline as ScipyBSpline
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.batch.system import BatchSystem
 from pathspace_graph.cli import COMMANDS, main
-from pathspace_graph.commands import online as commands_online
+from pathspace_graph.commands import estimate as commands_estimate
 from pathspace_graph.commands.options import one_line
 from pathspace_graph.io.log import Detections, Log, read_log, write_log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
@@ -57,7 +57,7 @@ def test_a_batch_that_is_late_in_a_vehicle_is_told(
     for late, told in ((0, False), (3, True)):
         batches = LapBatches((140,), late)
         run = RunResult("", {}, Map(True, {}), np.zeros(0), np.zeros((0, 3)), (), 1, batches=batches)
-        commands_online.report(run, read_log(log_folder))
+        commands_estimate.report(run, read_log(log_folder))
         line = "in a vehicle the batch of the lap would have been 3 cycles late"
         assert (line in capsys.readouterr().out) == told
 
@@ -268,7 +268,7 @@ def test_plot_draws_a_map_with_its_log(log_folder: Path, map_folder: Path, tmp_p
 def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pathspace_graph.commands.demo.simulate", lambda *_: read_log(log_folder))
+    monkeypatch.setattr("pathspace_graph.commands.compare.simulate", lambda *_: read_log(log_folder))
     monkeypatch.chdir(tmp_path)
     assert main(["demo"]) == 0
     assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png", "manifest.json"}
@@ -343,7 +343,7 @@ def test_the_output_is_checked_before_the_work(
     log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     read = "read_plausible_log"
-    monkeypatch.setattr(commands_online, read, lambda *_: pytest.fail("read before the check"))
+    monkeypatch.setattr(commands_estimate, read, lambda *_: pytest.fail("read before the check"))
     (tmp_path / "thesis.tex").write_text("mine")
     assert main(["online", str(log_folder), "--out", str(tmp_path)]) == 2
     assert main(["online", str(log_folder), "--out", str(tmp_path / "thesis.tex" / "map")]) == 2

@@ -85,13 +85,12 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
     figures = dict.fromkeys(("fit", "expansion"), lambda: (picture, "It shows."))
     answers = {
         "commands.simulate.simulate": recorded.log,
-        "commands.demo.simulate": recorded.log,
-        "commands.demo.map_with_both": (recorded.result, recorded.result),
-        "commands.demo.plot_map": picture,
-        "commands.demo.side_by_side": TextTable("", (), ()),
-        "commands.online.map_online": recorded.result,
-        "commands.online.report": None,
-        "commands.batch.report": None,
+        "commands.compare.simulate": recorded.log,
+        "commands.compare.map_with_both": (recorded.result, recorded.result),
+        "commands.compare.plot_map": picture,
+        "commands.compare.side_by_side": TextTable("", (), ()),
+        "commands.estimate.map_online": recorded.result,
+        "commands.estimate.report": None,
         "commands.plot.plot_map": picture,
         "eval.experiment.compare.read_logs": [],
         "commands.compare.compare": comparison,
@@ -105,9 +104,9 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
         "eval.benchmark.scaling_output._process_megabytes": 1.0,
     }
     judged = recorded.log, []
-    answers |= {f"commands.{command}.read_plausible_log": judged for command in ("online", "batch")}
+    answers["commands.estimate.read_plausible_log"] = judged
     answers["commands.plot.read_log"] = recorded.log
-    answers |= {f"{room}.summarize": {} for room in ("commands.demo", "commands.online", "commands.batch")}
+    answers |= {f"{room}.summarize": {} for room in ("commands.compare", "commands.estimate")}
     answers |= {"eval.experiment.output.summarize": {}}
     for name, answer in answers.items():
         monkeypatch.setattr(f"pathspace_graph.{name}", lambda *_, _answer=answer, **__: _answer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -13,9 +14,10 @@ import pytest
 
 from pathspace_graph.cli import main, parse_command
 from pathspace_graph.commands.options import ESSENTIAL
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import write_json
 from pathspace_graph.io.overrides import leaves
-from pathspace_graph.settings.checked import GONE, successor
+from pathspace_graph.settings.checked import GONE, check_gone
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
 SCREEN = 50
@@ -172,14 +174,15 @@ def gone() -> list[tuple[str, str]]:
     return [(f"{group}.{name}".lstrip("."), place) for group, (name, place) in entries]
 
 
-def test_what_is_gone_is_no_setting_and_its_new_name_is_one() -> None:
+def test_what_is_gone_is_no_setting_and_is_told_with_its_value() -> None:
     known, names = set(leaves(MapperSettings())), [name for name, _ in gone()]
     assert len(set(names)) == len(names)
     assert known.isdisjoint(names)
-    for name, place in gone():
-        assert place[1:] in known if place.startswith(">") else place
-        assert place.lstrip(">") in str(successor(name))
-    assert successor("lag") is None
+    for name, value in gone():
+        with pytest.raises(SettingsError, match=re.escape(f"{name}: expected a setting")) as error:
+            check_gone(name, name)
+        assert value and f"({value})" in str(error.value)
+    check_gone("lag", "lag")
 
 
 def test_the_estimators_have_few_settings() -> None:

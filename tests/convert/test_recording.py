@@ -48,7 +48,7 @@ def test_the_sensor_is_flipped_before_it_is_mounted() -> None:
     c, s, ray = np.cos(0.3), np.sin(0.3), np.array([0.8, 0.6])
     turned = np.array([0.8 * c + 0.6 * s, 0.8 * s - 0.6 * c])
     covariance = 4.0 * np.outer(ray, ray) + 0.01 * np.eye(2)
-    frames = Frames((1.0, 0.5, 0.3), "left", "right")
+    frames = Frames((1.0, 0.5, 0.3), y="right", y_odometry="left")
     log = to_log(record(one(4.0, 3.0, covariance)), frames, NoiseSettings(), FILE)
     np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.0, 0.5] + 5.0 * turned], atol=1e-12)
     expected = 4.0 * np.outer(turned, turned) + 0.01 * np.eye(2)

@@ -63,7 +63,7 @@ def test_messages_without_a_stamp_have_the_time_of_receipt(messages: Messages) -
 
 
 def test_the_frames_are_those_of_the_vehicle(messages: Messages) -> None:
-    stream = MessageStream(Frames((1.0, 0.0, 0.0), "right", "right"))
+    stream = MessageStream(Frames((1.0, 0.0, 0.0), y="right"))
     stream.take_odometry(messages.odometry(0.0, TWIST), 0.0)
     cycle = stream.take_detections(cloud(messages, 0.1), 0.0)
     assert cycle is not None

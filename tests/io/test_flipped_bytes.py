@@ -22,10 +22,11 @@ from pathspace_graph.eval.experiment.cells import (
     record_of,
     write_record,
 )
+from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.log import FILES, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import read_health, read_trajectory, write_result
+from pathspace_graph.io.results import read_trajectory, write_result
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings
@@ -42,7 +43,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     **dict.fromkeys(FILES, ("log", read_log)),
     "map.json": ("map", read_map),
     "trajectory.tum": ("map", lambda folder: read_trajectory(folder / "trajectory.tum")),
-    "cycles.csv": ("map", lambda folder: read_health(folder / "cycles.csv")),
+    "cycles.csv": ("map", read_cycles),
     "summary.json": ("map", verify_all),
     "mapper.snap": ("snapshot", lambda folder: FixedLagMapper.restore(folder / "mapper.snap")),
 }

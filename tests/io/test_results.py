@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import OutputError
+from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.io.results import (
-    CYCLES_FILE,
     SMOOTHED_FILE,
     CycleRecord,
     RunResult,
-    read_health,
     read_trajectory,
     write_result,
 )
@@ -57,7 +56,7 @@ def test_the_folder_holds_the_four_files_of_the_contract(tmp_path: Path) -> None
     rows = (tmp_path / "map" / "cycles.csv").read_text().splitlines()
     assert rows[0] == "cycle,t,seconds,size_left,size_right,readings,lap,offered,health,reason,dropped"
     assert rows[1:] == ["0,0.1,0.001,0,4,7,1,0,,,0", "1,0.2,0.002,9,7,12,2,15,lost,no way,0"]
-    assert read_health(tmp_path / "map" / CYCLES_FILE) == ["", "lost"]
+    assert read_cycles(tmp_path / "map")["health"].tolist() == ["", "lost"]
     read = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert read == {"estimator": "fixed-lag", "ate": None, "laps": [{"lap": 1, "rmse": 0.5}]}
 

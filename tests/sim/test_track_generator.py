@@ -140,7 +140,6 @@ def test_settings_that_contradict_are_refused() -> None:
     for bad in (
         {"lap_length": (400.0, 200.0)},
         {"corners": (2, 5)},
-        {"slalom_probability": 2.0},
         {"cones": 3},
     ):
         with pytest.raises(SettingsError, match="generator"):

@@ -1,35 +1,49 @@
-"""`online`: a log is mapped cycle by cycle, without reading ahead."""
+"""`online` and `batch`: a log is mapped cycle by cycle, without reading ahead, or optimized at once."""
 
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
-from pathspace_graph.estimators import DEFAULT, MapKind, check_online, for_map, make_online
+from pathspace_graph.estimators import (
+    DEFAULT,
+    DEFAULT_BATCH,
+    MapKind,
+    check_batch,
+    check_online,
+    for_map,
+    make_batch,
+    make_online,
+)
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
+from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE
-from pathspace_graph.io.results import RunResult, write_result
+from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online
+from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
+
+NOT_CONVERGED: Final = 3  # exit code of a batch whose result is written, but is not the optimum
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +121,60 @@ class Online:
             expected = f"expected cycles after {times[-1]:g} s, where {self.resume} ends"
             raise InputError(self.log, f"{expected}, found none")
         return replace(log, cycles=cycles), mapper
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Optimize a whole log at once, and write the map, the trajectory, the cycles and a summary."""
+
+    log: Positional[Path]
+    """Folder of the log."""
+    out: Path
+    """Folder for the map; an earlier map there is kept as a numbered backup."""
+    estimator: str = DEFAULT_BATCH
+    """Name of the batch estimator."""
+    map: MapKind = "boundaries"
+    """Kind of map: two boundaries, or one centre line with a width."""
+    start: Start | None = None
+    """Where the optimization begins: an online map, or odometry alone; by default as `batch.start` says."""
+    settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
+    """Settings of the estimator."""
+
+    def run(self) -> None:
+        check_batch(self.estimator)
+        name = for_map(self.estimator, self.map)
+        if self.start == "odometry" and name != DEFAULT_BATCH:
+            raise SettingsError(f"--start: expected online for {name}, found {self.start}")
+        check_target(self.out, MAP_FILE)
+        log, hints = read_plausible_log(self.log, self.settings.limits)
+        tell(hints)
+        with progress("optimizing") as advance:
+            estimator = make_batch(name, self.settings, log)
+            options = (self.start, advance) if isinstance(estimator, BatchMapper) else ()
+            result: BatchRun = estimator.solve(log, *options)
+        start = self.start or self.settings.batch.start
+        write_result(self.out, result, summarize_batch(result, log, start, hints))
+        report(result, log)
+        say(f"written to {self.out}")
+        known = result if isinstance(result, BatchResult) else None
+        if not result.converged:
+            note(f"not converged: {known.convergence.reason if known else 'associations still change'}")
+            raise SystemExit(NOT_CONVERGED)
+        if known and known.objection:
+            note(f"not a map of the drive: {known.objection}")
+            raise SystemExit(NOT_CONVERGED)
+
+
+def summarize_batch(result: BatchRun, log: Log, start: Start, hints: Sequence[Hint] = ()) -> dict[str, Any]:
+    """Return the summary of a run, how its optimization ended, and its gap from its online start."""
+    summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
+    if not isinstance(result, BatchResult):
+        return summary
+    summary["convergence"] = asdict(result.convergence)
+    summary["objection"] = result.objection
+    summary["stages"] = result.seconds
+    summary["gap"] = None if result.online is None else asdict(gap(result.online, result))
+    return summary
 
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:
