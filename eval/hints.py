@@ -22,7 +22,7 @@ from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import PathspaceError, SolveError, check_name
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment.cells import load_tracks
-from pathspace_graph.eval.experiment.run import Experiment, OnCell, WorkerDiedError
+from pathspace_graph.eval.experiment.run import OnCell, WorkerDiedError, run_cells
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.io.files import atomic_folder, check_target
@@ -225,7 +225,7 @@ class HintStudy:
         kinds = tuple(kind for kind in GOOD if self.good or kind in self.kinds)
         tracks = load_tracks([int(one) if one.isdigit() else Path(one) for one in self.tracks])
         cells = [*product([self], tracks, self.seeds, kinds)]
-        rows = Experiment(cells=cells, work=judge, died=lost).run(self.jobs, on_cell=on_cell)
+        rows = run_cells(cells, judge, lost, jobs=self.jobs, on_cell=on_cell)
         return pd.DataFrame([row for of in rows for row in of])
 
     def run(self) -> TextTable:

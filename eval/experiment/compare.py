@@ -27,18 +27,11 @@ from pathspace_graph.settings.online import LimitSettings
 
 from .cells import Cell, NamedLog, Outcome, run_cell
 from .frame import add_batch, difference
-from .run import Experiment, OnCell
+from .run import OnCell, run_cells
 from .study import known_estimators
 from .tables import TextTable, group_starts
 
 RUN: Final = ("log", "estimator")
-NO_TRUTH: Final = "the log has no true cones, which rmse, missed and most other metrics need"
-"""Part of a title where the columns of the paper are missing."""
-FAILED: Final = "failed"
-"""Text in place of a lap for an estimator that failed on every log."""
-AT_END: Final = "end"
-"""Text in place of a lap for an estimator that completed no lap."""
-_SPACE: Final = "   "
 _PRINTED: Final = (
     *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "two_way", "ghost_share", "size", "ate"),
     "ms_mean",
@@ -46,9 +39,6 @@ _PRINTED: Final = (
 """Metrics whose differences are in the table; the file has those of all."""
 _NOT_PAIRED: Final = ("nees_low", "nees_high")
 """Metrics whose differences mean nothing."""
-
-
-# --- runs ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +115,7 @@ def gap_columns(result: RunResult, batch: RunResult) -> dict[str, float]:
 
 
 def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedLog, ...]:
-    """Return the log of a log folder, or those of a folder of log folders by name; InputError if there
-    are none, or if a cycle of one cannot be used."""
+    """Return the log of a log folder, or those of a folder of log folders; InputError if it is neither."""
     folders = {folder.resolve().name: folder}
     if folder.is_dir() and not (folder / LOG_FILE).exists():
         entries = sorted(entry for entry in folder.iterdir() if not is_temporary(entry.name))
@@ -168,14 +157,10 @@ def compare(
     jobs: int = 1,
     on_run: OnCell | None = None,
 ) -> Comparison:
-    """Run every estimator on every log, `jobs` at a time on one BLAS thread each, see `Experiment.run`.
-
-    A failure of one does not stop the others.
-    """
+    """Run every estimator on every log, `jobs` at a time; a failure of one does not stop the others."""
     settings, measured = settings or MapperSettings(), {"ghost_settings": ghosts}
     cells = [Cell(log, name, settings, measured=measured) for log in logs for name in estimators]
-    experiment = Experiment(cells=cells, work=run_cell, died=Outcome.failed)
-    found = experiment.run(jobs, on_cell=on_run)
+    found = run_cells(cells, run_cell, Outcome.failed, jobs=jobs, on_cell=on_run)
     chosen = choose_reference(reference, estimators)
     return Comparison(tuple(logs), tuple(estimators), chosen, tuple(found))
 
@@ -212,7 +197,7 @@ def paper_table(comparison: Comparison) -> TextTable:
     logs = ["logs"] if len(comparison.logs) > 1 else []
     rows = []
     for row in paper_frame(comparison).to_dict("records"):
-        lap = (AT_END if row["logs"] else FAILED) if pd.isna(row["lap"]) else str(int(row["lap"]))
+        lap = ("end" if row["logs"] else "failed") if pd.isna(row["lap"]) else str(int(row["lap"]))
         cells = (*(str(row[key]) for key in logs), *(_cell(metric, row) for metric in shown))
         rows.append((row["estimator"], lap, *cells))
     header = ("estimator", "lap", *logs, *(metric.heading for metric in shown))
@@ -232,17 +217,13 @@ def final_table(comparison: Comparison) -> TextTable:
 
 def paired_frame(comparison: Comparison) -> pd.DataFrame:
     """Return a tidy row for each estimator and metric of whole logs: its difference from the reference."""
-    reference, logs = comparison.reference, [named.name for named in comparison.logs]
-    final = comparison.final.set_index([*RUN])
+    reference, rows = comparison.reference, []
+    final = comparison.final.set_index([*RUN]).unstack("estimator")
     keys = [key for key in METRICS if key in final and key not in _NOT_PAIRED]
-    rows = []
-    for estimator in comparison.estimators:
-        for key in keys if estimator != reference else ():
-            values, others = (
-                final[key].astype(float).reindex([(log, name) for log in logs]).to_numpy()
-                for name in (estimator, reference)
-            )
-            d = difference(values, others)
+    for estimator in (name for name in comparison.estimators if name != reference):
+        for key in keys:
+            values = final[key].reindex(columns=[estimator, reference]).to_numpy(float)
+            d = difference(*values.T)
             rows.append([estimator, reference, key, d.mean, d.low, d.high, d.count])
     return pd.DataFrame(rows, columns=["estimator", "reference", "metric", "mean", "low", "high", "pairs"])
 
@@ -277,23 +258,20 @@ def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
 
     The rmse, missed and size of an estimator share a column, so that its name stands above all three.
     """
-    titles = _SPACE.join(metric.heading for metric in PAPER)
-    header = ("lap", *(f"{name}\n{titles}" for name in laps))
-    beside = zip_longest(*laps.values())
-    rows = tuple((str(lap), *map(_three, of)) for lap, of in enumerate(beside, start=1))
-    return TextTable("", header, rows, names=0)
-
-
-def _three(row: LapMetrics | None) -> str:
-    values = {} if row is None else asdict(row)
-    return _SPACE.join(_cell(metric, values).rjust(len(metric.heading)) for metric in PAPER)
+    titles = "   ".join(metric.heading for metric in PAPER)
+    header, rows = ("lap", *(f"{name}\n{titles}" for name in laps)), []
+    for lap, beside in enumerate(zip_longest(*laps.values()), start=1):
+        values = ({} if row is None else asdict(row) for row in beside)
+        three = ("   ".join(_cell(m, row).rjust(len(m.heading)) for m in PAPER) for row in values)
+        rows.append((str(lap), *three))
+    return TextTable("", header, tuple(rows), names=0)
 
 
 def _title(comparison: Comparison, when: str) -> str:
     count = len(comparison.logs)
     logs = comparison.logs[0].name if count == 1 else f"mean over {count} logs"
-    missing = "" if comparison.has_truth else f" ({NO_TRUTH})"
-    return f"{logs}, {when}{missing}"
+    missing = " (the log has no true cones, which rmse, missed and most other metrics need)"
+    return f"{logs}, {when}{'' if comparison.has_truth else missing}"
 
 
 def _cell(metric: Metric, row: dict[Any, Any]) -> str:

@@ -23,26 +23,11 @@ SUITE: Final = Path("faults")
 """Name of the shipped study that is the suite."""
 CLEAN: Final = "clean"
 """Name of the noise without a fault, which every other one is compared with."""
-BY_PRIOR: Final = "_by_prior"
-"""Suffix of metrics that are estimates of a calibration by the sigma of its prior."""
-TITLE_BY_PRIOR: Final = " by its prior's sigma"
 Values = Mapping[str, Any]
 """Values of an outcome by name."""
-PAIR: Final = "{:.1f}, {:.1f}"
-NOTHING: Final = "nothing"
-"""Text where no run said anything."""
-_SAID_LENGTH: Final = 60
-"""Number of characters that a notice is shortened to; the JSON file has the whole of it."""
 _WORST: Final = ("error_max", "error_end", "astray_time", "astray_way")
 _MEASURED: Final = (
-    "rmse",
-    "size",
-    "missed",
-    "closed_at_end",
-    "lost_at_end",
-    *_WORST,
-    "told_degraded",
-    "told_lost",
+    *("rmse", "size", "missed", "closed_at_end", "lost_at_end", "told_degraded", "told_lost", *_WORST),
 )
 _NAME: Final = re.compile(r"(?P<kind>.+): (?P<strength>(?P<value>[-+.\d]+)(?: (?P<unit>\S+))?)")
 
@@ -55,12 +40,10 @@ class Fault:
     """A fault of a kind and a strength."""
 
     kind: str
-    """Kind in plain words; `clean` where there is no fault."""
     strength: str
     """Strength as it is written, a number and a unit."""
     value: float
     unit: str
-    """Unit; empty for counts."""
 
 
 def fault_of(noise: str) -> Fault:
@@ -80,9 +63,13 @@ def suite() -> Study:
     return read_study(find_study(SUITE))
 
 
+def by_kind(study: Study) -> list[list[str]]:
+    """Return the noises of each kind of fault, in ascending strength."""
+    return [list(noises) for _, noises in groupby(study.noise, lambda noise: fault_of(noise).kind)]
+
+
 def kinds(study: Study) -> list[str]:
-    every = dict.fromkeys(fault_of(noise).kind for noise in study.noise)
-    return [kind for kind in every if kind != CLEAN]
+    return [fault_of(noises[0]).kind for noises in by_kind(study) if noises != [CLEAN]]
 
 
 def only(study: Study, wanted: Sequence[str]) -> Study:
@@ -95,16 +82,12 @@ def only(study: Study, wanted: Sequence[str]) -> Study:
 
 def strongest(study: Study) -> Study:
     """Return the suite with the clean run and each fault at the last of its strengths."""
-    return _with(study, [noises[-1] for noises in _by_kind(study)])
+    return _with(study, [noises[-1] for noises in by_kind(study)])
 
 
 def of_middle_strength(study: Study) -> Study:
     """Return the suite with the clean run and each fault at the middle one of its strengths."""
-    return _with(study, [noises[len(noises) // 2] for noises in _by_kind(study)])
-
-
-def _by_kind(study: Study) -> list[list[str]]:
-    return [list(noises) for _, noises in groupby(study.noise, lambda noise: fault_of(noise).kind)]
+    return _with(study, [noises[len(noises) // 2] for noises in by_kind(study)])
 
 
 def _with(study: Study, noises: Sequence[str]) -> Study:
@@ -129,8 +112,8 @@ def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
     ratios = runs["ratio"].dropna()
-    sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith(BY_PRIOR)}
-    titles = {key: METRICS[key].title.removesuffix(TITLE_BY_PRIOR) for key in sigmas}
+    sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith("_by_prior")}
+    titles = {key: METRICS[key].title.removesuffix(" by its prior's sigma") for key in sigmas}
     return {
         "fault": fault.kind,
         "strength": fault.value,
@@ -197,8 +180,10 @@ def _closed(values: Values) -> str:
 
 
 def _said(values: Values) -> str:
-    said = (f"{n} of {values['runs']}: {_short(text)}" for text, n in values["said"].items())
-    return "; ".join(said) or NOTHING
+    """Return how many runs said what, shortened to 60 characters; the JSON file has all of it."""
+    short = {text: text if len(text) <= 60 else f"{text[:60].rstrip()} …" for text in values["said"]}
+    said = (f"{number} of {values['runs']}: {short[text]}" for text, number in values["said"].items())
+    return "; ".join(said) or "nothing"
 
 
 def _form(form: str, *names: str, factor: float = 1.0) -> Callable[[Values], str]:
@@ -206,10 +191,6 @@ def _form(form: str, *names: str, factor: float = 1.0) -> Callable[[Values], str
     return lambda values: (
         UNKNOWN if np.isnan(values[names[0]]) else form.format(*(factor * values[name] for name in names))
     )
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= _SAID_LENGTH else f"{text[:_SAID_LENGTH].rstrip()} …"
 
 
 COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
@@ -220,7 +201,7 @@ COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
     "closed": _closed,
     "lost at the end": lambda values: f"{values['lost']} of {values['runs']}",
     "largest error [m]": _form("{:.1f}", "error_max"),
-    "over 1 m off after closing [s, m]": _form(PAIR, "astray_time", "astray_way"),
+    "over 1 m off after closing [s, m]": _form("{:.1f}, {:.1f}", "astray_time", "astray_way"),
     "calibration by its prior's sigma": lambda values: ", ".join(
         f"{name} {value:+.1f}" for name, value in values["calibration"].items()
     ),

@@ -1,9 +1,10 @@
 """The files of studies, of the suite of faults and of comparisons: tables, tidy results, figures and maps."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -11,11 +12,12 @@ from matplotlib.figure import Figure
 from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.summary import summarize, versions
 from pathspace_graph.io.files import atomic_folder, replacing, write_json, write_text
-from pathspace_graph.io.map import PointBoundary
+from pathspace_graph.io.log import Truth
+from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.io.results import write_result
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .cells import NamedLog, Outcome
+from .cells import NamedLog
 from .compare import Comparison, paired_frame, paper_frame
 from .compare import tables as comparison_tables
 from .faults import beside_clean, fault_table, outcomes
@@ -24,8 +26,6 @@ from .plots import find_blind_spot, plot_blind_spot, plot_differences, plot_faul
 from .study import Study
 from .tables import as_latex, as_markdown, as_text, caption, summary_tables, track_tables
 
-FAULTS_FORMAT: Final = "pathspace-faults/1"
-COMPARISON_FORMAT: Final = "pathspace-comparison/1"
 MARKER: Final = "comparison.json"
 """File by which a comparison's folder is recognized."""
 
@@ -42,7 +42,8 @@ def write_csv(file: Path, frame: pd.DataFrame) -> None:
 def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write the tables and the figures of a study, and return the text of its summary."""
     summary, differences = write_tables(study, frame, out), plot_differences(study, frame)
-    save_figures(out / "figures", {} if differences is None else {"differences": differences})
+    if differences is not None:
+        save_figures(out / "figures", {"differences": differences})
     return summary
 
 
@@ -72,11 +73,11 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
     for suffix, content in (("txt", text), ("md", table.markdown()), ("tex", table.latex())):
         write_text(out / f"faults.{suffix}", content)
     about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
-    write_json(out / "faults.json", {"format": FAULTS_FORMAT, **about, "faults": faults}, indent=1)
-    texts = {
-        key: [json.dumps(row[key], ensure_ascii=False) for row in faults] for key in ("calibration", "said")
-    }
-    write_csv(out / "faults.csv", pd.DataFrame(faults).assign(**texts))
+    write_json(out / "faults.json", {"format": "pathspace-faults/1", **about, "faults": faults}, indent=1)
+    flat = pd.DataFrame(faults)
+    for key in ("calibration", "said"):
+        flat[key] = [json.dumps(value, ensure_ascii=False) for value in flat[key]]
+    write_csv(out / "faults.csv", flat)
     save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})
     return text
 
@@ -85,12 +86,10 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
 
 
 def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
-    """Write all files of a comparison, or on failure none.
+    """Write all files of a comparison (docs/formats.md), or on failure none.
 
-    `table.*` is the paper's Table 1. `metrics.*` has every metric; its CSV has a tidy row for each run and
-    lap. `times.csv` has the stages of the cycles, `paired.*` the differences. Each log has `maps.*`,
-    `blind_spot.*` and a map folder for each estimator, in a folder of its own where there are several logs.
-    An earlier comparison in `out` is kept as a numbered backup.
+    Where there are several logs, each has a folder of its own. An earlier comparison in `out` is kept as a
+    numbered backup.
     """
     frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": comparison.times()}
     if comparison.paired:
@@ -102,54 +101,44 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
         for name, frame in frames.items():
             frame.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
         for named in comparison.logs:
-            own = folder if len(comparison.logs) == 1 else folder / named.name
-            own.mkdir(exist_ok=True)
-            _write_log(own, named, comparison)
-        write_json(folder / MARKER, _content(comparison, settings, jobs))
+            _write_log(folder if len(comparison.logs) == 1 else folder / named.name, named, comparison)
+        about = {
+            "format": "pathspace-comparison/1",
+            "logs": [named.name for named in comparison.logs],
+            "estimators": comparison.estimators,
+            "reference": comparison.reference,
+            "failures": [{**o.names, "error": o.failure} for o in comparison.failures],
+            "jobs": jobs,
+            "settings": asdict(settings),
+            "versions": versions(),
+        }
+        write_json(folder / MARKER, about)
 
 
 def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
+    folder.mkdir(exist_ok=True)
     found = comparison.of(named.name)
+    maps = {str(o.names["estimator"]): o.result.map for o in found if o.result is not None}
     for outcome in found:
         if outcome.result is not None:
             summary = summarize(outcome.result, named.log, named.hints)
             write_result(folder / outcome.names["estimator"], outcome.result, summary)
-    if any(outcome.result is not None for outcome in found):
+    if maps:
         save_figures(folder, {"maps": plot_maps(found, named.log)})
-    figure = blind_spot_figure(found, named, comparison.reference)
-    if figure is not None:
-        save_figures(folder, {"blind_spot": figure})
+    if named.log.truth is not None and comparison.reference in maps:
+        figure = blind_spot_figure(maps, comparison.reference, named.log.truth)
+        save_figures(folder, {} if figure is None else {"blind_spot": figure})
 
 
-def blind_spot_figure(found: list[Outcome], named: NamedLog, reference: str) -> Figure | None:
-    """Return the reference beside the first landmark map that misses cones, or None.
-
-    It is None without truth, or where no landmark map misses cones that the reference passes.
-    """
-    maps = {o.names["estimator"]: o.result.map for o in found if o.result is not None}
+def blind_spot_figure(maps: Mapping[str, Map], reference: str, truth: Truth) -> Figure | None:
+    """Return the reference beside the first landmark map that misses cones that it passes, or None."""
     points = [
         name
         for name, track in maps.items()
         if any(isinstance(boundary, PointBoundary) for boundary in track.boundaries.values())
     ]
-    truth = named.log.truth
-    if truth is None or reference not in maps or reference in points:
-        return None
-    for name in points:
+    for name in points if reference not in points else ():
         spot = find_blind_spot(truth, maps[reference], maps[name])
         if spot is not None:
             return plot_blind_spot(spot, [(reference, maps[reference]), (name, maps[name])], truth)
     return None
-
-
-def _content(comparison: Comparison, settings: MapperSettings, jobs: int) -> dict[str, Any]:
-    return {
-        "format": COMPARISON_FORMAT,
-        "logs": [named.name for named in comparison.logs],
-        "estimators": comparison.estimators,
-        "reference": comparison.reference,
-        "failures": [{**o.names, "error": o.failure} for o in comparison.failures],
-        "jobs": jobs,
-        "settings": asdict(settings),
-        "versions": versions(),
-    }

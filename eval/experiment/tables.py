@@ -10,13 +10,11 @@ from rich.table import Table
 from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
 
-from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, column_of
+from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, Metric, column_of
 
-from .frame import COMBINATION, CORRECTION, LEVEL, RUN, RUN_OF, Contrast, Estimate, contrasts, last_laps
+from .frame import COMBINATION, LEVEL, RUN, RUN_OF, Estimate, contrasts, last_laps
 from .study import Study
 
-_BORDER: Final = 3
-"""Number of characters between two columns of a terminal's table."""
 _UNICODE: Final = str.maketrans(
     {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
 )
@@ -31,7 +29,6 @@ class TextTable:
     """Sentence above the table, which may be empty."""
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    """Rows, each as long as the header."""
     groups: tuple[int, ...] = ()
     """Row numbers at which a new group of rows begins."""
     names: int = 1
@@ -39,7 +36,8 @@ class TextTable:
 
     def parts(self, width: int) -> list[Self]:
         """Return tables of at most `width` characters, each with the names and some of the other columns."""
-        needed = [max(map(len, column)) + _BORDER for column in zip(self.header, *self.rows, strict=True)]
+        border = 3  # characters between two columns
+        needed = [max(map(len, column)) + border for column in zip(self.header, *self.rows, strict=True)]
         shared = sum(needed[: self.names]) + 1
         parts: list[list[int]] = [[]]
         for number in range(self.names, len(self.header)):
@@ -49,8 +47,8 @@ class TextTable:
         return [self._only([*range(self.names), *part]) for part in parts]
 
     def _only(self, columns: Sequence[int]) -> Self:
-        rows = tuple(tuple(row[k] for k in columns) for row in self.rows)
-        return replace(self, header=tuple(self.header[k] for k in columns), rows=rows)
+        header, *rows = (tuple(row[k] for k in columns) for row in (self.header, *self.rows))
+        return replace(self, header=header, rows=tuple(rows))
 
     def rich(self) -> Table:
         """Return the table for a terminal, without its title; units in brackets aren't taken for markup."""
@@ -98,12 +96,7 @@ def group_starts(rows: Sequence[Sequence[str]]) -> tuple[int, ...]:
     return tuple(k for k in range(1, len(rows)) if rows[k][0] != rows[k - 1][0])
 
 
-SMALLEST_P: Final = 0.001
-"""A p below this is shown as smaller than it."""
-FIGURES: Final = ("runs", "mean", "95 %", "difference", "95 %", "p", "")
-"""Columns of every table after those that name the combination."""
-_EXTREMES: Final = {"all, median": "median", "all, largest": "max"}
-"""Rows below the average over all runs, each made by a function of pandas."""
+# --- studies ---------------------------------------------------------------------------------------------
 
 
 def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
@@ -120,36 +113,30 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
         f"{study.name}: {study.question} "
         f"{len(runs)} runs ({int((runs != '').sum())} failed) of {study.laps} laps, at the end of the last. "
         f"Mean and {100 * LEVEL:g} % interval (Student's t) over track x seed; difference from {against} "
-        f"paired over track and seed; p of the paired t-test, corrected by {CORRECTION}'s method over all "
+        f"paired over track and seed; p of the paired t-test, corrected by Holm's method over all "
         f"comparisons of the metric; * where p < {1 - LEVEL:.2f}."
     )
 
 
 def _table(study: Study, frame: pd.DataFrame, key: str) -> TextTable:
     several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"]
-    header = (*several, *FIGURES)
-    metric = METRICS[key]
-    digits = max(metric.digits, MEAN_DIGITS)
-
-    def row(contrast: Contrast) -> tuple[str, ...]:
-        names = tuple(getattr(contrast, name) for name in several)
+    header, rows, metric = (*several, "runs", "mean", "95 %", "difference", "95 %", "p", ""), [], METRICS[key]
+    for contrast in contrasts(study, frame, key):
+        names = (getattr(contrast, name) for name in several)
         value, difference = contrast.value, contrast.difference
-        by = ("baseline", "") if difference is None else _figures(difference, metric.factor, digits, "+")
-        p = "" if np.isnan(contrast.p) else f"{contrast.p:.3f}"
-        p = f"<{SMALLEST_P:g}" if contrast.p < SMALLEST_P else p
-        figures = (str(value.count), *_figures(value, metric.factor, digits, ""))
-        return (*names, *figures, *by, p, "*" if contrast.significant else "")
-
-    rows = tuple(row(contrast) for contrast in contrasts(study, frame, key))
-    return TextTable(metric.heading, header, rows, names=len(several))
+        by = ("baseline", "") if difference is None else _figures(metric, difference, "+")
+        p = "" if np.isnan(contrast.p) else f"{contrast.p:.3f}" if contrast.p >= 0.001 else "<0.001"
+        mark = "*" if contrast.significant else ""
+        rows.append((*names, str(value.count), *_figures(metric, value), *by, p, mark))
+    return TextTable(metric.heading, header, tuple(rows), names=len(several))
 
 
-def _figures(estimated: Estimate, factor: float, digits: int, sign: str) -> tuple[str, str]:
-    if not estimated.count:
+def _figures(metric: Metric, of: Estimate, sign: str = "") -> tuple[str, str]:
+    if not of.count:
         return "", ""
-    mean = f"{factor * estimated.mean:{sign}.{digits}f}"
-    half = "" if np.isnan(estimated.half) else f"± {factor * estimated.half:.{digits}f}"
-    return mean, half
+    digits = max(metric.digits, MEAN_DIGITS)
+    half = "" if np.isnan(of.half) else f"± {metric.factor * of.half:.{digits}f}"
+    return f"{metric.factor * of.mean:{sign}.{digits}f}", half
 
 
 def as_text(tables: Sequence[TextTable], caption: str) -> str:
@@ -187,7 +174,7 @@ def _rows(columns: Sequence[Column], frame: pd.DataFrame) -> Iterator[tuple[str,
         texts = (c.average(v.loc[done.index]) for c, v in zip(columns, values, strict=True))
         yield (str(track), f"{int(done.sum())} of {len(done)}", *texts)
     yield ("all, mean", *whole, *(c.average(v) for c, v in zip(columns, values, strict=True)))
-    for name, over in _EXTREMES.items():
+    for name, over in {"all, median": "median", "all, largest": "max"}.items():
         yield (name, *whole, *(c.extreme(v, over) for c, v in zip(columns, values, strict=True)))
 
 
