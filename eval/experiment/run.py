@@ -69,8 +69,9 @@ def run_cells(
 ) -> list[R]:
     """Run the cells that `read` knows no result of, and return all results.
 
-    They run in `jobs` processes (-1: one for each core), or on the workers of a Dask scheduler. `work` is a function of a module that does not raise; where its process died, `died` makes the result.
-    `begin` is called once there are workers, and `write` keeps each result at once.
+    They run in `jobs` processes (-1: one for each core), or on the workers of a Dask scheduler. `work` is a
+    function of a module that does not raise; where its process died, `died` makes the result. `begin` is
+    called once there are workers, and `write` keeps each result at once.
     """
     check_jobs(jobs)
     known = {cell: read(cell) for cell in cells}

@@ -20,12 +20,16 @@ from pathspace_graph.sim.curves import arc_lengths
 
 from .accuracy import boundary_distances, root_mean_square
 
-LOST: Final = 5.0
-"""Position error beyond which a vehicle is lost (m)."""
-ASTRAY: Final = 1.0
-"""Position error beyond which a vehicle is astray (m)."""
-END: Final = 1.0
-"""Length of the end of a log (s)."""
+LOST, ASTRAY = 5.0, 1.0
+"""Position errors beyond which a vehicle is lost, or astray (m)."""
+MOST: Final = 35.0
+"""Greatest length of a reach (m)."""
+ON_CURVE: Final = 0.5
+"""Distance of a true cone from the mapped boundary at which the reach ends (m)."""
+SHORT: Final = 4.0
+"""Reach below which no planner can work (m)."""
+STARTING: Final = 0.03
+"""Share of lap 1 on which the map has only begun, and cycles don't count."""
 
 
 def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
@@ -67,7 +71,7 @@ def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
     if len(errors) == 0:
         return {}
     known = t[(t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])]
-    error_end = position_rms(errors[known >= known[-1] - END])
+    error_end = position_rms(errors[known >= known[-1] - 1.0])
     return {
         "error_max": float(np.linalg.norm(errors[:, :2], axis=1).max()),
         "error_end": error_end,
@@ -120,17 +124,7 @@ def position_rms(errors: Array) -> float:
     return root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
 
 
-MOST: Final = 35.0
-"""Greatest length of a reach (m)."""
-ON_CURVE: Final = 0.5
-"""Distance of a true cone from the mapped boundary at which the reach ends (m)."""
-SHORT: Final = 4.0
-"""Reach below which no planner can work (m)."""
-STARTING: Final = 0.03
-"""Share of lap 1 on which the map has only begun, and cycles don't count."""
-
-
-# --- the true road ---------------------------------------------------------------------------------------
+# --- reach -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,11 +152,6 @@ class TrueRoad:
     def counts(self, t: float, station: float) -> bool:
         """Return whether the cycle at a stamp (s), whose true station (m) is known, counts."""
         return bool(self.t[0] <= t <= self.t[-1]) and self.counted[0] <= station <= self.counted[1]
-
-    def ahead(self, station: float) -> slice:
-        """Return which of the cones are passed within the next `MOST` metres."""
-        first, stop = np.searchsorted(self.stations, [station, station + MOST])
-        return slice(int(first), int(stop))
 
 
 def true_road(truth: Truth) -> TrueRoad:
@@ -208,14 +197,8 @@ class CycleReach(NamedTuple):
     """Reach of the map in one cycle, a row of `RunResult.reach`."""
 
     reach: float
-    """Length ahead of the vehicle (m) over which the road is mapped on both sides."""
     squares: float
-    """Sum of squared distances (m^2) of the true cones on that stretch from the mapped boundaries."""
     cones: int
-    """Number of true cones on that stretch."""
-
-
-NOT_COUNTED: Final = CycleReach(np.nan, 0.0, 0)
 
 
 def cycle_reach(road: TrueRoad, station: float, pose_true: Array, pose: Array, track: Map) -> CycleReach:
@@ -224,7 +207,7 @@ def cycle_reach(road: TrueRoad, station: float, pose_true: Array, pose: Array, t
     The cones are placed by `map_T_vehicle * vehicle_T_cones`, with the estimated and with the true pose, so
     that only what the vehicle would see ahead of itself counts.
     """
-    ahead = road.ahead(station)
+    ahead = slice(*np.searchsorted(road.stations, [station, station + MOST]))
     cones, labels, away = road.cones[ahead], road.labels[ahead], road.stations[ahead] - station
     each = (len(cones), 3)
     points = to_map(to_vehicle(cones, np.broadcast_to(pose_true, each)), np.broadcast_to(pose, each))
@@ -251,13 +234,12 @@ class ReachObserver:
         self._rows: list[CycleReach] = []
 
     def __call__(self, cycle: ObservedCycle) -> None:
-        result = cycle.result
-        station, pose_true = self._road.at(result.t)
-        counts = self._road.counts(result.t, station)
-        row = (
-            cycle_reach(self._road, station, pose_true, result.pose, cycle.outline) if counts else NOT_COUNTED
-        )
-        self._rows.append(row)
+        road, result = self._road, cycle.result
+        station, pose_true = road.at(result.t)
+        if road.counts(result.t, station):
+            self._rows.append(cycle_reach(road, station, pose_true, result.pose, cycle.outline))
+        else:
+            self._rows.append(CycleReach(np.nan, 0.0, 0))
 
     @property
     def rows(self) -> Array:
