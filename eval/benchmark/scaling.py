@@ -27,8 +27,6 @@ Sweep = Literal["cones", "readings", "laps"]
 CONES: Final[Sweep] = "cones"
 READINGS: Final[Sweep] = "readings"
 LAPS: Final[Sweep] = "laps"
-LEAST_POINTS: Final = 3
-"""Least number of points of a slope: two would leave nothing to estimate its error from."""
 Logs = Sequence[tuple[Log, int, Array]]
 """Log, number of detections where that is varied, and the abscissa of each cycle; NaN doesn't count."""
 JUDGED: Final = 10
@@ -119,8 +117,7 @@ class Scaling:
     mapper: dict[str, Any]
     """Settings of the estimators, in full."""
     points: pd.DataFrame
-    """Row for each mean of some updates: `sweep`, `estimator`, `at` (mean number of cones, number of
-    detections, or lap), `seconds` of an update, number of `cycles`, mean `size` of the map."""
+    """Row for each mean of some updates, as `binned` returns them."""
     slopes: pd.DataFrame
     """Row for each sweep and estimator, as `fit_slope` returns it."""
     memory: dict[str, float]
@@ -146,7 +143,11 @@ class Scaling:
 
 
 def binned(sweep: Sweep, lane: Lane, edges: Array) -> pd.DataFrame:
-    """Return a point for each interval between two `edges` that holds cycles of a lane."""
+    """Return a point for each interval between two `edges` that holds cycles of a lane.
+
+    It has the mean abscissa `at`, the mean `seconds` of an update and `size` of the map, and the number of
+    `cycles`.
+    """
     at = lane.at[: len(lane.seconds)]
     frame = pd.DataFrame({"at": at, "seconds": lane.seconds, "size": lane.sizes})
     bins = np.searchsorted(edges, frame["at"], side="right") - 1
@@ -166,7 +167,7 @@ def fit_slope(
     """
     kept = points[points["at"] >= fit_from].astype({"at": float, "seconds": float})
     slope = error = float("nan")
-    if len(kept) >= LEAST_POINTS:
+    if len(kept) > 2:  # two would leave nothing to estimate the error from
         line = linregress(np.log(kept["at"]), np.log(kept["seconds"]))
         slope, error = float(line.slope), float(line.stderr)
     fitted = {"slope": slope, "error": error, "points": len(kept)}

@@ -25,26 +25,19 @@ from pathspace_graph.io.files import atomic_folder, write_json
 
 from .scaling import CONES, LAPS, READINGS, Scaling, Sweep
 
-FORMAT: Final = "pathspace-scaling/1"
 MARKER: Final = "scaling.json"
 """File by which a folder of results is known."""
 COMPARED_AT: Final = 200.0
 """Number of cones at which estimators are compared, that of an ordinary track."""
 
-_HEIGHT, _MARKER_SIZE = 3.1, 3.6
-"""Height of a figure (in), and size of the estimators' points (pt)."""
-_CONES_TICKS: Final = (50, 100, 200, 500, 1000, 2000)
-"""Labels of the axis of cones, as far as it reaches."""
+_HEIGHT: Final = 3.1
+"""Height of a figure (in)."""
 _TITLES: Final[dict[Sweep, tuple[str, str]]] = {
     CONES: ("cones seen", "(a) map size"),
     READINGS: ("detections per update", "(b) detections"),
     LAPS: ("lap", "time per lap on a closed road"),
 }
 """Axis title and title of each panel."""
-
-
-_DIGITS: Final = (2, 2, 1, 2, 0, 1, 1, 1)
-"""Digits of the columns of the table."""
 
 
 # --- table and files -------------------------------------------------------------------------------------
@@ -86,7 +79,8 @@ def scaling_table(scaling: Scaling) -> TextTable:
     header, found = scaling_figures(scaling)
     header, rows = (*header[:6], f"ms, lap 2 and {scaling.settings.laps}", header[8]), []
     for name, row in found.items():
-        *cells, second, last, peak = (_number(*of, digits) for of, digits in zip(row, _DIGITS, strict=True))
+        digits = (2, 2, 1, 2, 0, 1, 1, 1)
+        *cells, second, last, peak = (_number(*of, places) for of, places in zip(row, digits, strict=True))
         rows.append((name, *cells, f"{second}, {last}", peak))
     return TextTable("Time per update: slopes of the logarithms, +- standard error", header, tuple(rows))
 
@@ -110,17 +104,9 @@ def stops(scaling: Scaling) -> list[str]:
 
 def write_scaling(out: Path, scaling: Scaling) -> None:
     """Write `points.csv`, `scaling.json` (with slopes and settings), `table.md` and two figures."""
-    with atomic_folder(out, MARKER) as folder:
-        scaling.points.to_csv(folder / "points.csv", index=False, lineterminator="\n")
-        (folder / "table.md").write_text(scaling_table(scaling).markdown(), encoding="utf-8")
-        write_json(folder / MARKER, _content(scaling))
-        style.save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
-
-
-def _content(scaling: Scaling) -> dict[str, Any]:
     at = {name: scaling.seconds_at(COMPARED_AT, name) for name in scaling.estimators}
-    return {
-        "format": FORMAT,
+    content = {
+        "format": "pathspace-scaling/1",
         "slopes": scaling.slopes.to_dict("records"),
         "compared_at_cones": COMPARED_AT,
         "seconds_compared": at,
@@ -131,6 +117,11 @@ def _content(scaling: Scaling) -> dict[str, Any]:
         "estimator_settings": scaling.mapper,
         "versions": versions(),
     }
+    with atomic_folder(out, MARKER) as folder:
+        scaling.points.to_csv(folder / "points.csv", index=False, lineterminator="\n")
+        (folder / "table.md").write_text(scaling_table(scaling).markdown(), encoding="utf-8")
+        write_json(folder / MARKER, content)
+        style.save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
 
 
 def _process_megabytes() -> float | None:
@@ -151,11 +142,11 @@ def plot_scaling(scaling: Scaling) -> Figure:
                 _draw_power_law(axes, scaling, sweep, name, color)
                 if sweep == CONES and scaling.slope(sweep, name)["stopped"]:
                     last = scaling.of(sweep, name).iloc[-1]
-                    size = 3 * _MARKER_SIZE
-                    axes.plot(last["at"], 1e3 * last["seconds"], "x", color=color, markersize=size)
+                    axes.plot(last["at"], 1e3 * last["seconds"], "x", color=color, markersize=10.8)
             axes.set_xscale("log")
         cones.set_ylabel("mean update (ms)")
-        _label_ticks(cones, tuple(t for t in _CONES_TICKS if t <= scaling.settings.cones_max))
+        ticks = (50, 100, 200, 500, 1000, 2000)
+        _label_ticks(cones, tuple(tick for tick in ticks if tick <= scaling.settings.cones_max))
         _label_ticks(detections, scaling.settings.readings)
         style.shared_legend(figure, columns=min(len(scaling.estimators), 4))
     return figure
@@ -178,7 +169,7 @@ def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "no
     for name, color, marker in zip(scaling.estimators, cycle(PALETTE), cycle(MARKERS), strict=False):
         points = scaling.of(sweep, name)
         if len(points):
-            look: dict[str, Any] = {"linewidth": 0.7, "marker": marker, "markersize": _MARKER_SIZE}
+            look: dict[str, Any] = {"linewidth": 0.7, "marker": marker, "markersize": 3.6}
             milliseconds = 1e3 * points["seconds"]
             axes.plot(points["at"], milliseconds, linestyle=linestyle, color=color, label=name, **look)
             drawn[name] = color
