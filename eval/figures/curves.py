@@ -1,7 +1,6 @@
 """The uncertainty along a spline, with what its formula leaves out, and the simplification of a curve."""
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -37,11 +36,9 @@ class Uncertainty:
     length: Array
     """Parameters (n,) of the places, and lengths along the curve (m)."""
     joint: Array
-    """(n,) By the joint covariance, B Sigma B'."""
     marginals: Array
-    """(n,) By the paper's formula, the sum of beta_j^2 Sigma_j."""
     sampled: Array
-    """(n,) Of the splines drawn at random."""
+    """Sigmas (n,): B Sigma B', the paper's sum of beta_j^2 Sigma_j, and of splines drawn at random."""
     curves: Array
     """Points (s, n, 2) of the splines drawn at random (m)."""
 
@@ -86,16 +83,9 @@ def posterior(
     return np.asarray(np.linalg.inv(information + np.eye(len(information)) / sigma_anchor**2))
 
 
-_SEED: Final = 0
-_SHOWN: Final = 40
-"""Number of the splines drawn at random that are shown."""
-_EVERY: Final = 6
-"""Stride of the places at which the spread of the samples is marked."""
-
-
 def plot_uncertainty() -> tuple[Figure, str]:
     """Draw (a) the uncertainty of control points and curve, (b) its sigma across itself in three ways."""
-    data = uncertainty(np.random.default_rng(_SEED))
+    data = uncertainty(np.random.default_rng(0))
     with style.figure_context():
         figure = Figure((WIDTH, 4.6), layout="constrained")
         above, below = figure.subplots(2, 1, height_ratios=(1.55, 1.0))
@@ -112,7 +102,7 @@ def plot_uncertainty() -> tuple[Figure, str]:
 
 def _draw_curves(axes: Axes, data: Uncertainty) -> None:
     points = data.boundary.spline.control_points
-    for number, curve in enumerate(data.curves[:_SHOWN]):
+    for number, curve in enumerate(data.curves[:40]):
         label = None if number else "sampled splines"
         axes.plot(*curve.T, color=LIGHT, linewidth=THIN_WIDTH, zorder=1.5, label=label)
     edges = style.uncertainty_band(data.boundary, data.u)
@@ -132,7 +122,7 @@ def _draw_sigmas(axes: Axes, data: Uncertainty) -> None:
     axes.plot(data.length, data.joint, color=BLUE, label="joint covariance, $BΣB^⊤$")
     marginals = r"marginals only, $\Sigma_j\, β_j^2 Σ_{C_j}$"
     axes.plot(data.length, data.marginals, color=ORANGE, linestyle="--", label=marginals)
-    spread = np.stack([data.length, data.sampled], axis=1)[::_EVERY]
+    spread = np.stack([data.length, data.sampled], axis=1)[::6]
     style.draw_points(axes, spread, ".", "black", f"spread of {len(data.curves)} sampled splines", zorder=2)
     axes.set(xlim=(0.0, data.length[-1]), ylim=(0.0, 1.25 * float(data.joint.max())))
     axes.set(xlabel="length along the curve [m]", ylabel="σ [m]")
@@ -141,10 +131,6 @@ def _draw_sigmas(axes: Axes, data: Uncertainty) -> None:
 
 
 # --- simplification --------------------------------------------------------------------------------------
-
-# the left boundary of a generated track of some length (m) gets fewer control points
-_TRACK_SEED, _LAP_LENGTH = 3, (200.0, 260.0)
-_BEFORE, _AFTER, _SAMPLES = 100, 32, 1500
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +152,8 @@ class Simplification:
 
     old: BSpline
     length: Array
-    """Lengths (n,) along the old curve at which the errors are taken (m)."""
     curvature: Array
-    """Old curve's curvature (n,) there (1/m)."""
+    """Lengths (n,) along the old curve at which the errors are taken (m), and its curvature there (1/m)."""
     weighted: Simplified
     uniform: Simplified
     """Curve on as many knots at equal lengths."""
@@ -176,17 +161,15 @@ class Simplification:
 
 def simplification() -> Simplification:
     """Fit a spline of many control points to a generated boundary, and simplify it in two ways."""
-    settings = TrackGeneratorSettings(lap_length=_LAP_LENGTH)
-    track = generate_track(np.random.default_rng(_TRACK_SEED), settings)
-    old = fit_spline(np.asarray(track.left), _BEFORE, periodic=True)
-    length = old.length() * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    track = generate_track(np.random.default_rng(3), TrackGeneratorSettings(lap_length=(200.0, 260.0)))
+    old = fit_spline(np.asarray(track.left), 100, periodic=True)
+    length = old.length() * (np.arange(1500) + 0.5) / 1500
     u = old.parameters_at(length)
     points = old.evaluate(u)
 
     def simplified(baseline: float) -> Simplified:
-        empty = BSpline.periodic_from(
-            curvature_weighted_breaks(old, _AFTER, baseline), np.zeros((_AFTER, 2)), old.degree
-        )
+        breaks = curvature_weighted_breaks(old, 32, baseline)
+        empty = BSpline.periodic_from(breaks, np.zeros((32, 2)), old.degree)
         curve = empty.with_points(refit(old, empty).new_from_old @ old.distinct_control_points)
         return Simplified(curve, np.linalg.norm(points - closest_points(curve, points).position, axis=1))
 
