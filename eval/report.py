@@ -23,8 +23,7 @@ from pathspace_graph.sim.mistakes import MISTAKES
 from . import real, views
 from .benchmark.measurement import measure_drive, metrics
 from .benchmark.roads import QUICK, ScalingSettings, make_drives
-from .benchmark.scaling import measure_scaling
-from .benchmark.scaling_output import scaling_figures
+from .benchmark.scaling import measure_scaling, scaling_figures
 from .experiment.cells import ESTIMATORS as ESTIMATOR_ROOMS
 from .experiment.cells import code_digest
 from .experiment.faults import kinds, of_middle_strength, only, suite

@@ -1,4 +1,4 @@
-"""Every estimator on the same logs: their frame, the paper's Table 1, all metrics, and paired differences."""
+"""Every estimator on the same logs: the paper's Table 1, all metrics, paired differences, and all files."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,25 +12,29 @@ import pandas as pd
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
 from pathspace_graph.eval.metrics.measures import online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.reference import gap
-from pathspace_graph.eval.metrics.summary import has_cones
-from pathspace_graph.io.files import is_temporary
+from pathspace_graph.eval.metrics.summary import has_cones, summarize, versions
+from pathspace_graph.io.files import atomic_folder, is_temporary, write_json
 from pathspace_graph.io.log import LOG_FILE
 from pathspace_graph.io.map import SplineBoundary
-from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
 from .cells import Cell, NamedLog, Outcome, run_cell
 from .frame import add_batch, difference
+from .plots import blind_spot_figure, plot_maps
 from .run import OnCell, run_cells
 from .study import known_estimators
 from .tables import TextTable, group_starts
 
+MARKER: Final = "comparison.json"
+"""File by which a comparison's folder is recognized."""
 RUN: Final = ("log", "estimator")
 _PRINTED: Final = (
     *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "two_way", "ghost_share", "size", "ate"),
@@ -276,3 +280,51 @@ def _title(comparison: Comparison, when: str) -> str:
 
 def _cell(metric: Metric, row: dict[Any, Any]) -> str:
     return metric.text(float(row.get(metric.key, np.nan)))
+
+
+# --- files -----------------------------------------------------------------------------------------------
+
+
+def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
+    """Write all files of a comparison (docs/formats.md), or on failure none.
+
+    Where there are several logs, each has a folder of its own. An earlier comparison in `out` is kept as a
+    numbered backup.
+    """
+    frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": comparison.times()}
+    if comparison.paired:
+        frames["paired"] = paired_frame(comparison)
+    with atomic_folder(out, MARKER) as folder:
+        for name, table in tables(comparison).items():
+            (folder / f"{name}.md").write_text(table.markdown(), encoding="utf-8")
+            (folder / f"{name}.tex").write_text(table.latex(), encoding="utf-8")
+        for name, frame in frames.items():
+            frame.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
+        for named in comparison.logs:
+            _write_log(folder if len(comparison.logs) == 1 else folder / named.name, named, comparison)
+        about = {
+            "format": "pathspace-comparison/1",
+            "logs": [named.name for named in comparison.logs],
+            "estimators": comparison.estimators,
+            "reference": comparison.reference,
+            "failures": [{**o.names, "error": o.failure} for o in comparison.failures],
+            "jobs": jobs,
+            "settings": asdict(settings),
+            "versions": versions(),
+        }
+        write_json(folder / MARKER, about)
+
+
+def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
+    folder.mkdir(exist_ok=True)
+    found = comparison.of(named.name)
+    maps = {str(o.names["estimator"]): o.result.map for o in found if o.result is not None}
+    for outcome in found:
+        if outcome.result is not None:
+            summary = summarize(outcome.result, named.log, named.hints)
+            write_result(folder / outcome.names["estimator"], outcome.result, summary)
+    if maps:
+        save_figures(folder, {"maps": plot_maps(found, named.log)})
+    if named.log.truth is not None and comparison.reference in maps:
+        figure = blind_spot_figure(maps, comparison.reference, named.log.truth)
+        save_figures(folder, {} if figure is None else {"blind_spot": figure})

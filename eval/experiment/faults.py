@@ -1,5 +1,6 @@
 """The suite of faults: a study whose noises are single faults, `fault: strength`, each beside a clean run."""
 
+import json
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -10,19 +11,26 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from pathspace_graph.errors import SettingsError, check_name
+from pathspace_graph.eval.figures import style
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, ORANGE, WIDTH
 from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN
+from pathspace_graph.io.files import write_json, write_text
 from pathspace_graph.plausibility.diagnosis import LIMIT
 
 from .frame import RUN, last_laps
 from .study import Study, find_study, read_study
-from .tables import TextTable, group_starts
+from .tables import TextTable, group_starts, write_csv, write_results
 
 SUITE: Final = Path("faults")
 """Name of the shipped study that is the suite."""
 CLEAN: Final = "clean"
 """Name of the noise without a fault, which every other one is compared with."""
+FAULT_COLUMNS: Final = 4
+"""Panels side by side in the figure of faults."""
 Values = Mapping[str, Any]
 """Values of an outcome by name."""
 _WORST: Final = ("error_max", "error_end", "astray_time", "astray_way")
@@ -211,3 +219,84 @@ COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
     "said": _said,
 }
 """Columns of the table after the fault and its strength, each made of the values of an outcome."""
+
+
+# --- figure and files ------------------------------------------------------------------------------------
+
+
+def plot_faults(study: Study, runs: pd.DataFrame) -> Figure:
+    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said.
+
+    The runs are those of `beside_clean`.
+    """
+    panels = [noises for noises in by_kind(study) if noises != [CLEAN]]
+    rows = max(1, -(-len(panels) // FAULT_COLUMNS))
+    with style.figure_context():
+        figure = Figure(figsize=(WIDTH, 0.5 + 1.45 * rows), layout="constrained")
+        every = figure.subplots(rows, FAULT_COLUMNS, sharey=True, squeeze=False).ravel()
+        for axes, noises in zip(every, panels, strict=False):
+            _draw_fault(axes, noises, runs)
+        for axes in every[len(panels) :]:
+            axes.set_visible(False)
+        ratios = np.append(runs["ratio"].dropna(), 1.0)
+        every[0].set_yscale("log")
+        every[0].set_ylim(ratios.min() / 1.15, ratios.max() * 1.15)
+        style.label_logarithms(every[0])
+        figure.supylabel("rmse by that of the clean run")
+        style.shared_legend(figure, columns=6)
+    return figure
+
+
+def _draw_fault(axes: Axes, noises: Sequence[str], runs: pd.DataFrame) -> None:
+    axes.axhline(1.0, color=DARK, linewidth=0.6)
+    means = []
+    for at, noise in enumerate(noises):
+        own = runs[runs["noise"] == noise]
+        means.append(own["ratio"].mean())
+        spread = 0.15 if len(own) > 1 else 0.0
+        places = at + np.linspace(-spread, spread, len(own))
+        for place, *run in zip(places, own["ratio"], own["lost_at_end"] == 1.0, own["told"], strict=True):
+            _draw_faulty_run(axes, float(place), *run)
+    known = np.flatnonzero(~np.isnan(means))
+    if len(known):
+        axes.plot(known, np.array(means)[known], color=BLUE, linewidth=0.9, label="mean", zorder=1)
+    faults = [fault_of(noise) for noise in noises]
+    axes.set_xticks(range(len(faults)), [f"{fault.value:g}" for fault in faults])
+    axes.set_xlim(-0.5, len(faults) - 0.5)
+    title = f"{faults[0].kind} [{faults[0].unit}]".removesuffix(" []")
+    cut = title.rfind(" ", 0, 30) if len(title) > 30 else 0
+    axes.set_title(f"{title[:cut]}\n{title[cut + 1 :]}" if cut > 0 else title)
+    axes.grid(axis="y")
+
+
+def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool) -> None:
+    """Draw a triangle where the vehicle is lost at the end, a cross at the top where there is no map."""
+    if np.isnan(ratio):
+        edge = axes.get_xaxis_transform()
+        axes.plot(at, 0.95, "x", color=ORANGE, markersize=4.0, transform=edge, label="no map")
+        return
+    color = ORANGE if lost else GREEN
+    label = f"{'lost at the end' if lost else 'not lost'}{', said so' if told else ''}"
+    look: dict[str, Any] = {"markerfacecolor": color if told else "none", "markersize": 4.0}
+    axes.plot(at, ratio, "^" if lost else "o", color=color, markeredgewidth=0.8, label=label, **look)
+
+
+def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write the results of every run, and the table, the values and the figure; return the table's text.
+
+    `faults.csv` has calibration and notices as JSON texts.
+    """
+    faults = outcomes(study, frame)
+    table = fault_table(study, faults)
+    text = f"{table.title}\n\n{table.text()}\n"
+    write_results(frame, out)
+    for suffix, content in (("txt", text), ("md", table.markdown()), ("tex", table.latex())):
+        write_text(out / f"faults.{suffix}", content)
+    about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
+    write_json(out / "faults.json", {"format": "pathspace-faults/1", **about, "faults": faults}, indent=1)
+    flat = pd.DataFrame(faults)
+    for key in ("calibration", "said"):
+        flat[key] = [json.dumps(value, ensure_ascii=False) for value in flat[key]]
+    write_csv(out / "faults.csv", flat)
+    style.save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})
+    return text

@@ -1,34 +1,26 @@
-"""Figures: differences from the baseline, faults, and maps side by side."""
+"""Maps side by side over the truth: whole tracks, and the stretch where landmarks miss most cones."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 
 from pathspace_graph.eval.figures import map_plot, style
 from pathspace_graph.eval.figures.map_plot import MARGIN, WHOLE_TRACK, MapStyle
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, ORANGE, RED, WIDTH
+from pathspace_graph.eval.figures.style import RED, WIDTH
 from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
-from pathspace_graph.eval.metrics.metric import METRICS, PAPER
+from pathspace_graph.eval.metrics.metric import PAPER
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log, Truth
-from pathspace_graph.io.map import Map
+from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES
 
 from .cells import Outcome
-from .faults import CLEAN, by_kind, fault_of
-from .frame import Contrast, contrasts
-from .study import Study
 
-MAX_PANELS: Final = 3
-"""Most metrics side by side in the figure of differences."""
-FAULT_COLUMNS: Final = 4
-"""Panels side by side in the figure of faults."""
 COLUMNS: Final = (2, 3, 4)
 """Numbers of maps side by side; the first with which the figure fits a page is taken."""
 MAX_HEIGHT: Final = 10.0
@@ -37,127 +29,6 @@ DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)
 """Distances (m) within which nothing is mapped at a missed cone, in the order in which they are tried."""
 CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
 """Style of a panel that shows a short stretch of a track."""
-
-
-# --- differences -----------------------------------------------------------------------------------------
-
-
-def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
-    """Draw every pair, their mean and its interval: a row for each combination, a panel for each metric.
-
-    Only the first metrics of the study have a panel, and there is none where no run differs.
-    """
-    panels = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
-    panels = [p for p in panels if any(d != 0.0 for contrast in p for d in contrast.differences)]
-    panels = panels[:MAX_PANELS]
-    if not panels:
-        return None
-    rows = [i for i in range(len(panels[0])) if any(panel[i].differences for panel in panels)]
-    names = [_name(study, panels[0][i]) for i in rows]
-    with style.figure_context():
-        figure = Figure(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
-        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-        for axes, panel in zip(all_axes, panels, strict=True):
-            _draw_differences(axes, [panel[i] for i in rows])
-        all_axes[0].set_yticks(range(len(rows)), names)
-        all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
-        text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
-        figure.supxlabel(text)
-    return figure
-
-
-def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
-    metric = METRICS[rows[0].metric]
-    rng = np.random.default_rng(0)
-    axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
-    for row, contrast in enumerate(rows):
-        if contrast.difference is None or not contrast.difference.count:
-            continue
-        color = BLUE if contrast.significant else GREY
-        pairs = metric.factor * np.array(contrast.differences)
-        scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
-        axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
-        mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
-        look: dict[str, Any] = {"color": color, "markersize": 4.5, "elinewidth": 1.0}
-        axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", zorder=3, **look)
-    axes.set_title(metric.heading)
-    axes.grid(axis="x")
-
-
-def _name(study: Study, contrast: Contrast) -> str:
-    """Return the names of a combination that others have differently, `sigma_spacing=1` for
-    `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
-    counts = {"noise": study.noise, "estimator": study.estimators, "variant": study.points}
-    several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
-    name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
-    last = {field: field.rpartition(".")[2] for field in study.varied}
-    if len(set(last.values())) == len(last):
-        for field, short in last.items():
-            name = name.replace(f"{field}=", f"{short}=")
-    return name
-
-
-# --- faults ----------------------------------------------------------------------------------------------
-
-
-def plot_faults(study: Study, runs: pd.DataFrame) -> Figure:
-    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said.
-
-    The runs are those of `beside_clean`.
-    """
-    panels = [noises for noises in by_kind(study) if noises != [CLEAN]]
-    rows = max(1, -(-len(panels) // FAULT_COLUMNS))
-    with style.figure_context():
-        figure = Figure(figsize=(WIDTH, 0.5 + 1.45 * rows), layout="constrained")
-        every = figure.subplots(rows, FAULT_COLUMNS, sharey=True, squeeze=False).ravel()
-        for axes, noises in zip(every, panels, strict=False):
-            _draw_fault(axes, noises, runs)
-        for axes in every[len(panels) :]:
-            axes.set_visible(False)
-        ratios = np.append(runs["ratio"].dropna(), 1.0)
-        every[0].set_yscale("log")
-        every[0].set_ylim(ratios.min() / 1.15, ratios.max() * 1.15)
-        style.label_logarithms(every[0])
-        figure.supylabel("rmse by that of the clean run")
-        style.shared_legend(figure, columns=6)
-    return figure
-
-
-def _draw_fault(axes: Axes, noises: Sequence[str], runs: pd.DataFrame) -> None:
-    axes.axhline(1.0, color=DARK, linewidth=0.6)
-    means = []
-    for at, noise in enumerate(noises):
-        own = runs[runs["noise"] == noise]
-        means.append(own["ratio"].mean())
-        spread = 0.15 if len(own) > 1 else 0.0
-        places = at + np.linspace(-spread, spread, len(own))
-        for place, *run in zip(places, own["ratio"], own["lost_at_end"] == 1.0, own["told"], strict=True):
-            _draw_faulty_run(axes, float(place), *run)
-    known = np.flatnonzero(~np.isnan(means))
-    if len(known):
-        axes.plot(known, np.array(means)[known], color=BLUE, linewidth=0.9, label="mean", zorder=1)
-    faults = [fault_of(noise) for noise in noises]
-    axes.set_xticks(range(len(faults)), [f"{fault.value:g}" for fault in faults])
-    axes.set_xlim(-0.5, len(faults) - 0.5)
-    title = f"{faults[0].kind} [{faults[0].unit}]".removesuffix(" []")
-    cut = title.rfind(" ", 0, 30) if len(title) > 30 else 0
-    axes.set_title(f"{title[:cut]}\n{title[cut + 1 :]}" if cut > 0 else title)
-    axes.grid(axis="y")
-
-
-def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool) -> None:
-    """Draw a triangle where the vehicle is lost at the end, a cross at the top where there is no map."""
-    if np.isnan(ratio):
-        edge = axes.get_xaxis_transform()
-        axes.plot(at, 0.95, "x", color=ORANGE, markersize=4.0, transform=edge, label="no map")
-        return
-    color = ORANGE if lost else GREEN
-    label = f"{'lost at the end' if lost else 'not lost'}{', said so' if told else ''}"
-    look: dict[str, Any] = {"markerfacecolor": color if told else "none", "markersize": 4.0}
-    axes.plot(at, ratio, "^" if lost else "o", color=color, markeredgewidth=0.8, label=label, **look)
-
-
-# --- maps side by side ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +77,20 @@ def _densest(points: Array, weights: Array, half_size: tuple[float, float]) -> A
     best = max(neighbours, key=lambda members: (len(members), float(weights[members].sum())))
     chosen: Array = points[best]
     return np.asarray(0.5 * (chosen.min(axis=0) + chosen.max(axis=0)))
+
+
+def blind_spot_figure(maps: Mapping[str, Map], reference: str, truth: Truth) -> Figure | None:
+    """Return the reference beside the first landmark map that misses cones that it passes, or None."""
+    points = [
+        name
+        for name, track in maps.items()
+        if any(isinstance(boundary, PointBoundary) for boundary in track.boundaries.values())
+    ]
+    for name in points if reference not in points else ():
+        spot = find_blind_spot(truth, maps[reference], maps[name])
+        if spot is not None:
+            return plot_blind_spot(spot, [(reference, maps[reference]), (name, maps[name])], truth)
+    return None
 
 
 def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:

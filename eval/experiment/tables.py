@@ -1,19 +1,38 @@
-"""Tables as text, Markdown and LaTeX, and a study's own: differences from the baseline, columns by track."""
+"""Tables in every form, and the files of a study: its tables, tidy results, and a figure of differences."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from pathlib import Path
+from typing import Any, Final, Self
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
 
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, figure_context, save_figures
 from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, Metric, column_of
+from pathspace_graph.io.files import replacing, write_text
 
-from .frame import COMBINATION, LEVEL, RUN, RUN_OF, Estimate, contrasts, last_laps
+from .frame import (
+    COMBINATION,
+    LEVEL,
+    RUN,
+    RUN_OF,
+    Contrast,
+    Estimate,
+    contrasts,
+    last_laps,
+    times_of,
+    without_times,
+)
 from .study import Study
+
+MAX_PANELS: Final = 3
+"""Most metrics side by side in the figure of differences."""
 
 _UNICODE: Final = str.maketrans(
     {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
@@ -96,7 +115,7 @@ def group_starts(rows: Sequence[Sequence[str]]) -> tuple[int, ...]:
     return tuple(k for k in range(1, len(rows)) if rows[k][0] != rows[k - 1][0])
 
 
-# --- studies ---------------------------------------------------------------------------------------------
+# --- tables of studies ---------------------------------------------------------------------------------
 
 
 def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
@@ -189,3 +208,89 @@ def _values(column: Column, frame: pd.DataFrame) -> pd.DataFrame:
     done = done.reindex(columns=[*RUN, *(metric.key for metric in column.metrics)])
     by_run = done.groupby([*RUN], sort=False)
     return pd.DataFrame({m.key: by_run[m.key].agg(m.over) for m in column.metrics})
+
+
+# --- files of studies ------------------------------------------------------------------------------------
+
+
+def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write the tables and the figures of a study, and return the text of its summary."""
+    summary, differences = write_tables(study, frame, out), plot_differences(study, frame)
+    if differences is not None:
+        save_figures(out / "figures", {"differences": differences})
+    return summary
+
+
+def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write `results.csv`, `times.csv` and the summary in three forms, and return its text."""
+    write_results(frame, out)
+    tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
+    for suffix, form in (("txt", as_text), ("md", as_markdown), ("tex", as_latex)):
+        write_text(out / f"summary.{suffix}", form(tables, note))
+    return as_text(tables, note)
+
+
+def write_results(frame: pd.DataFrame, out: Path) -> None:
+    write_csv(out / "results.csv", without_times(frame))
+    write_csv(out / "times.csv", times_of(frame))
+
+
+def write_csv(file: Path, frame: pd.DataFrame) -> None:
+    """Write a frame without its index, whole or not at all."""
+    with replacing(file) as temporary:
+        frame.to_csv(temporary, index=False, lineterminator="\n")
+
+
+def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
+    """Draw every pair, their mean and its interval: a row for each combination, a panel for each metric.
+
+    Only the first metrics of the study have a panel, and there is none where no run differs.
+    """
+    panels = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
+    panels = [p for p in panels if any(d != 0.0 for contrast in p for d in contrast.differences)]
+    panels = panels[:MAX_PANELS]
+    if not panels:
+        return None
+    rows = [i for i in range(len(panels[0])) if any(panel[i].differences for panel in panels)]
+    names = [_name(study, panels[0][i]) for i in rows]
+    with figure_context():
+        figure = Figure(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
+        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, panel in zip(all_axes, panels, strict=True):
+            _draw_differences(axes, [panel[i] for i in rows])
+        all_axes[0].set_yticks(range(len(rows)), names)
+        all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
+        text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
+        figure.supxlabel(text)
+    return figure
+
+
+def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
+    metric = METRICS[rows[0].metric]
+    rng = np.random.default_rng(0)
+    axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
+    for row, contrast in enumerate(rows):
+        if contrast.difference is None or not contrast.difference.count:
+            continue
+        color = BLUE if contrast.significant else GREY
+        pairs = metric.factor * np.array(contrast.differences)
+        scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
+        axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
+        mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
+        look: dict[str, Any] = {"color": color, "markersize": 4.5, "elinewidth": 1.0}
+        axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", zorder=3, **look)
+    axes.set_title(metric.heading)
+    axes.grid(axis="x")
+
+
+def _name(study: Study, contrast: Contrast) -> str:
+    """Return the names of a combination that others have differently, `sigma_spacing=1` for
+    `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
+    counts = {"noise": study.noise, "estimator": study.estimators, "variant": study.points}
+    several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
+    name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
+    last = {field: field.rpartition(".")[2] for field in study.varied}
+    if len(set(last.values())) == len(last):
+        for field, short in last.items():
+            name = name.replace(f"{field}=", f"{short}=")
+    return name

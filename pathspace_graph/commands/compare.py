@@ -8,8 +8,7 @@ from tyro.conf import Positional, arg
 
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.eval.experiment import compare as experiment
-from pathspace_graph.eval.experiment.compare import Comparison, compare, tables
-from pathspace_graph.eval.experiment.output import MARKER, write_comparison
+from pathspace_graph.eval.experiment.compare import MARKER, Comparison, compare, tables, write_comparison
 from pathspace_graph.eval.experiment.run import check_jobs
 from pathspace_graph.eval.metrics.accuracy import GhostSettings
 from pathspace_graph.io.files import check_target
