@@ -55,19 +55,15 @@ class Benchmark:
 def main() -> None:
     """Run the script; the exit code is 1 where a figure is worse than the baseline, 2 on bad files."""
     try:
-        worse = _is_worse(tyro.cli(Benchmark))
+        if _is_worse(tyro.cli(Benchmark)):
+            raise SystemExit(WORSE)
     except PathspaceError as error:
         note(f"benchmark: {error}")
         raise SystemExit(BAD_INPUT) from error
-    if worse:
-        raise SystemExit(WORSE)
 
 
 def _is_worse(benchmark: Benchmark) -> bool:
-    """Measure, write and report; return whether anything is worse than the baseline.
-
-    OutputError or InputError, before anything runs, where a file can't be written or read.
-    """
+    """Measure, write and report; return whether anything is worse than the baseline."""
     for file in (benchmark.json, benchmark.baseline if benchmark.write_baseline else None):
         if file is not None:
             check_file_target(file)

@@ -110,10 +110,9 @@ def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
 
     `runs` that finished count, `failed` ones don't. What is not known is NaN.
     """
-    runs = beside_clean(frame)
-    failures = frame[frame["failure"] != ""].groupby("noise").size()
+    every, failures = beside_clean(frame), frame.loc[frame["failure"] != "", "noise"].value_counts()
     return [
-        _outcome(fault_of(noise), runs[runs["noise"] == noise], int(failures.get(noise, 0)))
+        _outcome(fault_of(noise), every[every["noise"] == noise], int(failures.get(noise, 0)))
         for noise in study.noise
     ]
 

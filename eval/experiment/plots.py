@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -36,9 +36,8 @@ class BlindSpot:
     """Stretch of the track, and the true cones in it that maps miss."""
 
     centre: Array
-    """Centre (2,) of the stretch in m, map frame."""
     half_size: tuple[float, float]
-    """Half width and half height of the stretch (m)."""
+    """Centre (2,), half width and half height of the stretch in m, map frame."""
     distance: float
     """Distance (m) within which nothing is mapped at a missed cone."""
     cones: int
@@ -60,7 +59,10 @@ def find_blind_spot(
     for distance in DISTANCES:
         bridged = (distances[0] <= distance) & (distances[1] > distance)
         if bridged.any():
-            centre = _densest(cones[bridged], np.minimum(distances[1][bridged], 10.0), half_size)
+            points, weights = cones[bridged], np.minimum(distances[1][bridged], 10.0)
+            near: Any = KDTree(points / half_size).query_ball_point(points / half_size, 1.0, p=np.inf)
+            chosen = points[max(near, key=lambda members: (len(members), weights[members].sum()))]
+            centre = 0.5 * (chosen.min(axis=0) + chosen.max(axis=0))
             inside = (np.abs(cones - centre) <= half_size).all(axis=1)
             missed = tuple(cones[inside & (d > distance)] for d in distances)
             spot = BlindSpot(centre, half_size, distance, int(inside.sum()), missed)
@@ -68,15 +70,6 @@ def find_blind_spot(
                 return spot
             best = best or spot
     return best
-
-
-def _densest(points: Array, weights: Array, half_size: tuple[float, float]) -> Array:
-    """Return the centre (2,) of the points (k, 2) around the one with most neighbours, then most weight."""
-    scaled = points / np.array(half_size)
-    neighbours = KDTree(scaled).query_ball_point(scaled, 1.0, p=np.inf)
-    best = max(neighbours, key=lambda members: (len(members), float(weights[members].sum())))
-    chosen: Array = points[best]
-    return np.asarray(0.5 * (chosen.min(axis=0) + chosen.max(axis=0)))
 
 
 def blind_spot_figure(maps: Mapping[str, Map], reference: str, truth: Truth) -> Figure | None:
@@ -94,9 +87,13 @@ def blind_spot_figure(maps: Mapping[str, Map], reference: str, truth: Truth) -> 
 
 
 def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:
-    """Draw a panel for each map over the truth, all of the same area; failures have no panel."""
+    """Draw a panel for each map over the truth, all of the area of the true cones, or else of all maps."""
     drawn = [(outcome, outcome.result.map) for outcome in outcomes if outcome.result is not None]
-    low, high = _extent([track for _, track in drawn], log.truth)
+    points = [] if log.truth is None else [log.truth.cones]
+    if not sum(map(len, points)):
+        points = [mapped_points(boundary) for _, track in drawn for boundary in track.boundaries.values()]
+    together = np.concatenate([np.zeros((1, 2)), *points])
+    low, high = together.min(axis=0) - MARGIN, together.max(axis=0) + MARGIN
     with style.figure_context():
         figure, panels, columns = _panels(len(drawn), (high - low) / 2.0)
         for axes, (outcome, track) in zip(panels, drawn, strict=False):
@@ -165,12 +162,3 @@ def _caption(outcome: Outcome) -> str:
     row = outcome.rows[-1].values
     *words, size = (f"{m.title} {m.text(float(row[m.key]))} {m.unit}".strip() for m in PAPER if m.key in row)
     return "\n".join([outcome.names["estimator"], ", ".join(words), size])
-
-
-def _extent(maps: Sequence[Map], truth: Truth | None) -> tuple[Array, Array]:
-    """Return two corners (2,) around the true cones and a margin, or around all maps without true cones."""
-    points = [truth.cones] if truth is not None and len(truth.cones) else []
-    if not points:
-        points = [mapped_points(boundary) for track in maps for boundary in track.boundaries.values()]
-    together = np.concatenate([np.zeros((1, 2)), *points])
-    return together.min(axis=0) - MARGIN, together.max(axis=0) + MARGIN

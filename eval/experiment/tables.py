@@ -120,7 +120,19 @@ def group_starts(rows: Sequence[Sequence[str]]) -> tuple[int, ...]:
 
 def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
     """Return a table for each metric of the study that its runs have."""
-    return [_table(study, frame, metric) for metric in study.metrics if metric in frame]
+    several, tables = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"], []
+    for metric in (METRICS[key] for key in study.metrics if key in frame):
+        rows = []
+        for contrast in contrasts(study, frame, metric.key):
+            names = (getattr(contrast, name) for name in several)
+            value, difference = contrast.value, contrast.difference
+            by = ("baseline", "") if difference is None else _figures(metric, difference, "+")
+            p = "" if np.isnan(contrast.p) else f"{contrast.p:.3f}" if contrast.p >= 0.001 else "<0.001"
+            mark = "*" if contrast.significant else ""
+            rows.append((*names, str(value.count), *_figures(metric, value), *by, p, mark))
+        header = (*several, "runs", "mean", "95 %", "difference", "95 %", "p", "")
+        tables.append(TextTable(metric.heading, header, tuple(rows), names=len(several)))
+    return tables
 
 
 def caption(study: Study, frame: pd.DataFrame) -> str:
@@ -135,19 +147,6 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
         f"paired over track and seed; p of the paired t-test, corrected by Holm's method over all "
         f"comparisons of the metric; * where p < {1 - LEVEL:.2f}."
     )
-
-
-def _table(study: Study, frame: pd.DataFrame, key: str) -> TextTable:
-    several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"]
-    header, rows, metric = (*several, "runs", "mean", "95 %", "difference", "95 %", "p", ""), [], METRICS[key]
-    for contrast in contrasts(study, frame, key):
-        names = (getattr(contrast, name) for name in several)
-        value, difference = contrast.value, contrast.difference
-        by = ("baseline", "") if difference is None else _figures(metric, difference, "+")
-        p = "" if np.isnan(contrast.p) else f"{contrast.p:.3f}" if contrast.p >= 0.001 else "<0.001"
-        mark = "*" if contrast.significant else ""
-        rows.append((*names, str(value.count), *_figures(metric, value), *by, p, mark))
-    return TextTable(metric.heading, header, tuple(rows), names=len(several))
 
 
 def _figures(metric: Metric, of: Estimate, sign: str = "") -> tuple[str, str]:
@@ -215,9 +214,8 @@ def _values(column: Column, frame: pd.DataFrame) -> pd.DataFrame:
 
 def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write the tables and the figures of a study, and return the text of its summary."""
-    summary, differences = write_tables(study, frame, out), plot_differences(study, frame)
-    if differences is not None:
-        save_figures(out / "figures", {"differences": differences})
+    summary, figure = write_tables(study, frame, out), plot_differences(study, frame)
+    save_figures(out / "figures", {} if figure is None else {"differences": figure})
     return summary
 
 

@@ -56,12 +56,15 @@ def expansion() -> Expansion:
 
     Detections lie on the curve and beyond its end.
     """
-    before, settings = _known_curve(), CkfSettings(threshold=2.0, separation=2.0)
+    # a curve along the bend that drifts to its outside and ends beside the origin
+    along, settings = np.linspace(-18.0, 0.0, 13), CkfSettings(threshold=2.0, separation=2.0)
+    spline = fit_spline(_on_bend(along, -0.03 * (along - along[0])), 6, periodic=False)
+    seen = np.linspace(*spline.domain, 12)
+    before = SplineBoundary(spline, posterior(spline, seen, 0.3, 0.5, 1.0))
     detections = _on_bend(np.array([-5.5, -2.6, 2.2, 4.6, 7.0]), np.array([0.1, 0.25, 0.3, 0.05, 0.2]))
     covariances = np.tile(SIGMA_DETECTION**2 * np.eye(2), (len(detections), 1, 1))
-    spline, high = before.spline, before.spline.domain[1]
     foot_u = spline.foot_points(detections).u
-    expands = beyond_end(detections, foot_u, high, spline.control_points, settings)
+    expands = beyond_end(detections, foot_u, spline.domain[1], spline.control_points, settings)
     beyond = np.flatnonzero(expands)
     order = beyond[proximity_chain(detections[beyond], spline.control_points[-1])]
     extended = extend(before, detections[order[-1]], covariances[order[-1]])
@@ -94,15 +97,6 @@ def update(boundary: SplineBoundary, detections: Array, covariances: Array) -> S
     return SplineBoundary(spline.with_points(points), keep @ P @ keep.T + gain @ R @ gain.T)
 
 
-def _known_curve() -> SplineBoundary:
-    """Return a clamped curve along the bend that drifts to its outside and ends beside the origin."""
-    along = np.linspace(-18.0, 0.0, 13)
-    row = _on_bend(along, -0.03 * (along - along[0]))
-    spline = fit_spline(row, 6, periodic=False)
-    seen = np.linspace(*spline.domain, 12)
-    return SplineBoundary(spline, posterior(spline, seen, 0.3, 0.5, 1.0))
-
-
 def _on_bend(along: Array, inside: Array) -> Array:
     """Return points (m, 2) of a left bend of 30 m that passes the origin eastward, m."""
     angle, r = along / 30.0, 30.0 - inside
@@ -128,7 +122,9 @@ def plot_expansion() -> tuple[Figure, str]:
         for axes, (title, boundary, before) in zip(panels, steps, strict=True):
             _draw_step(axes, data, boundary, data.expands if before is None else interpolated)
             if before is None:
-                _draw_chain(axes, data)
+                ends = (data.before.spline.control_points[-1:], data.detections[data.order])
+                chain: dict[str, Any] = {"linestyle": ":", "zorder": 2, "label": "proximity chain"}
+                axes.plot(*np.concatenate(ends).T, color=RED, linewidth=0.8, **chain)
             else:
                 look: dict[str, Any] = {"linestyle": "--", "zorder": 3.5}
                 style.draw_curve(axes, before.spline, DARK, "spline before the step", 0.9, **look)
@@ -158,11 +154,6 @@ def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: B
         style.draw_points(axes, points, "o", of, text)
     shown = np.concatenate([data.detections, data.updated.spline.control_points])
     style.set_frame(axes, shown.min(axis=0) - 1.0, shown.max(axis=0) + 0.8)
-
-
-def _draw_chain(axes: Axes, data: Expansion) -> None:
-    chain = np.concatenate([data.before.spline.control_points[-1:], data.detections[data.order]])
-    axes.plot(*chain.T, color=RED, linewidth=0.8, linestyle=":", zorder=2, label="proximity chain")
 
 
 # --- the fit of S_z --------------------------------------------------------------------------------------
@@ -203,7 +194,10 @@ def fit() -> Fit:
     beside = curve.parameters_at(np.array([0.36, 0.47, 0.58, 0.68]) * curve.length())
     offsets = np.array([[0.5], [1.2], [1.3], [0.6]])
     detections = curve.evaluate(beside) + offsets * style.normals(curve, beside)
-    covariances = _ray_covariances(detections - np.array([2.0, 5.5]), (0.45, 0.15))
+    along = unit(detections - np.array([2.0, 5.5]))
+    covariances = np.zeros((len(along), 2, 2))
+    for sigma, axis in ((0.45, along), (0.15, left_normals(along))):
+        covariances += sigma**2 * axis[:, :, None] * axis[:, None, :]
     foot_u = curve.foot_points(detections).u
     basis = curve.basis_matrix(foot_u)
     settings = CkfSettings(ridge=RIDGE)
@@ -213,13 +207,6 @@ def fit() -> Fit:
     innovations = sigma_points - basis @ curve.control_points
     fitted_points = curve.control_points + np.einsum("nm,kmd->knd", measurement.gain, innovations)
     return Fit(curve, detections, covariances, foot_u, basis, sigma_points, fitted_points, measurement)
-
-
-def _ray_covariances(rays: Array, sigmas: tuple[float, float]) -> Array:
-    """Return covariances (m, 2, 2), m^2, of standard deviations (m) along each ray (m, 2) and across it."""
-    along = unit(rays)
-    parts = zip(sigmas, (along, left_normals(along)), strict=True)
-    return np.asarray(sum(s**2 * v[:, :, None] * v[:, None, :] for s, v in parts))
 
 
 def plot_fit() -> tuple[Figure, str]:

@@ -12,7 +12,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
+from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.settings.checked import Positive
@@ -289,18 +289,13 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> d
         all_ghosts.append(is_ghost)
         if isinstance(boundary, SplineBoundary):
             metres += float(np.mean(is_ghost)) * boundary.spline.length()
-        else:
-            landmarks += int(is_ghost.sum())
-            duplicates += _duplicates(boundary, truth.cones[truth.cone_labels == label], settings.distance)
+            continue
+        landmarks += int(is_ghost.sum())
+        cones = truth.cones[truth.cone_labels == label]
+        if len(cones) and boundary.size:
+            distances, nearest = KDTree(cones).query(boundary.points)
+            matched = np.asarray(nearest)[np.asarray(distances) <= settings.distance]
+            duplicates += len(matched) - len(np.unique(matched))
     share = mean_of(np.concatenate(all_ghosts))
     found = {"ghost_landmarks": landmarks, "ghost_metres": metres, "ghost_share": share}
     return {**found, "duplicates": duplicates}
-
-
-def _duplicates(boundary: PointBoundary, cones: Array, distance: float) -> int:
-    """Return how many landmarks within `distance` of their nearest cone share it with an earlier one."""
-    if len(cones) == 0 or boundary.size == 0:
-        return 0
-    distances, nearest = KDTree(cones).query(boundary.points)
-    matched = np.asarray(nearest)[np.asarray(distances) <= distance]
-    return int(len(matched) - len(np.unique(matched)))
