@@ -90,14 +90,13 @@ class Drives:
     """Logs of the three sweeps."""
 
     cones: Log
-    """A long road, up to the cycle in which the last cone asked for is seen."""
     seen: Array
-    """Number of cones seen by the end of each cycle of that log (n,)."""
+    """Long road up to the last cone asked for, and number of cones seen by the end of each cycle (n,)."""
     readings: dict[int, Log]
     """A short dense road, by the number of detections in a cycle."""
     laps: Log
     lap_ends: Array
-    """Stamps at which the laps end (m,), s."""
+    """Closed road, and stamps at which the laps end (m,), s."""
 
     @property
     def cycles(self) -> int:
@@ -115,13 +114,8 @@ def make_drives(settings: ScalingSettings) -> Drives:
     dense = drive_log(open_road(settings.readings_cones, DENSE_GAP), seed, dense=True)
     rng = np.random.default_rng(seed)
     laps = drive_log(closed_road(settings.laps_cones), seed, settings.laps)
-    return Drives(
-        cones=first_cycles(long, count),
-        seen=seen[:count].astype(float),
-        readings={k: thinned(dense, k, rng) for k in settings.readings},
-        laps=laps,
-        lap_ends=lap_times(laps),
-    )
+    readings = {k: thinned(dense, k, rng) for k in settings.readings}
+    return Drives(first_cycles(long, count), seen[:count].astype(float), readings, laps, lap_times(laps))
 
 
 # --- roads -----------------------------------------------------------------------------------------------

@@ -76,9 +76,8 @@ class Lane:
     readings: int = 0
     """Number of detections in each cycle of the log, where they are varied."""
     seconds: list[float] = field(default_factory=list)
-    """Processor time of each update, s."""
     sizes: list[int] = field(default_factory=list)
-    """Number of control points or landmarks after each update."""
+    """Processor time of each update (s), and size of the map after it."""
     stopped: str = ""
     """Why it did not reach the log's end; empty where it did."""
 
@@ -144,7 +143,6 @@ class Scaling:
 
     settings: ScalingSettings
     mapper: dict[str, Any]
-    """Settings of the estimators, in full."""
     points: pd.DataFrame
     """Row for each mean of some updates, as `binned` returns them."""
     slopes: pd.DataFrame
@@ -274,17 +272,11 @@ def scaling_figures(scaling: Scaling) -> tuple[tuple[str, ...], dict[str, list[t
     rows = {}
     for name in scaling.estimators:
         slopes = (scaling.slope(sweep, name) for sweep in (CONES, READINGS))
-        at = scaling.seconds_at(COMPARED_AT, name)
-        laps = scaling.of(LAPS, name).set_index("at")["seconds"]
-        alone = [
-            1e3 * at,
-            scaling.seconds_at(COMPARED_AT, first) / at,
-            scaling.of(CONES, name)["at"].max(),
-            *(1e3 * laps.get(float(lap), math.nan) for lap in (2, settings.laps)),
-            scaling.memory[name],
-        ]
         both = [(float(slope["slope"]), float(slope["error"])) for slope in slopes]
-        rows[name] = [*both, *((float(value), math.nan) for value in alone)]
+        at, laps = scaling.seconds_at(COMPARED_AT, name), scaling.of(LAPS, name).set_index("at")["seconds"]
+        alone = [1e3 * at, scaling.seconds_at(COMPARED_AT, first) / at, scaling.of(CONES, name)["at"].max()]
+        alone += [1e3 * laps.get(float(lap), math.nan) for lap in (2, settings.laps)]
+        rows[name] = [*both, *((float(value), math.nan) for value in (*alone, scaling.memory[name]))]
     return header, rows
 
 
@@ -300,20 +292,17 @@ def scaling_table(scaling: Scaling) -> TextTable:
 
 
 def _number(value: float, error: float, digits: int) -> str:
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:.{digits}f}" + (f" +- {error:.{digits}f}" if math.isfinite(error) else "")
+    by = f" +- {error:.{digits}f}" if math.isfinite(error) else ""
+    return f"{value:.{digits}f}{by}" if math.isfinite(value) else "-"
 
 
 def stops(scaling: Scaling) -> list[str]:
     """Return a line for each estimator and sweep that did not reach the end."""
-    stopped = (s for s in scaling.slopes.to_dict("records") if s["stopped"])
-    slope = " (slope to {high:.0f})"
-    return [
-        f"{s['estimator']}, {s['sweep']}: stopped, {s['stopped']}"
-        + (slope.format(**s) if s["points"] else "")
-        for s in stopped
-    ]
+    lines = []
+    for row in (row for row in scaling.slopes.to_dict("records") if row["stopped"]):
+        reached = f" (slope to {row['high']:.0f})" if row["points"] else ""
+        lines.append(f"{row['estimator']}, {row['sweep']}: stopped, {row['stopped']}{reached}")
+    return lines
 
 
 def write_scaling(out: Path, scaling: Scaling) -> None:

@@ -47,12 +47,11 @@ _NOT_PAIRED: Final = ("nees_low", "nees_high")
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All outcomes, log by log, in the order of the estimators."""
+    """All outcomes, log by log; the estimators are compared with one of them, the reference."""
 
     logs: tuple[NamedLog, ...]
     estimators: tuple[str, ...]
     reference: str
-    """Estimator that the others are compared with."""
     outcomes: tuple[Outcome, ...] = ()
 
     @cached_property

@@ -69,7 +69,7 @@ def _settings_row(study: Study, cell: Cell[Drive]) -> dict[str, Any]:
 
 def without_times(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the columns that are the same whenever the study is run."""
-    return frame.drop(columns=[name for name in TIMES if name in frame])
+    return frame.drop(columns=[*TIMES], errors="ignore")
 
 
 def times_of(frame: pd.DataFrame) -> pd.DataFrame:

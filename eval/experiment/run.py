@@ -52,7 +52,7 @@ OnCell = Callable[[int, int], None]
 
 
 class WorkerDiedError(RuntimeError):
-    """The process that did the work was killed, ran out of memory or crashed."""
+    """The process that did the work died."""
 
 
 def run_cells(
@@ -93,12 +93,11 @@ def run_cells(
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A study with its tracks and all of its cells."""
+    """A study with its tracks and all of its cells, in the order of the results."""
 
     study: Study
     tracks: tuple[Track, ...]
     cells: tuple[Cell[Drive], ...]
-    """Runs of the study, in the order of the results."""
 
     def resolved(self) -> dict[str, Any]:
         """Return the content of `study.json`: the study with every default written out."""
@@ -139,11 +138,8 @@ def run_study(study: Study, out: Path | str | None = None, **how: Any) -> pd.Dat
     Finished cells are kept in the folder `out`, if there is one. `how` is that of `run_plan`.
     """
     check_jobs(how.get("jobs", 1))
-    plan = make_plan(study)
-    if out is not None:
-        return run_plan(plan, Path(out), **how)
-    with tempfile.TemporaryDirectory() as folder:
-        return run_plan(plan, Path(folder), **how)
+    with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
+        return run_plan(make_plan(study), Path(folder), **how)
 
 
 def run_plan(plan: Plan, out: Path, *, retry_failed: bool = False, **how: Any) -> pd.DataFrame:

@@ -99,10 +99,10 @@ def label_logarithms(axes: Axes) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def shared_legend(figure: Figure, columns: int = 1, loc: str = "outside lower center") -> None:
-    """Add one legend for all panels, below them by default, with each entry once."""
+def shared_legend(figure: Figure, columns: int = 1) -> None:
+    """Add one legend for all panels, below them, with each entry once."""
     entries = _entries(figure.axes)
-    figure.legend(entries.values(), entries.keys(), loc=loc, ncols=columns)
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)
 
 
 def grouped_legend(figure: Figure) -> None:

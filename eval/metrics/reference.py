@@ -32,11 +32,10 @@ from .trajectory import pose_errors
 
 
 def limit(log: Log, track: Map) -> dict[str, float]:
-    """Return the least error (m) to be expected of a simulated log and a map of it.
+    """Return the least error (m) to be expected of a simulated log and a map of it; ValueError for others.
 
     `l` is the rmse in the plane of the landmark batch with oracle association, `f` that of the true cones to
-    splines of the mapped size that are fitted to them, `limit` both. ValueError without truth or
-    associations.
+    splines of the mapped size that are fitted to them, `limit` both.
     """
     truth = _truth(log)
     landmarks, fit = landmark_rmse(solve_oracle_landmarks(log)[1], truth), fit_rmse(track, truth)

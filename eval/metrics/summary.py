@@ -48,15 +48,12 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "size": result.map.size,
         "not_mapped": not_mapped(result.map, log),
         "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
-        "seconds": {
-            "mean": float(np.mean(seconds)),
-            "p99": float(np.quantile(seconds, 0.99)),
-            "max": max(seconds),
-        }
-        if seconds
-        else None,
+        "seconds": None,
         "gate": {name: sum(getattr(record, name) for record in result.cycles) for name in GATE},
     }
+    if seconds:
+        p99 = float(np.quantile(seconds, 0.99))
+        summary["seconds"] = {"mean": float(np.mean(seconds)), "p99": p99, "max": max(seconds)}
     if result.batches is not None:
         summary["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
     if hints:
