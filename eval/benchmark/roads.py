@@ -17,10 +17,8 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
-GAP, DENSE_GAP = 5.0, 1.0
-"""Distances of the cones of a row on a road, and on the dense one, where detections are counted (m)."""
-DENSE_RANGE: Final = 30.0
-"""Range of the sensor on the dense road (m)."""
+GAP, DENSE_GAP, DENSE_RANGE = 5.0, 1.0, 30.0
+"""Distances of the cones of a row on a road, and on the dense one with its range of the sensor (m)."""
 WIDTH: Final = 4.0
 """Distance of the rows (m)."""
 SWING, WAVELENGTH = 0.9, 300.0

@@ -48,8 +48,6 @@ DIGEST: Final = "digest"
 """Key of a record's digest in its file."""
 Record = dict[str, Any]
 """What is kept of a cell, in the types of JSON only."""
-_IDENTITY_DIGITS, _SEED_DIGITS, _CODE_DIGITS = 20, 8, 16
-"""Numbers of hexadecimal digits of an identity, of a seed and of a digest of sources."""
 _latest: dict[str, Log] = {}
 """The log that was simulated last, by its drive."""
 
@@ -58,7 +56,7 @@ def track_digest(track: Track) -> str:
     """Return the identity of a track's geometry, wherever it came from."""
     parts = (track.left, track.right, track.other, track.start, track.cone_labels)
     cones = b"|".join(np.ascontiguousarray(part, dtype=float).tobytes() for part in parts)
-    return hashlib.sha256(cones + str(track.closed).encode()).hexdigest()[:_IDENTITY_DIGITS]
+    return hashlib.sha256(cones + str(track.closed).encode()).hexdigest()[:20]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +76,7 @@ class Drive:
     @cached_property
     def own_seed(self) -> int:
         """Seed of the simulation: drives of one seed on several tracks are independent samples."""
-        return int(identity(track=track_digest(self.track), seed=self.seed)[:_SEED_DIGITS], 16)
+        return int(identity(track=track_digest(self.track), seed=self.seed)[:8], 16)
 
     @cached_property
     def id(self) -> str:
@@ -100,7 +98,7 @@ class Drive:
 def identity(**parts: Any) -> str:
     """Return a text that is the same for the same values, which are JSON's types only."""
     text = json.dumps(parts, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:_IDENTITY_DIGITS]
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 @cache
@@ -113,7 +111,7 @@ def code_digest(rooms: tuple[str, ...]) -> str:
         inside = [*origin.parent.glob("*.py"), *origin.parent.glob("*.cpp")]
         for file in sorted(inside) if origin.name == "__init__.py" else [origin]:
             digest.update(f"{room}/{file.name}".encode() + file.read_bytes())
-    return digest.hexdigest()[:_CODE_DIGITS]
+    return digest.hexdigest()[:16]
 
 
 def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:

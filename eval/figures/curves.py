@@ -1,6 +1,7 @@
 """The uncertainty along a spline, with what its formula leaves out, and the simplification of a curve."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,11 +19,8 @@ from pathspace_graph.spline.knots import BASELINE, curvature_weighted_breaks, fi
 from . import style
 from .style import BLUE, DARK, LIGHT, ORANGE, PURPLE, THIN_WIDTH, WIDTH
 
-# a curve swings to either side, and cones along it were seen but between two shares of its length (m)
-_CONTROL_POINTS, _SPACING, _SWING = 13, 5.5, 6.0
-_CONES, BLIND = 18, (0.52, 0.74)
-_SIGMA_DETECTION = 0.3  # of a seen cone across the curve
-_SIGMA_BEND, _SIGMA_ANCHOR = 1.0, 2.0  # weak priors of second differences and of control points
+BLIND: Final = (0.52, 0.74)
+"""Shares of the length of the curve between which no cone was seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +43,12 @@ class Uncertainty:
 
 def uncertainty(rng: np.random.Generator, samples: int = 2000) -> Uncertainty:
     """Compute the posterior of a curve that cones hold across itself, and draw splines from it."""
-    x = _SPACING * np.arange(_CONTROL_POINTS)
-    points = np.stack([x, _SWING * np.sin(2.0 * np.pi * x / x[-1])], axis=1)
-    spline = BSpline.open_uniform(points, interval=_SPACING).clamp()
-    share = (np.arange(_CONES) + 0.5) / _CONES
+    x = 5.5 * np.arange(13)
+    points = np.stack([x, 6.0 * np.sin(2.0 * np.pi * x / x[-1])], axis=1)
+    spline = BSpline.open_uniform(points, interval=5.5).clamp()
+    share = (np.arange(18) + 0.5) / 18
     seen = spline.parameters_at(spline.length() * share[(share < BLIND[0]) | (share > BLIND[1])])
-    covariance = posterior(spline, seen, _SIGMA_DETECTION, _SIGMA_BEND, _SIGMA_ANCHOR)
+    covariance = posterior(spline, seen, 0.3, 1.0, 2.0)
     boundary, u = SplineBoundary(spline, covariance), np.linspace(*spline.domain, 301)
     drawn = rng.multivariate_normal(spline.control_points.ravel(), covariance, samples)
     curves = np.einsum("nm,smd->snd", spline.basis_matrix(u), drawn.reshape(samples, -1, 2))

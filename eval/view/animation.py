@@ -36,8 +36,6 @@ DPI: Final = 100.0
 """Resolution of a frame (dots per inch), which decides how large the text is."""
 VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
 """Arrow that stands for the vehicle (m, vehicle frame), larger than it is, so that it is seen."""
-NOTICE_SECONDS: Final = 2.0
-"""Time (s) of the film for which a frame shows what happened."""
 Pixels = NDArray[np.uint8]
 _STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8, widest_band=5.0)
 """Lines are wider than on paper, since a film has few pixels."""
@@ -212,7 +210,7 @@ class Animation:
         if result.jump is not None:
             told.append(f"the lap was solved again: the pose moves by {np.hypot(*result.jump[:2]):.2f} m")
         if told:
-            self._notice, self._notice_until = "\n".join(told), film_time + NOTICE_SECONDS
+            self._notice, self._notice_until = "\n".join(told), film_time + 2.0
         self._was_closed, self._size = result.closed, sum(result.sizes)
 
     # --- a frame -----------------------------------------------------------------------------------------
