@@ -98,10 +98,11 @@ class Study:
             if len(values) == 0 or len({repr(value) for value in values}) != len(values):
                 expected = "expected at least one, and none twice"
                 raise SettingsError(f"{name}: {expected}, found {shown(list(values))}")
-        numbers = [track for track in self.tracks if not isinstance(track, Path)]
-        for name, value in (*(("seeds", seed) for seed in self.seeds), *(("tracks", of) for of in numbers)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
+        generated = [track for track in self.tracks if not isinstance(track, Path)]
+        for name, values in {"seeds": self.seeds, "tracks": generated}.items():
+            for value in values:
+                if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+                    raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
         for name in self.estimators:
             check_name(name, known_estimators(), "estimators: expected a known estimator")
         for name in self.metrics:
@@ -120,10 +121,9 @@ class Study:
     @property
     def points(self) -> dict[str, MapperSettings]:
         """Settings to run by name; of variants with equal settings the first."""
-        first: dict[MapperSettings, str] = {}
-        for name, settings in self._named().items():
-            first.setdefault(settings, name)
-        return {name: settings for settings, name in first.items()}
+        named = [*self._named().items()]
+        first = {settings: name for name, settings in reversed(named)}
+        return {name: settings for name, settings in named if first[settings] == name}
 
     @property
     def baseline_variant(self) -> str:

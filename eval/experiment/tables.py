@@ -187,13 +187,12 @@ def track_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
 def _rows(columns: Sequence[Column], frame: pd.DataFrame) -> Iterator[tuple[str, ...]]:
     finished = frame.groupby([*RUN], sort=False)["failure"].first() == ""
     values = [_values(column, frame).reindex(finished.index) for column in columns]
-    whole = (f"{int(finished.sum())} of {len(finished)}",)
     for track, done in finished.groupby(level=0, sort=False):
-        texts = (c.average(v.loc[done.index]) for c, v in zip(columns, values, strict=True))
+        texts = (c.text(v.loc[done.index]) for c, v in zip(columns, values, strict=True))
         yield (str(track), f"{int(done.sum())} of {len(done)}", *texts)
-    yield ("all, mean", *whole, *(c.average(v) for c, v in zip(columns, values, strict=True)))
-    for name, over in {"all, median": "median", "all, largest": "max"}.items():
-        yield (name, *whole, *(c.extreme(v, over) for c, v in zip(columns, values, strict=True)))
+    for name, over in {"mean": "mean", "median": "median", "largest": "max"}.items():
+        texts = (c.text(v, over) for c, v in zip(columns, values, strict=True))
+        yield (f"all, {name}", f"{int(finished.sum())} of {len(finished)}", *texts)
 
 
 def _values(column: Column, frame: pd.DataFrame) -> pd.DataFrame:
