@@ -39,14 +39,8 @@ RUNS: Final = {
 """Estimator of each run."""
 FIRST, LAST = 25.0, 14.0
 """Lengths of the beginning of a drive, and of its end that is registered on it (m)."""
-NEAR: Final = 15.0
-"""Range of the sightings that count there (m)."""
-GATES: Final = (2.0, 1.5, 1.0, 1.0, 0.7, 0.7)
-"""Distance within which a cone is the nearest one of its colour, from step to step (m)."""
 LEAST: Final = 6
 """Least number of cones of a registration."""
-SAME: Final = 1.0
-"""Distance of two maps of the same cones (m)."""
 ERRORS: Final = {
     "latency": ("latency [ms]", 1e3),
     "yaw": ("yaw [°]", 180.0 / np.pi),
@@ -115,11 +109,11 @@ def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Ar
 
 
 def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise, frame: Array) -> Array:
-    """Return the cones (k, 2) of a label in the frame of a pose (3,), each the mean of its sightings."""
+    """Return the cones (k, 2) of a label in the frame of a pose (3,), each the mean of those within 15 m."""
     own = []
     for cycle in cycles:
         seen = cycle.detections
-        chosen = (seen.labels == label) & (np.hypot(*seen.points_vehicle.T) < NEAR)
+        chosen = (seen.labels == label) & (np.hypot(*seen.points_vehicle.T) < 15.0)
         own.append(replace(cycle, detections=seen.where(chosen)))
     table = Follower(noise).follow(own)
     corrected = table.point + by_sensor(table.point, table.twist) @ noise.sensor
@@ -133,7 +127,7 @@ def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise, frame:
 def _registered(start: list[Array], end: list[Array], pose: Array) -> tuple[int, float, Array]:
     """Return the number of paired cones, minus their mean distance, and the pose (3,) for it."""
     count, distance = 0, np.inf
-    for gate in GATES:
+    for gate in (2.0, 1.5, 1.0, 1.0, 0.7, 0.7):
         pairs = []
         for known, seen in zip(start, end, strict=True):
             if len(known) and len(seen):
@@ -191,13 +185,13 @@ def runs_table(drives: Sequence[RealDrive]) -> View:
 
 
 def maps_table(drives: Sequence[RealDrive]) -> View:
-    """Return the distance between the maps of each two drives around the same cones."""
+    """Return the distance between the maps of each two drives around the same cones: under a metre."""
     rows = []
     for k, first in enumerate(drives):
         for second in drives[k + 1 :]:
             both = zip(first.runs.values(), second.runs.values(), strict=True)
             apart = [aligned_distance(one.map, other.map) for one, other in both]
-            if min(apart) < SAME:
+            if min(apart) < 1.0:
                 figures = tuple(Figure.known(distance, 2) for distance in apart)
                 rows.append((f"{first.name}, {second.name}", figures))
     return ("maps", *(f"{name} [m]" for name in RUNS)), tuple(rows)

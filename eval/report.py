@@ -9,7 +9,6 @@ under the table says so.
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final, Self
@@ -23,8 +22,7 @@ from pathspace_graph.sim.mistakes import MISTAKES
 from . import real, views
 from .benchmark.measurement import measure_drive, metrics
 from .benchmark.roads import QUICK, ScalingSettings, make_drives
-from .benchmark.scaling import measure_scaling
-from .benchmark.scaling_output import scaling_figures
+from .benchmark.scaling import measure_scaling, scaling_figures
 from .experiment.cells import ESTIMATORS as ESTIMATOR_ROOMS
 from .experiment.cells import code_digest
 from .experiment.faults import kinds, of_middle_strength, only, suite
@@ -35,8 +33,6 @@ from .hints import HintStudy
 from .views import ESTIMATORS, LANDMARKS, ONLINE, Figure, Rows, View
 
 FORMAT: Final = "pathspace-figures/1"
-NOTHING: Final = "pages"
-"""Name in place of the experiments where only the pages are written anew."""
 FILE: Final = "figures.json"
 ABLATIONS: Final = ("gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
 """Studies of parts of the method, driven by one estimator on the generated tracks for two laps."""
@@ -55,7 +51,7 @@ PAGES: Final = {
 }
 """Tables of each page, from the root of the project."""
 GENERATED: Final = (0, 1, 2)
-"""Seeds of the generated tracks."""
+"""Seeds of the generated tracks, also of the benchmark."""
 SPEED: Final = {
     "mean_by_isam2": "mean update by that of GTSAM's `ISAM2` on landmarks, given every association",
     "p99_by_isam2": "99th percentile by that of `ISAM2`",
@@ -67,10 +63,6 @@ SPEED: Final = {
     "solve": "the batch of the open lap, in its own process [s]",
 }
 """Figures of the benchmark, each with its label."""
-README_SPEED: Final = 6
-"""Number of those that the README shows."""
-SCALED: Final = ScalingSettings(cones_max=800.0, laps=10)
-"""How far the time of an update is measured."""
 README: Final = ("rmse", "missed", "reach_median")
 COMPARED: Final = (
     *("missed_2m", "missed_1m", "rmse_capped", "mapped_to_truth", "truth_to_mapped", "ghost_landmarks"),
@@ -85,7 +77,6 @@ PAPER: Final = ("rmse", "missed", "size", "ate", "inside")
 CENTRE_LINE: Final = (
     *("rmse", "missed", "nees", "inside", "centre", "centre_nees", "half_width", "half_width_nees"),
 )
-BENCHMARK_SEEDS: Final = (0, 1, 2)
 _MARKED: Final = re.compile(r"(<!-- report: ([\w-]+) -->\n)(.*?)(<!-- end report -->)", re.DOTALL)
 
 
@@ -94,14 +85,12 @@ class MeasuredTable:
     """A table of figures, and how they were measured."""
 
     command: str
-    """Command that measures them."""
     commit: str
     """Commit of the sources, where that was known."""
     date: str
     sources: str
     """Digest of the sources of the estimators."""
     header: tuple[str, ...]
-    """Headings of the labels and of each column."""
     rows: Rows
 
     @classmethod
@@ -189,8 +178,9 @@ class Plan:
         study, frame = self._shipped("centerline", folder, tracks=GENERATED, seeds=(0,))
         return {"centerline": views.metrics_table(frame, CENTRE_LINE, study.estimators)}
 
-    def ablation(self, name: str, folder: Path) -> Views:
-        """Drive the variants of a shipped study for two laps, under the first and the last of its noises."""
+    def ablation(self, folder: Path) -> Views:
+        """Drive the study of the folder's name for two laps, under the first and the last of its noises."""
+        name = folder.name
         noises = list(read_study(find_study(Path(name))).noise.items())
         small: dict[str, Any] = {"tracks": GENERATED, "laps": 2, "noise": dict([noises[0], noises[-1]])}
         small["seeds"] = (0,) if name in ONE_SEED else (0, 1)
@@ -217,7 +207,7 @@ class Plan:
 
     def speed(self, _: Path) -> Views:
         """Time the benchmark's drives."""
-        seeds, laps = (BENCHMARK_SEEDS[:1], 1) if self.quick else (BENCHMARK_SEEDS, 5)
+        seeds, laps = (GENERATED[:1], 1) if self.quick else (GENERATED, 5)
         runs = [{m.key: m.value for m in metrics(measure_drive(seed, laps))} for seed in seeds]
         values = pd.DataFrame(runs).reindex(columns=[*SPEED])
         rows = tuple(
@@ -225,7 +215,7 @@ class Plan:
             for key, label in SPEED.items()
         )
         view = ("figure", "measured"), rows
-        return {"readme-speed": (view[0], rows[:README_SPEED]), "results-speed": view}
+        return {"readme-speed": (view[0], rows[:6]), "results-speed": view}
 
     def real_logs(self, folder: Path) -> Views:
         """Map the logs of a real car."""
@@ -241,7 +231,7 @@ class Plan:
 
     def scale(self, _: Path) -> Views:
         """Time updates against the size of the map, the detections and the laps."""
-        settings = QUICK if self.quick else SCALED
+        settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
         header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
         rows = tuple(
             (f"`{name}`", tuple(Figure.known(value, 2) for value, _ in row)) for name, row in found.items()
@@ -261,10 +251,6 @@ class Plan:
         return run_study(study, folder, jobs=self.jobs, on_cell=self.on_cell)
 
 
-def _ablation(name: str) -> Callable[[Plan, Path], Views]:
-    return lambda plan, folder: plan.ablation(name, folder)
-
-
 EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "accuracy": Plan.accuracy,
     "skidpad": Plan.skidpad,
@@ -273,7 +259,7 @@ EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "hard": Plan.hard,
     "endurance": Plan.endurance,
     "centerline": Plan.centerline,
-    **{name: _ablation(name) for name in ABLATIONS},
+    **dict.fromkeys(ABLATIONS, Plan.ablation),
     "hints": Plan.hints,
     "speed": Plan.speed,
     "scale": Plan.scale,
@@ -291,14 +277,15 @@ def measure_figures(
 ) -> Tables:
     """Run experiments, each in a folder of its own, and return the known tables with theirs in place.
 
-    `about` holds the command, the commit and the date of the run.
+    `about` holds the command, the commit and the date of the run. `pages` is no experiment: only the pages
+    are written anew.
     """
     tables, sources = dict(known), sources_digest()
     for name in only:
-        check_name(name, (*EXPERIMENTS, NOTHING), "--only: expected an experiment")
+        check_name(name, (*EXPERIMENTS, "pages"), "--only: expected an experiment")
     every = [name for name in QUICKEST if plan.quick] or [*EXPERIMENTS]
     chosen = only or [name for name in every if name != "real" or plan.real]
-    for name in (name for name in chosen if name != NOTHING):
+    for name in (name for name in chosen if name != "pages"):
         for table, (header, rows) in EXPERIMENTS[name](plan, folder / name).items():
             tables[table] = MeasuredTable(**about, sources=sources, header=header, rows=rows)
     return tables
@@ -328,19 +315,18 @@ def sources_digest() -> str:
 def render_pages(root: Path, tables: Tables) -> dict[Path, str]:
     """Return the text of each page below a root, with its tables; InputError where one is not known."""
     sources = sources_digest()
-    return {
-        root / page: render(root / page, read_text(root / page, "a page"), tables, sources) for page in PAGES
-    }
+    files = [root / page for page in PAGES]
+    return {file: render(file, read_text(file, "a page"), tables, sources) for file in files}
 
 
 def render(page: Path, text: str, tables: Tables, sources: str) -> str:
     """Return the text of a page with each marked table made anew."""
-    return _MARKED.sub(partial(_rendered, page, tables, sources), text)
 
+    def rendered(found: re.Match[str]) -> str:
+        begin, name, _, end = found.groups()
+        if name not in {*tables, *chain.from_iterable(PAGES.values())}:
+            raise InputError(page, f"expected a table of the report, found {name}")
+        shown = tables[name].markdown(sources) if name in tables else "\n*Not measured yet.*\n\n"
+        return f"{begin}{shown}{end}"
 
-def _rendered(page: Path, tables: Tables, sources: str, found: re.Match[str]) -> str:
-    begin, name, _, end = found.groups()
-    if name not in {*tables, *chain.from_iterable(PAGES.values())}:
-        raise InputError(page, f"expected a table of the report, found {name}")
-    shown = tables[name].markdown(sources) if name in tables else "\n*Not measured yet.*\n\n"
-    return f"{begin}{shown}{end}"
+    return _MARKED.sub(rendered, text)

@@ -7,7 +7,6 @@ that baseline.
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final
 
 import tyro
 
@@ -27,10 +26,8 @@ from .measurement import (
     write_baseline,
 )
 
-WORSE: Final = 1
-"""Exit code where a figure is worse than the baseline."""
-BAD_INPUT: Final = 2
-"""Exit code where a file can't be read or written."""
+WORSE, BAD_INPUT = 1, 2
+"""Exit codes where a figure is worse than the baseline, and where a file can't be read or written."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,14 +47,6 @@ class Benchmark:
     baseline: Path = BASELINE
     """File of the baseline; by default the one that comes with the package."""
 
-    def check(self) -> None:
-        """Raise OutputError or InputError, before anything runs, where a file can't be written or read."""
-        for file in (self.json, self.baseline if self.write_baseline else None):
-            if file is not None:
-                check_file_target(file)
-        if self.compare:
-            read_baseline(self.baseline)
-
     def measure(self) -> Measurement:
         """Simulate the drive and measure a run on it."""
         return measure_drive(self.seed, self.laps)
@@ -65,28 +54,31 @@ class Benchmark:
 
 def main() -> None:
     """Run the script; the exit code is 1 where a figure is worse than the baseline, 2 on bad files."""
-    benchmark = tyro.cli(Benchmark)
     try:
-        worse = _is_worse(benchmark)
+        if _is_worse(tyro.cli(Benchmark)):
+            raise SystemExit(WORSE)
     except PathspaceError as error:
         note(f"benchmark: {error}")
         raise SystemExit(BAD_INPUT) from error
-    if worse:
-        raise SystemExit(WORSE)
 
 
 def _is_worse(benchmark: Benchmark) -> bool:
     """Measure, write and report; return whether anything is worse than the baseline."""
-    benchmark.check()
+    for file in (benchmark.json, benchmark.baseline if benchmark.write_baseline else None):
+        if file is not None:
+            check_file_target(file)
+    baseline = read_baseline(benchmark.baseline) if benchmark.compare else {}
     figures = metrics(benchmark.measure())
     if benchmark.json is not None:
         with atomic_file(benchmark.json) as temporary:
             write_json(temporary, [asdict(metric) for metric in figures])
     console = output()
-    console.print(metrics_table(figures))
-    found = compare(figures, read_baseline(benchmark.baseline)) if benchmark.compare else []
+    console.print(metrics_table(figures).rich())
+    found = compare(figures, baseline) if benchmark.compare else []
     if benchmark.compare:
-        console.print(baseline_table(found))
+        table = baseline_table(found)
+        console.print(table.title)
+        console.print(table.rich())
     if benchmark.write_baseline:
         write_baseline(benchmark.baseline, figures)
         say(f"baseline written to {benchmark.baseline}")

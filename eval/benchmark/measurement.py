@@ -15,11 +15,12 @@ from typing import Final
 
 import gtsam
 import numpy as np
-from rich.table import Table
 
 from pathspace_graph.console import progress
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.estimators import make_online
+from pathspace_graph.eval.experiment.tables import TextTable
+from pathspace_graph.eval.metrics.accuracy import mean_of
 from pathspace_graph.eval.metrics.measures import stage_times
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array, IntArray
@@ -44,8 +45,6 @@ RIVAL: Final = "landmark-fixed-lag"
 """Estimator that gets the same cycles in turn."""
 WARM_UP: Final = 50
 """Number of cycles after which the window is full, before which the means do not begin."""
-REFERENCE_LAP: Final = 2
-"""Lap that the last one is compared with, the first on a closed map."""
 BOUNDS: Final = {
     "p99": 10.0,  # a mean cycle of 3 ms was measured when it was chosen
     "last_lap_by_lap_2": 1.1,
@@ -74,7 +73,6 @@ class Metric:
     """One figure of a run, of which less is better."""
 
     key: str
-    """Name of the figure, also in a baseline."""
     value: float
     """Value; NaN where the run was too short for the figure."""
     unit: str
@@ -133,47 +131,30 @@ def read_baseline(file: Path) -> dict[str, float]:
     return entries
 
 
-def metrics_table(figures: Iterable[Metric]) -> Table:
-    """Return a table for a terminal: each figure beside its bound."""
-    table = _table("figure", "value", "unit", "bound")
+def metrics_table(figures: Iterable[Metric]) -> TextTable:
+    """Return each figure beside its bound."""
+    rows = []
     for metric in figures:
-        bound = "" if metric.bound is None else f"<= {metric.bound:g}"
-        style = None if metric.holds else "red"
-        table.add_row(metric.key, f"{metric.value:.3g}", metric.unit, bound, style=style)
-    return table
+        bound = "" if metric.bound is None else f"{'' if metric.holds else 'NOT '}<= {metric.bound:g}"
+        rows.append((metric.key, f"{metric.value:.3g}", metric.unit, bound))
+    return TextTable("", ("figure", "value", "unit", "bound"), tuple(rows))
 
 
-def baseline_table(compared: Sequence[Compared]) -> Table:
-    """Return a table for a terminal, where figures that are worse are marked in words and in red."""
-    table = _table("ratio", "baseline", "now", "change", "tolerance", "", title="against the baseline")
+def baseline_table(compared: Sequence[Compared]) -> TextTable:
+    """Return each ratio beside its baseline, and which are worse."""
+    rows = []
     for metric, before in compared:
-        worse = metric.worse_than(before)
-        table.add_row(
-            metric.key,
-            "-" if before is None else f"{before:.3g}",
-            f"{metric.value:.3g}",
-            f"{100 * (metric.value / before - 1.0):+.0f} %"
-            if before and math.isfinite(metric.value)
-            else "-",
-            f"{100 * (metric.tolerance or 0.0):.0f} %",
-            "WORSE" if worse else ("new" if before is None else "ok"),
-            style="red" if worse else None,
-        )
-    return table
-
-
-def _table(name: str, *numbers: str, title: str | None = None) -> Table:
-    table = Table(name, title=title, title_justify="left")
-    for number in numbers:
-        table.add_column(number, justify="right")
-    return table
+        old = "-" if before is None else f"{before:.3g}"
+        share = metric.value / before - 1.0 if before else math.nan
+        change = f"{100 * share:+.0f} %" if math.isfinite(share) else "-"
+        verdict = "WORSE" if metric.worse_than(before) else "new" if before is None else "ok"
+        tolerance = f"{100 * (metric.tolerance or 0.0):.0f} %"
+        rows.append((metric.key, old, f"{metric.value:.3g}", change, tolerance, verdict))
+    header = ("ratio", "baseline", "now", "change", "tolerance", "")
+    return TextTable("against the baseline", header, tuple(rows))
 
 
 # --- ISAM2 on landmarks ----------------------------------------------------------------------------------
-
-
-FIRST_POSE: tuple[float, float, float] = (1e-3, 1e-3, 1e-4)
-"""Standard deviations (m, m, rad) of the first pose, at the origin."""
 
 
 class ToldLandmarks:
@@ -222,7 +203,7 @@ class ToldLandmarks:
     def _add_pose(self, graph: gtsam.NonlinearFactorGraph, odometry: Odometry, t: float) -> None:
         key = gtsam.symbol("x", self._count)
         if self._count == 0:
-            known = gtsam.noiseModel.Diagonal.Sigmas(np.array(FIRST_POSE))
+            known = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3, 1e-3, 1e-4]))  # the origin of the map
             graph.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(), known))
             return
         motion = integrate_odometry(odometry, t, self._sigma)
@@ -315,68 +296,42 @@ def measure(log: Log, settings: MapperSettings) -> Measurement:
     return Measurement(records, result.laps, rivals, isam2, mapper.lap_seconds, ahead)
 
 
-def metrics(measurement: Measurement) -> tuple[Metric, ...]:
-    """Return every figure; those with a bound come first."""
+def metrics(run: Measurement) -> tuple[Metric, ...]:
+    """Return every figure; those with a bound come first, and those of what did not happen are left out."""
+    cycles, times = run.cycles, 1e3 * np.array([record.seconds for record in run.cycles])
+    rivals, isam2s, ahead = (1e3 * np.asarray(of, float) for of in (run.rival, run.isam2, run.ahead))
+    mean, rival, isam2 = (mean_of(of[WARM_UP:]) for of in (times, rivals, isam2s))
+    p99, isam2_p99 = float(np.quantile(times, 0.99)), float(np.quantile(isam2s, 0.99))
+    lap = np.array([record.lap for record in cycles])
+    laps = [mean_of(times[lap == k]) for k in range(1, run.laps + 1)]
+    closing = math.nan if run.closing is None else float(times[run.closing])
+    found = {
+        "mean_by_landmark": mean / rival,
+        "mean_by_isam2": mean / isam2,
+        "p99_by_isam2": p99 / isam2_p99,
+        "p99": p99,
+        "last_lap_by_lap_2": laps[-1] / laps[1] if len(laps) > 2 else math.nan,
+        "closing": closing,
+    }
+    if run.closing is not None and run.swap is not None:
+        meanwhile = times[run.closing + 1 : run.swap]
+        before = times[max(run.closing - len(meanwhile), 0) : run.closing]
+        found["meanwhile_by_before"] = mean_of(meanwhile) / mean_of(before)
+        found |= {"solve": run.solve, "swap": float(times[run.swap])}
+        after = times[run.swap + 1 :][: len(meanwhile)]
+        found["meanwhile_by_after"] = mean_of(meanwhile) / mean_of(after)
+    closed = np.array([record.closed for record in cycles[: len(ahead)]], bool)
+    looks = {"ahead_open": ahead[~closed][WARM_UP:], "ahead_closed": ahead[closed]}
+    found |= {key: float(np.median(of)) for key, of in looks.items() if len(of)}
+    found |= {"p99_by_mean": p99 / mean, "closing_by_mean": closing / mean}
+    found |= {"mean": mean_of(times), "median": float(np.median(times)), "slowest": float(times.max())}
+    found |= {"landmark": rival, "isam2": isam2, "isam2_p99": isam2_p99}
+    found |= {f"mean_lap_{number}": value for number, value in enumerate(laps, start=1)}
+    found |= {f"mean_{stage['stage']}": 1e3 * stage["mean"] for stage in stage_times(cycles)[1:]}
     return tuple(
-        Metric(key, value, unit, bound=BOUNDS.get(key), tolerance=TOLERANCES.get(key))
-        for key, value, unit in _figures(measurement)
+        Metric(key, value, _unit(key), BOUNDS.get(key), TOLERANCES.get(key)) for key, value in found.items()
     )
 
 
-def _figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]:
-    """Yield the key, the value and the unit of each figure."""
-    cycles = measurement.cycles
-    times = np.array([record.seconds for record in cycles])
-    mean, p99 = _mean(times[WARM_UP:]), float(np.quantile(times, 0.99))
-    rival = _mean(measurement.rival[WARM_UP:])
-    isam2, isam2_p99 = _mean(measurement.isam2[WARM_UP:]), float(np.quantile(measurement.isam2, 0.99))
-    laps = [_mean([c.seconds for c in cycles if c.lap == k]) for k in range(1, measurement.laps + 1)]
-    closing = float(times[measurement.closing]) if measurement.closing is not None else float("nan")
-    yield "mean_by_landmark", mean / rival, ""
-    yield "mean_by_isam2", mean / isam2, ""
-    yield "p99_by_isam2", p99 / isam2_p99, ""
-    yield "p99", 1e3 * p99, "ms"
-    yield "last_lap_by_lap_2", laps[-1] / laps[REFERENCE_LAP - 1] if len(laps) > REFERENCE_LAP else np.nan, ""
-    yield "closing", 1e3 * closing, "ms"
-    yield from _swap_figures(measurement, times)
-    yield from _ahead_figures(measurement)
-    yield "p99_by_mean", p99 / mean, ""
-    yield "closing_by_mean", closing / mean, ""
-    milliseconds = {
-        "mean": _mean(times),
-        "median": float(np.median(times)),
-        "slowest": float(times.max()),
-        "landmark": rival,
-        "isam2": isam2,
-        "isam2_p99": isam2_p99,
-        **{f"mean_lap_{lap}": value for lap, value in enumerate(laps, start=1)},
-        **{f"mean_{stage['stage']}": stage["mean"] for stage in stage_times(cycles)[1:]},
-    }
-    yield from ((key, 1e3 * seconds, "ms") for key, seconds in milliseconds.items())
-
-
-def _swap_figures(measurement: Measurement, times: Array) -> Iterator[tuple[str, float, str]]:
-    """Yield what it takes to replace the map, where it was replaced."""
-    closing, swap = measurement.closing, measurement.swap
-    if closing is None or swap is None:
-        return
-    meanwhile = times[closing + 1 : swap]
-    before = times[max(closing - len(meanwhile), 0) : closing]
-    yield "meanwhile_by_before", _mean(meanwhile) / _mean(before), ""
-    yield "solve", measurement.solve, "s"
-    yield "swap", 1e3 * float(times[swap]), "ms"
-    yield "meanwhile_by_after", _mean(meanwhile) / _mean(times[swap + 1 :][: len(meanwhile)]), ""
-
-
-def _ahead_figures(measurement: Measurement) -> Iterator[tuple[str, float, str]]:
-    """Yield the median time of a look ahead, on the open map and on the closed one."""
-    closed = np.array([record.closed for record in measurement.cycles[: len(measurement.ahead)]], bool)
-    times = 1e3 * np.array(measurement.ahead)
-    for name, own in (("ahead_open", times[~closed][WARM_UP:]), ("ahead_closed", times[closed])):
-        if len(own):
-            yield name, float(np.median(own)), "ms"
-
-
-def _mean(values: Iterable[float]) -> float:
-    array = np.asarray(list(values))
-    return float(array.mean()) if len(array) else float("nan")
+def _unit(key: str) -> str:
+    return "" if "_by_" in key else "s" if key == "solve" else "ms"

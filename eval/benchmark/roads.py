@@ -17,10 +17,8 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
-GAP, DENSE_GAP = 5.0, 1.0
-"""Distances of the cones of a row on a road, and on the dense one, where detections are counted (m)."""
-DENSE_RANGE: Final = 30.0
-"""Range of the sensor on the dense road (m)."""
+GAP, DENSE_GAP, DENSE_RANGE = 5.0, 1.0, 30.0
+"""Distances of the cones of a row on a road, and on the dense one with its range of the sensor (m)."""
 WIDTH: Final = 4.0
 """Distance of the rows (m)."""
 SWING, WAVELENGTH = 0.9, 300.0
@@ -90,14 +88,13 @@ class Drives:
     """Logs of the three sweeps."""
 
     cones: Log
-    """A long road, up to the cycle in which the last cone asked for is seen."""
     seen: Array
-    """Number of cones seen by the end of each cycle of that log (n,)."""
+    """Long road up to the last cone asked for, and number of cones seen by the end of each cycle (n,)."""
     readings: dict[int, Log]
     """A short dense road, by the number of detections in a cycle."""
     laps: Log
     lap_ends: Array
-    """Stamps at which the laps end (m,), s."""
+    """Closed road, and stamps at which the laps end (m,), s."""
 
     @property
     def cycles(self) -> int:
@@ -115,13 +112,8 @@ def make_drives(settings: ScalingSettings) -> Drives:
     dense = drive_log(open_road(settings.readings_cones, DENSE_GAP), seed, dense=True)
     rng = np.random.default_rng(seed)
     laps = drive_log(closed_road(settings.laps_cones), seed, settings.laps)
-    return Drives(
-        cones=first_cycles(long, count),
-        seen=seen[:count].astype(float),
-        readings={k: thinned(dense, k, rng) for k in settings.readings},
-        laps=laps,
-        lap_ends=lap_times(laps),
-    )
+    readings = {k: thinned(dense, k, rng) for k in settings.readings}
+    return Drives(first_cycles(long, count), seen[:count].astype(float), readings, laps, lap_times(laps))
 
 
 # --- roads -----------------------------------------------------------------------------------------------

@@ -1,36 +1,63 @@
-"""Time of an update against the size of the map, its detections and the laps: points, power laws, memory.
+"""Time of an update against the size of the map, its detections and the laps: points, power laws, figures.
 
 All estimators run in one process: every cycle goes to each in turn, so that whatever slows the machine down
 slows all alike.
 """
 
+import math
+import platform
 import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import cycle
+from pathlib import Path
 from typing import Any, Final, Literal
+
+try:
+    import resource
+except ImportError:  # Windows does not say how much memory was used at most
+    resource = None  # type: ignore[assignment]
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.estimators import make_online
+from pathspace_graph.eval.experiment.tables import TextTable
+from pathspace_graph.eval.figures import style
+from pathspace_graph.eval.figures.style import MARKERS, PALETTE, WIDTH
+from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry, timed_update, timed_wait
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .roads import Drives, ScalingSettings, first_cycles
 
+MARKER: Final = "scaling.json"
+"""File by which a folder of results is known."""
+COMPARED_AT: Final = 200.0
+"""Number of cones at which estimators are compared, that of an ordinary track."""
 Sweep = Literal["cones", "readings", "laps"]
 """What is varied: the cones seen, the detections of an update (readings), or the lap."""
 CONES: Final[Sweep] = "cones"
 READINGS: Final[Sweep] = "readings"
 LAPS: Final[Sweep] = "laps"
-LEAST_POINTS: Final = 3
-"""Least number of points of a slope: two would leave nothing to estimate its error from."""
 Logs = Sequence[tuple[Log, int, Array]]
 """Log, number of detections where that is varied, and the abscissa of each cycle; NaN doesn't count."""
+_HEIGHT: Final = 3.1
+"""Height of a figure (in)."""
+_TITLES: Final[dict[Sweep, tuple[str, str]]] = {
+    CONES: ("cones seen", "(a) map size"),
+    READINGS: ("detections per update", "(b) detections"),
+    LAPS: ("lap", "time per lap on a closed road"),
+}
+"""Axis title and title of each panel."""
 JUDGED: Final = 10
 """Number of updates whose mean is compared with the budget."""
 
@@ -49,19 +76,18 @@ class Lane:
     readings: int = 0
     """Number of detections in each cycle of the log, where they are varied."""
     seconds: list[float] = field(default_factory=list)
-    """Processor time of each update, s."""
     sizes: list[int] = field(default_factory=list)
-    """Number of control points or landmarks after each update."""
+    """Processor time of each update (s), and size of the map after it."""
     stopped: str = ""
     """Why it did not reach the log's end; empty where it did."""
 
     def updates(self, settings: MapperSettings, budget: float) -> Iterator[None]:
         """Do an update at each step, until the log ends or the lane is stopped."""
         estimator = make_online(self.estimator, settings, self.log)
-        for cycle in split_odometry(self.log):
+        for odometry, detections in split_odometry(self.log):
             try:
                 timed_wait(estimator)
-                estimate, _, seconds = timed_update(estimator, *cycle)
+                estimate, _, seconds = timed_update(estimator, odometry, detections)
             except Exception as error:  # the table reports any failure
                 self.stopped = " ".join(f"{type(error).__name__}: {error}".split())
                 return
@@ -86,8 +112,8 @@ def run_lanes(
     """
     runners = [lane.updates(settings, budget) for lane in lanes]
     with threadpool_limits(limits=1):
-        for cycle in range(max(len(lane.log.cycles) for lane in lanes)):
-            first = cycle % len(runners)
+        for number in range(max(len(lane.log.cycles) for lane in lanes)):
+            first = number % len(runners)
             for runner in (*runners[first:], *runners[:first]):
                 next(runner, None)
             on_cycle()
@@ -117,10 +143,8 @@ class Scaling:
 
     settings: ScalingSettings
     mapper: dict[str, Any]
-    """Settings of the estimators, in full."""
     points: pd.DataFrame
-    """Row for each mean of some updates: `sweep`, `estimator`, `at` (mean number of cones, number of
-    detections, or lap), `seconds` of an update, number of `cycles`, mean `size` of the map."""
+    """Row for each mean of some updates, as `binned` returns them."""
     slopes: pd.DataFrame
     """Row for each sweep and estimator, as `fit_slope` returns it."""
     memory: dict[str, float]
@@ -146,7 +170,11 @@ class Scaling:
 
 
 def binned(sweep: Sweep, lane: Lane, edges: Array) -> pd.DataFrame:
-    """Return a point for each interval between two `edges` that holds cycles of a lane."""
+    """Return a point for each interval between two `edges` that holds cycles of a lane.
+
+    It has the mean abscissa `at`, the mean `seconds` of an update and `size` of the map, and the number of
+    `cycles`.
+    """
     at = lane.at[: len(lane.seconds)]
     frame = pd.DataFrame({"at": at, "seconds": lane.seconds, "size": lane.sizes})
     bins = np.searchsorted(edges, frame["at"], side="right") - 1
@@ -166,7 +194,7 @@ def fit_slope(
     """
     kept = points[points["at"] >= fit_from].astype({"at": float, "seconds": float})
     slope = error = float("nan")
-    if len(kept) >= LEAST_POINTS:
+    if len(kept) > 2:  # two would leave nothing to estimate the error from
         line = linregress(np.log(kept["at"]), np.log(kept["seconds"]))
         slope, error = float(line.slope), float(line.stderr)
     fitted = {"slope": slope, "error": error, "points": len(kept)}
@@ -181,10 +209,10 @@ def sweeps(drives: Drives, settings: ScalingSettings) -> dict[Sweep, tuple[Logs,
     """Return the logs of each sweep, the edges of its points' intervals, and where its slope begins."""
     low, high = np.log(settings.cones_min), np.log(settings.cones_max + 1.0)
     cones = np.exp(np.linspace(low, high, settings.bins + 1))
-    lap = 1.0 + np.searchsorted(drives.lap_ends, [cycle.t for cycle in drives.laps.cycles])
+    lap = 1.0 + np.searchsorted(drives.lap_ends, [seen.t for seen in drives.laps.cycles])
     dense = []
     for wanted, log in drives.readings.items():
-        counts = np.array([len(cycle.labels) for cycle in log.cycles])
+        counts = np.array([len(seen.labels) for seen in log.cycles])
         counts[: settings.warm_up] = -1
         dense.append((log, wanted, np.where(counts == wanted, float(wanted), np.nan)))
     ends = np.arange(1.0, len(drives.lap_ends) + 2.0)
@@ -214,7 +242,7 @@ def measure_scaling(
             stops = [(lane.readings, lane.stopped) for lane in own if lane.stopped]
             stopped = "; ".join(f"{k} readings: {why}" if k else why for k, why in stops)
             slopes.append(fit_slope(sweep, name, points[-1], fit_from, stopped))
-    end = int(np.searchsorted([cycle.t for cycle in drives.laps.cycles], drives.lap_ends[0]))
+    end = int(np.searchsorted([seen.t for seen in drives.laps.cycles], drives.lap_ends[0]))
     first_lap = first_cycles(drives.laps, end)
     memory = {name: peak_memory(Lane(name, first_lap), mapper) for name in estimators}
     return Scaling(settings, asdict(mapper), _joined(points), pd.DataFrame(slopes), memory)
@@ -222,3 +250,151 @@ def measure_scaling(
 
 def _joined(points: Sequence[pd.DataFrame]) -> pd.DataFrame:
     return pd.concat([of for of in points if len(of)] or points[:1], ignore_index=True)
+
+
+# --- table and files -------------------------------------------------------------------------------------
+
+
+def scaling_figures(scaling: Scaling) -> tuple[tuple[str, ...], dict[str, list[tuple[float, float]]]]:
+    """Return the header, and the figures of each estimator with their standard errors, NaN where none."""
+    settings, first = scaling.settings, scaling.estimators[0]
+    header = (
+        "estimator",
+        f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})",
+        "slope, readings",
+        f"ms at {COMPARED_AT:g} cones",
+        f"{first} / this",
+        "most cones",
+        "ms, lap 2",
+        f"ms, lap {settings.laps}",
+        "peak MB",
+    )
+    rows = {}
+    for name in scaling.estimators:
+        slopes = (scaling.slope(sweep, name) for sweep in (CONES, READINGS))
+        both = [(float(slope["slope"]), float(slope["error"])) for slope in slopes]
+        at, laps = scaling.seconds_at(COMPARED_AT, name), scaling.of(LAPS, name).set_index("at")["seconds"]
+        alone = [1e3 * at, scaling.seconds_at(COMPARED_AT, first) / at, scaling.of(CONES, name)["at"].max()]
+        alone += [1e3 * laps.get(float(lap), math.nan) for lap in (2, settings.laps)]
+        rows[name] = [*both, *((float(value), math.nan) for value in (*alone, scaling.memory[name]))]
+    return header, rows
+
+
+def scaling_table(scaling: Scaling) -> TextTable:
+    """Return a row for each estimator: slopes, times, the ratio to the first, laps and memory."""
+    header, found = scaling_figures(scaling)
+    header, rows = (*header[:6], f"ms, lap 2 and {scaling.settings.laps}", header[8]), []
+    for name, row in found.items():
+        digits = (2, 2, 1, 2, 0, 1, 1, 1)
+        *cells, second, last, peak = (_number(*of, places) for of, places in zip(row, digits, strict=True))
+        rows.append((name, *cells, f"{second}, {last}", peak))
+    return TextTable("Time per update: slopes of the logarithms, +- standard error", header, tuple(rows))
+
+
+def _number(value: float, error: float, digits: int) -> str:
+    by = f" +- {error:.{digits}f}" if math.isfinite(error) else ""
+    return f"{value:.{digits}f}{by}" if math.isfinite(value) else "-"
+
+
+def stops(scaling: Scaling) -> list[str]:
+    """Return a line for each estimator and sweep that did not reach the end."""
+    lines = []
+    for row in (row for row in scaling.slopes.to_dict("records") if row["stopped"]):
+        reached = f" (slope to {row['high']:.0f})" if row["points"] else ""
+        lines.append(f"{row['estimator']}, {row['sweep']}: stopped, {row['stopped']}{reached}")
+    return lines
+
+
+def write_scaling(out: Path, scaling: Scaling) -> None:
+    """Write `points.csv`, `scaling.json` (with slopes and settings), `table.md` and two figures."""
+    at = {name: scaling.seconds_at(COMPARED_AT, name) for name in scaling.estimators}
+    content = {
+        "format": "pathspace-scaling/1",
+        "slopes": scaling.slopes.to_dict("records"),
+        "compared_at_cones": COMPARED_AT,
+        "seconds_compared": at,
+        "ratio_of_first": {name: at[scaling.estimators[0]] / seconds for name, seconds in at.items()},
+        "peak_megabytes_tracemalloc_first_lap": scaling.memory,
+        "peak_megabytes_of_the_process": _process_megabytes(),
+        "settings": asdict(scaling.settings),
+        "estimator_settings": scaling.mapper,
+        "versions": versions(),
+    }
+    with atomic_folder(out, MARKER) as folder:
+        scaling.points.to_csv(folder / "points.csv", index=False, lineterminator="\n")
+        (folder / "table.md").write_text(scaling_table(scaling).markdown(), encoding="utf-8")
+        write_json(folder / MARKER, content)
+        style.save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
+
+
+def _process_megabytes() -> float | None:
+    """Return the most memory (MB) that the process had, with all estimators loaded; None if unknown."""
+    if resource is None:
+        return None
+    unit = 1e-6 if platform.system() == "Darwin" else 1.024e-3
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def plot_scaling(scaling: Scaling) -> Figure:
+    """Draw two sweeps on logarithmic axes, with fitted lines, and a cross where an estimator was stopped."""
+    with style.figure_context():
+        figure = Figure(figsize=(WIDTH, _HEIGHT), layout="constrained")
+        cones, detections = figure.subplots(1, 2, sharey=True)
+        for axes, sweep in ((cones, CONES), (detections, READINGS)):
+            for name, color in _draw_sweep(axes, scaling, sweep).items():
+                _draw_power_law(axes, scaling, sweep, name, color)
+                if sweep == CONES and scaling.slope(sweep, name)["stopped"]:
+                    last = scaling.of(sweep, name).iloc[-1]
+                    axes.plot(last["at"], 1e3 * last["seconds"], "x", color=color, markersize=10.8)
+            axes.set_xscale("log")
+        cones.set_ylabel("mean update (ms)")
+        ticks = (50, 100, 200, 500, 1000, 2000)
+        _label_ticks(cones, tuple(tick for tick in ticks if tick <= scaling.settings.cones_max))
+        _label_ticks(detections, scaling.settings.readings)
+        style.shared_legend(figure, columns=min(len(scaling.estimators), 4))
+    return figure
+
+
+def plot_laps(scaling: Scaling) -> Figure:
+    """Draw the time per update of each lap, from the first on."""
+    with style.figure_context():
+        figure = Figure(figsize=(WIDTH / 2, _HEIGHT), layout="constrained")
+        axes = figure.subplots()
+        _draw_sweep(axes, scaling, LAPS, linestyle="-")
+        axes.set_ylabel("mean update (ms)")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        style.shared_legend(figure, columns=2)
+    return figure
+
+
+def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "none") -> dict[str, str]:
+    drawn: dict[str, str] = {}
+    for name, color, marker in zip(scaling.estimators, cycle(PALETTE), cycle(MARKERS), strict=False):
+        points = scaling.of(sweep, name)
+        if len(points):
+            look: dict[str, Any] = {"linewidth": 0.7, "marker": marker, "markersize": 3.6}
+            milliseconds = 1e3 * points["seconds"]
+            axes.plot(points["at"], milliseconds, linestyle=linestyle, color=color, label=name, **look)
+            drawn[name] = color
+    abscissa, title = _TITLES[sweep]
+    axes.set(yscale="log", xlabel=abscissa, title=title)
+    style.label_logarithms(axes)
+    axes.grid(which="both")
+    return drawn
+
+
+def _draw_power_law(axes: Axes, scaling: Scaling, sweep: Sweep, name: str, color: str) -> None:
+    slope = scaling.slope(sweep, name)
+    if not np.isfinite(slope["slope"]):
+        return
+    ends = slope[["low", "high"]].to_numpy(float)
+    points = scaling.of(sweep, name)[["at", "seconds"]]
+    at, seconds = np.exp(np.log(points[points["at"].between(*ends)]).mean())
+    milliseconds = 1e3 * seconds * (ends / at) ** slope["slope"]
+    axes.plot(ends, milliseconds, color=color, linewidth=0.9, alpha=0.8)
+
+
+def _label_ticks(axes: Axes, ticks: tuple[int, ...]) -> None:
+    axes.xaxis.set_major_locator(FixedLocator(ticks))
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())

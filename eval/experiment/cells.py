@@ -43,8 +43,11 @@ MEASURED: Final = (*ESTIMATORS, "health", "laps", "run", "plausibility", "eval.m
 """Rooms whose sources the metrics of a run depend on."""
 CELLS: Final = "cells"
 """Folder of the kept cells."""
-_IDENTITY_DIGITS, _SEED_DIGITS, _CODE_DIGITS = 20, 8, 16
-"""Numbers of hexadecimal digits of an identity, of a seed and of a digest of sources."""
+FORMAT: Final = "pathspace-cell/3"
+DIGEST: Final = "digest"
+"""Key of a record's digest in its file."""
+Record = dict[str, Any]
+"""What is kept of a cell, in the types of JSON only."""
 _latest: dict[str, Log] = {}
 """The log that was simulated last, by its drive."""
 
@@ -53,7 +56,7 @@ def track_digest(track: Track) -> str:
     """Return the identity of a track's geometry, wherever it came from."""
     parts = (track.left, track.right, track.other, track.start, track.cone_labels)
     cones = b"|".join(np.ascontiguousarray(part, dtype=float).tobytes() for part in parts)
-    return hashlib.sha256(cones + str(track.closed).encode()).hexdigest()[:_IDENTITY_DIGITS]
+    return hashlib.sha256(cones + str(track.closed).encode()).hexdigest()[:20]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +76,13 @@ class Drive:
     @cached_property
     def own_seed(self) -> int:
         """Seed of the simulation: drives of one seed on several tracks are independent samples."""
-        return int(identity(track=track_digest(self.track), seed=self.seed)[:_SEED_DIGITS], 16)
+        return int(identity(track=track_digest(self.track), seed=self.seed)[:8], 16)
 
     @cached_property
     def id(self) -> str:
         """Identity of everything that the log depends on, except the code."""
-        geometry = track_digest(self.track)
-        return identity(track=geometry, seed=self.own_seed, simulation=asdict(self.simulation))
+        simulation = asdict(self.simulation)
+        return identity(track=track_digest(self.track), seed=self.own_seed, simulation=simulation)
 
     def load(self) -> Log:
         """Return the log; the last one is kept, since cells are in the order of their logs."""
@@ -95,7 +98,7 @@ class Drive:
 def identity(**parts: Any) -> str:
     """Return a text that is the same for the same values, which are JSON's types only."""
     text = json.dumps(parts, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:_IDENTITY_DIGITS]
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 @cache
@@ -108,7 +111,7 @@ def code_digest(rooms: tuple[str, ...]) -> str:
         inside = [*origin.parent.glob("*.py"), *origin.parent.glob("*.cpp")]
         for file in sorted(inside) if origin.name == "__init__.py" else [origin]:
             digest.update(f"{room}/{file.name}".encode() + file.read_bytes())
-    return digest.hexdigest()[:_CODE_DIGITS]
+    return digest.hexdigest()[:16]
 
 
 def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:
@@ -117,18 +120,16 @@ def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:
     A folder stands for every track file in it, a number is the seed of a generated track, and the name of an
     event stands for its track. InputError where a file is no track or a folder has none.
     """
-    every = [track for entry in tracks for track in _expanded(entry)]
+    every = list[Path | int]()
+    for entry in tracks:
+        files = [entry]
+        if isinstance(entry, Path) and entry.is_dir():
+            files = [*sorted(file for file in entry.iterdir() if file.suffix in TRACK_SUFFIXES)]
+            if not files:
+                raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
+        every += files
     stems = [track.stem for track in every if isinstance(track, Path)]
     return [_load(track, stems) for track in every]
-
-
-def _expanded(entry: Path | int) -> list[Path | int]:
-    if isinstance(entry, int) or not entry.is_dir():
-        return [entry]
-    files = sorted(file for file in entry.iterdir() if file.suffix in TRACK_SUFFIXES)
-    if not files:
-        raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
-    return [*files]
 
 
 def _load(track: Path | int, stems: list[str]) -> Track:
@@ -136,28 +137,17 @@ def _load(track: Path | int, stems: list[str]) -> Track:
         return replace(generate_track(np.random.default_rng(track)), name=f"generated {track}")
     if track.name in EVENTS and not track.exists():
         return EVENTS[track.name]()
-    _check_file(track)
+    if not track.exists() and track.parent.is_dir():
+        beside = sorted(entry.name for entry in track.parent.iterdir() if entry.suffix == track.suffix)
+        try:
+            check_name(track.name, beside, "expected a track file")
+        except SettingsError as error:
+            raise InputError(track, str(error)) from error
     folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
     return replace(read_track(track), name=f"{folder}{track.stem}")
 
 
-def _check_file(file: Path) -> None:
-    """Raise InputError with the nearest name in the folder where there is no such file."""
-    if not file.exists() and file.parent.is_dir():
-        beside = sorted(entry.name for entry in file.parent.iterdir() if entry.suffix == file.suffix)
-        try:
-            check_name(file.name, beside, "expected a track file")
-        except SettingsError as error:
-            raise InputError(file, str(error)) from error
-
-
-FORMAT: Final = "pathspace-cell/3"
-DIGEST: Final = "digest"
-"""Key of a record's digest in its file."""
-_KEYS: Final = {"format", "id", "cell", "versions", "failure", "traceback", "said", "laps"}
-
-Record = dict[str, Any]
-"""What is kept of a cell, in the types of JSON only."""
+# --- runs ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +228,6 @@ class Outcome:
         return cls(cell.names, failure=failure, trace="".join(traceback.format_exception(error)))
 
 
-# --- runs ------------------------------------------------------------------------------------------------
-
-
 def run_cell(cell: Cell[Any]) -> Outcome:
     """Run and measure a cell with one thread of BLAS; never raise."""
     try:
@@ -277,28 +264,21 @@ def record_cell(cell: Cell[Drive]) -> Record:
 
 
 def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
-    record: Record = to_plain(
-        {
-            "format": FORMAT,
-            "id": cell.id,
-            "cell": cell.names,
-            "versions": versions(),
-            "failure": outcome.failure,
-            "traceback": outcome.trace,
-            "said": _said(outcome.result),
-            "laps": lap_rows(outcome.rows),
-        }
-    )
-    return record
-
-
-def _said(run: RunResult | None) -> str:
-    if run is None:
-        return ""
-    state = run.vehicle
-    lines = [record.notice for record in run.cycles if record.notice]
-    lines += [] if state is None else diagnose(state, run.settings)
-    return "; ".join(dict.fromkeys(lines))
+    run, said = outcome.result, list[str]()
+    if run is not None:
+        said += [record.notice for record in run.cycles if record.notice]
+        said += [] if run.vehicle is None else diagnose(run.vehicle, run.settings)
+    record: Record = {
+        "format": FORMAT,
+        "id": cell.id,
+        "cell": cell.names,
+        "versions": versions(),
+        "failure": outcome.failure,
+        "traceback": outcome.trace,
+        "said": "; ".join(dict.fromkeys(said)),
+        "laps": lap_rows(outcome.rows),
+    }
+    return dict(to_plain(record))
 
 
 def lap_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -319,21 +299,15 @@ def read_record(folder: Path, cell: Cell[Drive]) -> Record | None:
         record = read_json(_file(folder, cell), "a cell")
     except InputError:
         return None
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
+    if not isinstance(record, dict) or record.pop(DIGEST, None) != identity(record=record):
         return None
-    digest = record.pop(DIGEST, None)  # older records have none
-    whole = record.keys() == _KEYS and digest in (None, _digest(record)) and record["id"] == cell.id
-    return record if whole else None
+    return record if (record.get("format"), record.get("id")) == (FORMAT, cell.id) else None
 
 
 def write_record(folder: Path, cell: Cell[Drive], record: Record) -> None:
     """Write the record as a file of its own, whole or not at all."""
-    write_json(_file(folder, cell), {**record, DIGEST: _digest(record)}, indent=1)
+    write_json(_file(folder, cell), {**record, DIGEST: identity(record=record)}, indent=1)
 
 
 def _file(folder: Path, cell: Cell[Drive]) -> Path:
     return folder / CELLS / f"{cell.id}.json"
-
-
-def _digest(record: Record) -> str:
-    return identity(record=record)

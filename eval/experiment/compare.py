@@ -1,4 +1,4 @@
-"""Every estimator on the same logs: their frame, the paper's Table 1, all metrics, and paired differences."""
+"""Every estimator on the same logs: the paper's Table 1, all metrics, paired differences, and all files."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,33 +12,30 @@ import pandas as pd
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
 from pathspace_graph.eval.metrics.measures import online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.reference import gap
-from pathspace_graph.eval.metrics.summary import has_cones
-from pathspace_graph.io.files import is_temporary
+from pathspace_graph.eval.metrics.summary import has_cones, summarize, versions
+from pathspace_graph.io.files import atomic_folder, is_temporary, write_json
 from pathspace_graph.io.log import LOG_FILE
 from pathspace_graph.io.map import SplineBoundary
-from pathspace_graph.io.results import BatchRun, RunResult
+from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
 from .cells import Cell, NamedLog, Outcome, run_cell
 from .frame import add_batch, difference
-from .run import Experiment, OnCell
+from .plots import blind_spot_figure, plot_maps
+from .run import OnCell, run_cells
 from .study import known_estimators
 from .tables import TextTable, group_starts
 
+MARKER: Final = "comparison.json"
+"""File by which a comparison's folder is recognized."""
 RUN: Final = ("log", "estimator")
-NO_TRUTH: Final = "the log has no true cones, which rmse, missed and most other metrics need"
-"""Part of a title where the columns of the paper are missing."""
-FAILED: Final = "failed"
-"""Text in place of a lap for an estimator that failed on every log."""
-AT_END: Final = "end"
-"""Text in place of a lap for an estimator that completed no lap."""
-_SPACE: Final = "   "
 _PRINTED: Final = (
     *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "two_way", "ghost_share", "size", "ate"),
     "ms_mean",
@@ -48,17 +45,13 @@ _NOT_PAIRED: Final = ("nees_low", "nees_high")
 """Metrics whose differences mean nothing."""
 
 
-# --- runs ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All outcomes, log by log, in the order of the estimators."""
+    """All outcomes, log by log; the estimators are compared with one of them, the reference."""
 
     logs: tuple[NamedLog, ...]
     estimators: tuple[str, ...]
     reference: str
-    """Estimator that the others are compared with."""
     outcomes: tuple[Outcome, ...] = ()
 
     @cached_property
@@ -125,8 +118,7 @@ def gap_columns(result: RunResult, batch: RunResult) -> dict[str, float]:
 
 
 def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedLog, ...]:
-    """Return the log of a log folder, or those of a folder of log folders by name; InputError if there
-    are none, or if a cycle of one cannot be used."""
+    """Return the log of a log folder, or those of a folder of log folders; InputError if it is neither."""
     folders = {folder.resolve().name: folder}
     if folder.is_dir() and not (folder / LOG_FILE).exists():
         entries = sorted(entry for entry in folder.iterdir() if not is_temporary(entry.name))
@@ -168,14 +160,10 @@ def compare(
     jobs: int = 1,
     on_run: OnCell | None = None,
 ) -> Comparison:
-    """Run every estimator on every log, `jobs` at a time on one BLAS thread each, see `Experiment.run`.
-
-    A failure of one does not stop the others.
-    """
+    """Run every estimator on every log, `jobs` at a time; a failure of one does not stop the others."""
     settings, measured = settings or MapperSettings(), {"ghost_settings": ghosts}
     cells = [Cell(log, name, settings, measured=measured) for log in logs for name in estimators]
-    experiment = Experiment(cells=cells, work=run_cell, died=Outcome.failed)
-    found = experiment.run(jobs, on_cell=on_run)
+    found = run_cells(cells, run_cell, Outcome.failed, jobs=jobs, on_cell=on_run)
     chosen = choose_reference(reference, estimators)
     return Comparison(tuple(logs), tuple(estimators), chosen, tuple(found))
 
@@ -212,7 +200,7 @@ def paper_table(comparison: Comparison) -> TextTable:
     logs = ["logs"] if len(comparison.logs) > 1 else []
     rows = []
     for row in paper_frame(comparison).to_dict("records"):
-        lap = (AT_END if row["logs"] else FAILED) if pd.isna(row["lap"]) else str(int(row["lap"]))
+        lap = ("end" if row["logs"] else "failed") if pd.isna(row["lap"]) else str(int(row["lap"]))
         cells = (*(str(row[key]) for key in logs), *(_cell(metric, row) for metric in shown))
         rows.append((row["estimator"], lap, *cells))
     header = ("estimator", "lap", *logs, *(metric.heading for metric in shown))
@@ -232,17 +220,13 @@ def final_table(comparison: Comparison) -> TextTable:
 
 def paired_frame(comparison: Comparison) -> pd.DataFrame:
     """Return a tidy row for each estimator and metric of whole logs: its difference from the reference."""
-    reference, logs = comparison.reference, [named.name for named in comparison.logs]
-    final = comparison.final.set_index([*RUN])
+    reference, rows = comparison.reference, []
+    final = comparison.final.set_index([*RUN]).unstack("estimator")
     keys = [key for key in METRICS if key in final and key not in _NOT_PAIRED]
-    rows = []
-    for estimator in comparison.estimators:
-        for key in keys if estimator != reference else ():
-            values, others = (
-                final[key].astype(float).reindex([(log, name) for log in logs]).to_numpy()
-                for name in (estimator, reference)
-            )
-            d = difference(values, others)
+    for estimator in (name for name in comparison.estimators if name != reference):
+        for key in keys:
+            values = final[key].reindex(columns=[estimator, reference]).to_numpy(float)
+            d = difference(*values.T)
             rows.append([estimator, reference, key, d.mean, d.low, d.high, d.count])
     return pd.DataFrame(rows, columns=["estimator", "reference", "metric", "mean", "low", "high", "pairs"])
 
@@ -277,24 +261,69 @@ def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
 
     The rmse, missed and size of an estimator share a column, so that its name stands above all three.
     """
-    titles = _SPACE.join(metric.heading for metric in PAPER)
-    header = ("lap", *(f"{name}\n{titles}" for name in laps))
-    beside = zip_longest(*laps.values())
-    rows = tuple((str(lap), *map(_three, of)) for lap, of in enumerate(beside, start=1))
-    return TextTable("", header, rows, names=0)
-
-
-def _three(row: LapMetrics | None) -> str:
-    values = {} if row is None else asdict(row)
-    return _SPACE.join(_cell(metric, values).rjust(len(metric.heading)) for metric in PAPER)
+    titles = "   ".join(metric.heading for metric in PAPER)
+    header, rows = ("lap", *(f"{name}\n{titles}" for name in laps)), []
+    for lap, beside in enumerate(zip_longest(*laps.values()), start=1):
+        values = ({} if row is None else asdict(row) for row in beside)
+        three = ("   ".join(_cell(m, row).rjust(len(m.heading)) for m in PAPER) for row in values)
+        rows.append((str(lap), *three))
+    return TextTable("", header, tuple(rows), names=0)
 
 
 def _title(comparison: Comparison, when: str) -> str:
     count = len(comparison.logs)
     logs = comparison.logs[0].name if count == 1 else f"mean over {count} logs"
-    missing = "" if comparison.has_truth else f" ({NO_TRUTH})"
-    return f"{logs}, {when}{missing}"
+    missing = " (the log has no true cones, which rmse, missed and most other metrics need)"
+    return f"{logs}, {when}{'' if comparison.has_truth else missing}"
 
 
 def _cell(metric: Metric, row: dict[Any, Any]) -> str:
     return metric.text(float(row.get(metric.key, np.nan)))
+
+
+# --- files -----------------------------------------------------------------------------------------------
+
+
+def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
+    """Write all files of a comparison (docs/formats.md), or on failure none.
+
+    Where there are several logs, each has a folder of its own. An earlier comparison in `out` is kept as a
+    numbered backup.
+    """
+    frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": comparison.times()}
+    if comparison.paired:
+        frames["paired"] = paired_frame(comparison)
+    with atomic_folder(out, MARKER) as folder:
+        for name, table in tables(comparison).items():
+            (folder / f"{name}.md").write_text(table.markdown(), encoding="utf-8")
+            (folder / f"{name}.tex").write_text(table.latex(), encoding="utf-8")
+        for name, frame in frames.items():
+            frame.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
+        for named in comparison.logs:
+            _write_log(folder if len(comparison.logs) == 1 else folder / named.name, named, comparison)
+        about = {
+            "format": "pathspace-comparison/1",
+            "logs": [named.name for named in comparison.logs],
+            "estimators": comparison.estimators,
+            "reference": comparison.reference,
+            "failures": [{**o.names, "error": o.failure} for o in comparison.failures],
+            "jobs": jobs,
+            "settings": asdict(settings),
+            "versions": versions(),
+        }
+        write_json(folder / MARKER, about)
+
+
+def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
+    folder.mkdir(exist_ok=True)
+    found = comparison.of(named.name)
+    maps = {str(o.names["estimator"]): o.result.map for o in found if o.result is not None}
+    for outcome in found:
+        if outcome.result is not None:
+            summary = summarize(outcome.result, named.log, named.hints)
+            write_result(folder / outcome.names["estimator"], outcome.result, summary)
+    if maps:
+        save_figures(folder, {"maps": plot_maps(found, named.log)})
+    if named.log.truth is not None and comparison.reference in maps:
+        figure = blind_spot_figure(maps, comparison.reference, named.log.truth)
+        save_figures(folder, {} if figure is None else {"blind_spot": figure})

@@ -1,5 +1,6 @@
 """The suite of faults: a study whose noises are single faults, `fault: strength`, each beside a clean run."""
 
+import json
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -10,39 +11,31 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from pathspace_graph.errors import SettingsError, check_name
+from pathspace_graph.eval.figures import style
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, ORANGE, WIDTH
 from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN
+from pathspace_graph.io.files import write_json, write_text
 from pathspace_graph.plausibility.diagnosis import LIMIT
 
 from .frame import RUN, last_laps
 from .study import Study, find_study, read_study
-from .tables import TextTable, group_starts
+from .tables import TextTable, group_starts, write_csv, write_results
 
 SUITE: Final = Path("faults")
 """Name of the shipped study that is the suite."""
 CLEAN: Final = "clean"
 """Name of the noise without a fault, which every other one is compared with."""
-BY_PRIOR: Final = "_by_prior"
-"""Suffix of metrics that are estimates of a calibration by the sigma of its prior."""
-TITLE_BY_PRIOR: Final = " by its prior's sigma"
+FAULT_COLUMNS: Final = 4
+"""Panels side by side in the figure of faults."""
 Values = Mapping[str, Any]
 """Values of an outcome by name."""
-PAIR: Final = "{:.1f}, {:.1f}"
-NOTHING: Final = "nothing"
-"""Text where no run said anything."""
-_SAID_LENGTH: Final = 60
-"""Number of characters that a notice is shortened to; the JSON file has the whole of it."""
 _WORST: Final = ("error_max", "error_end", "astray_time", "astray_way")
 _MEASURED: Final = (
-    "rmse",
-    "size",
-    "missed",
-    "closed_at_end",
-    "lost_at_end",
-    *_WORST,
-    "told_degraded",
-    "told_lost",
+    *("rmse", "size", "missed", "closed_at_end", "lost_at_end", "told_degraded", "told_lost", *_WORST),
 )
 _NAME: Final = re.compile(r"(?P<kind>.+): (?P<strength>(?P<value>[-+.\d]+)(?: (?P<unit>\S+))?)")
 
@@ -55,12 +48,10 @@ class Fault:
     """A fault of a kind and a strength."""
 
     kind: str
-    """Kind in plain words; `clean` where there is no fault."""
     strength: str
     """Strength as it is written, a number and a unit."""
     value: float
     unit: str
-    """Unit; empty for counts."""
 
 
 def fault_of(noise: str) -> Fault:
@@ -80,9 +71,13 @@ def suite() -> Study:
     return read_study(find_study(SUITE))
 
 
+def by_kind(study: Study) -> list[list[str]]:
+    """Return the noises of each kind of fault, in ascending strength."""
+    return [list(noises) for _, noises in groupby(study.noise, lambda noise: fault_of(noise).kind)]
+
+
 def kinds(study: Study) -> list[str]:
-    every = dict.fromkeys(fault_of(noise).kind for noise in study.noise)
-    return [kind for kind in every if kind != CLEAN]
+    return [fault_of(noises[0]).kind for noises in by_kind(study) if noises != [CLEAN]]
 
 
 def only(study: Study, wanted: Sequence[str]) -> Study:
@@ -95,16 +90,12 @@ def only(study: Study, wanted: Sequence[str]) -> Study:
 
 def strongest(study: Study) -> Study:
     """Return the suite with the clean run and each fault at the last of its strengths."""
-    return _with(study, [noises[-1] for noises in _by_kind(study)])
+    return _with(study, [noises[-1] for noises in by_kind(study)])
 
 
 def of_middle_strength(study: Study) -> Study:
     """Return the suite with the clean run and each fault at the middle one of its strengths."""
-    return _with(study, [noises[len(noises) // 2] for noises in _by_kind(study)])
-
-
-def _by_kind(study: Study) -> list[list[str]]:
-    return [list(noises) for _, noises in groupby(study.noise, lambda noise: fault_of(noise).kind)]
+    return _with(study, [noises[len(noises) // 2] for noises in by_kind(study)])
 
 
 def _with(study: Study, noises: Sequence[str]) -> Study:
@@ -119,18 +110,17 @@ def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
 
     `runs` that finished count, `failed` ones don't. What is not known is NaN.
     """
-    runs = beside_clean(frame)
-    failures = frame[frame["failure"] != ""].groupby("noise").size()
+    every, failures = beside_clean(frame), frame.loc[frame["failure"] != "", "noise"].value_counts()
     return [
-        _outcome(fault_of(noise), runs[runs["noise"] == noise], int(failures.get(noise, 0)))
+        _outcome(fault_of(noise), every[every["noise"] == noise], int(failures.get(noise, 0)))
         for noise in study.noise
     ]
 
 
 def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
     ratios = runs["ratio"].dropna()
-    sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith(BY_PRIOR)}
-    titles = {key: METRICS[key].title.removesuffix(TITLE_BY_PRIOR) for key in sigmas}
+    sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith("_by_prior")}
+    titles = {key: METRICS[key].title.removesuffix(" by its prior's sigma") for key in sigmas}
     return {
         "fault": fault.kind,
         "strength": fault.value,
@@ -197,8 +187,10 @@ def _closed(values: Values) -> str:
 
 
 def _said(values: Values) -> str:
-    said = (f"{n} of {values['runs']}: {_short(text)}" for text, n in values["said"].items())
-    return "; ".join(said) or NOTHING
+    """Return how many runs said what, shortened to 60 characters; the JSON file has all of it."""
+    short = {text: text if len(text) <= 60 else f"{text[:60].rstrip()} …" for text in values["said"]}
+    said = (f"{number} of {values['runs']}: {short[text]}" for text, number in values["said"].items())
+    return "; ".join(said) or "nothing"
 
 
 def _form(form: str, *names: str, factor: float = 1.0) -> Callable[[Values], str]:
@@ -206,10 +198,6 @@ def _form(form: str, *names: str, factor: float = 1.0) -> Callable[[Values], str
     return lambda values: (
         UNKNOWN if np.isnan(values[names[0]]) else form.format(*(factor * values[name] for name in names))
     )
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= _SAID_LENGTH else f"{text[:_SAID_LENGTH].rstrip()} …"
 
 
 COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
@@ -220,7 +208,7 @@ COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
     "closed": _closed,
     "lost at the end": lambda values: f"{values['lost']} of {values['runs']}",
     "largest error [m]": _form("{:.1f}", "error_max"),
-    "over 1 m off after closing [s, m]": _form(PAIR, "astray_time", "astray_way"),
+    "over 1 m off after closing [s, m]": _form("{:.1f}, {:.1f}", "astray_time", "astray_way"),
     "calibration by its prior's sigma": lambda values: ", ".join(
         f"{name} {value:+.1f}" for name, value in values["calibration"].items()
     ),
@@ -230,3 +218,84 @@ COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
     "said": _said,
 }
 """Columns of the table after the fault and its strength, each made of the values of an outcome."""
+
+
+# --- figure and files ------------------------------------------------------------------------------------
+
+
+def plot_faults(study: Study, runs: pd.DataFrame) -> Figure:
+    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said.
+
+    The runs are those of `beside_clean`.
+    """
+    panels = [noises for noises in by_kind(study) if noises != [CLEAN]]
+    rows = max(1, -(-len(panels) // FAULT_COLUMNS))
+    with style.figure_context():
+        figure = Figure(figsize=(WIDTH, 0.5 + 1.45 * rows), layout="constrained")
+        every = figure.subplots(rows, FAULT_COLUMNS, sharey=True, squeeze=False).ravel()
+        for axes, noises in zip(every, panels, strict=False):
+            _draw_fault(axes, noises, runs)
+        for axes in every[len(panels) :]:
+            axes.set_visible(False)
+        ratios = np.append(runs["ratio"].dropna(), 1.0)
+        every[0].set_yscale("log")
+        every[0].set_ylim(ratios.min() / 1.15, ratios.max() * 1.15)
+        style.label_logarithms(every[0])
+        figure.supylabel("rmse by that of the clean run")
+        style.shared_legend(figure, columns=6)
+    return figure
+
+
+def _draw_fault(axes: Axes, noises: Sequence[str], runs: pd.DataFrame) -> None:
+    axes.axhline(1.0, color=DARK, linewidth=0.6)
+    means = []
+    for at, noise in enumerate(noises):
+        own = runs[runs["noise"] == noise]
+        means.append(own["ratio"].mean())
+        spread = 0.15 if len(own) > 1 else 0.0
+        places = at + np.linspace(-spread, spread, len(own))
+        for place, *run in zip(places, own["ratio"], own["lost_at_end"] == 1.0, own["told"], strict=True):
+            _draw_faulty_run(axes, float(place), *run)
+    known = np.flatnonzero(~np.isnan(means))
+    if len(known):
+        axes.plot(known, np.array(means)[known], color=BLUE, linewidth=0.9, label="mean", zorder=1)
+    faults = [fault_of(noise) for noise in noises]
+    axes.set_xticks(range(len(faults)), [f"{fault.value:g}" for fault in faults])
+    axes.set_xlim(-0.5, len(faults) - 0.5)
+    title = f"{faults[0].kind} [{faults[0].unit}]".removesuffix(" []")
+    cut = title.rfind(" ", 0, 30) if len(title) > 30 else 0
+    axes.set_title(f"{title[:cut]}\n{title[cut + 1 :]}" if cut > 0 else title)
+    axes.grid(axis="y")
+
+
+def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool) -> None:
+    """Draw a triangle where the vehicle is lost at the end, a cross at the top where there is no map."""
+    if np.isnan(ratio):
+        edge = axes.get_xaxis_transform()
+        axes.plot(at, 0.95, "x", color=ORANGE, markersize=4.0, transform=edge, label="no map")
+        return
+    color = ORANGE if lost else GREEN
+    label = f"{'lost at the end' if lost else 'not lost'}{', said so' if told else ''}"
+    look: dict[str, Any] = {"markerfacecolor": color if told else "none", "markersize": 4.0}
+    axes.plot(at, ratio, "^" if lost else "o", color=color, markeredgewidth=0.8, label=label, **look)
+
+
+def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write the results of every run, and the table, the values and the figure; return the table's text.
+
+    `faults.csv` has calibration and notices as JSON texts.
+    """
+    faults = outcomes(study, frame)
+    table = fault_table(study, faults)
+    text = f"{table.title}\n\n{table.text()}\n"
+    write_results(frame, out)
+    for suffix, content in (("txt", text), ("md", table.markdown()), ("tex", table.latex())):
+        write_text(out / f"faults.{suffix}", content)
+    about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
+    write_json(out / "faults.json", {"format": "pathspace-faults/1", **about, "faults": faults}, indent=1)
+    flat = pd.DataFrame(faults)
+    for key in ("calibration", "said"):
+        flat[key] = [json.dumps(value, ensure_ascii=False) for value in flat[key]]
+    write_csv(out / "faults.csv", flat)
+    style.save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})
+    return text

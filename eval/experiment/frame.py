@@ -25,19 +25,10 @@ COMBINATION: Final = ("noise", "estimator", "variant")
 RUN: Final = ("track", "seed")
 """Columns that name a drive; combinations are paired on the same drive and noise."""
 RUN_OF: Final = (*RUN, *COMBINATION)
-SIMULATION: Final = "simulation."
-"""Prefix of columns with settings of the simulation."""
-SETTING: Final = "settings."
-"""Prefix of columns with settings of the estimator where another column has their name."""
 TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
 """Columns of wall times, all that differs when a study is run again."""
 LEVEL: Final = 0.95
 """Confidence level of intervals; a difference is significant where its p is below 1 - LEVEL."""
-CORRECTION: Final = "Holm"
-"""Method by which multiple comparisons are corrected."""
-
-
-# --- frame -----------------------------------------------------------------------------------------------
 
 
 def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -> pd.DataFrame:
@@ -70,18 +61,15 @@ def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
 
 def _settings_row(study: Study, cell: Cell[Drive]) -> dict[str, Any]:
     settings, simulation = leaves(cell.settings), leaves(cell.drive.simulation)
-    row = {f"{SIMULATION}{name}": _cell(simulation[name]) for name in study.varied_noise}
+    row = {f"simulation.{name}": simulation[name] for name in study.varied_noise}
     own = {"study", *RUN_OF}
-    return row | {f"{SETTING}{name}" if name in own else name: _cell(settings[name]) for name in study.varied}
-
-
-def _cell(value: Any) -> Any:
-    return " ".join(str(part) for part in value) if isinstance(value, tuple) else value
+    row |= {f"settings.{name}" if name in own else name: settings[name] for name in study.varied}
+    return {name: " ".join(map(str, v)) if isinstance(v, tuple) else v for name, v in row.items()}
 
 
 def without_times(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the columns that are the same whenever the study is run."""
-    return frame.drop(columns=[name for name in TIMES if name in frame])
+    return frame.drop(columns=[*TIMES], errors="ignore")
 
 
 def times_of(frame: pd.DataFrame) -> pd.DataFrame:
@@ -188,8 +176,7 @@ def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
 
     p is corrected by Holm's method over all comparisons of the metric in the study.
     """
-    last = last_laps(frame)
-    known = last.assign(**{metric: last[metric].astype(float)}).dropna(subset=[metric])
+    known = last_laps(frame).astype({metric: float}).dropna(subset=[metric])
     runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
     nothing, contrasted = pd.Series(dtype=float), []
     for key in product(study.noise, study.estimators, study.points):
@@ -199,8 +186,7 @@ def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
         if key != base:
             shared = values.index[values.index.isin(against.index)]
             d = values[shared].to_numpy() - against[shared].to_numpy()
-            pairs = tuple(d.tolist())
-            contrast = replace(contrast, difference=estimate(d), differences=pairs, p=paired_p(d))
+            contrast = replace(contrast, difference=estimate(d), differences=tuple(d.tolist()), p=paired_p(d))
         contrasted.append(contrast)
     corrected = holm(np.array([contrast.p for contrast in contrasted]))
     return [replace(contrast, p=float(p)) for contrast, p in zip(contrasted, corrected, strict=True)]

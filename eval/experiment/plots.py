@@ -1,194 +1,34 @@
-"""Figures: differences from the baseline, faults, and maps side by side."""
+"""Maps side by side over the truth: whole tracks, and the stretch where landmarks miss most cones."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, Final
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 
 from pathspace_graph.eval.figures import map_plot, style
 from pathspace_graph.eval.figures.map_plot import MARGIN, WHOLE_TRACK, MapStyle
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, ORANGE, RED, WIDTH
+from pathspace_graph.eval.figures.style import RED, WIDTH
 from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
-from pathspace_graph.eval.metrics.metric import METRICS, PAPER
+from pathspace_graph.eval.metrics.metric import PAPER
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log, Truth
-from pathspace_graph.io.map import Map
+from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES
 
 from .cells import Outcome
-from .faults import CLEAN, fault_of
-from .frame import Contrast, contrasts
-from .study import Study
 
-_MAX_PANELS: Final = 3
-"""Most metrics side by side in the figure of differences."""
-_ROW_HEIGHT: Final = 0.24
-"""Height of a combination in the figure of differences (in)."""
-_LABELS_HEIGHT: Final = 1.1
-"""Height of titles and tick labels there (in)."""
-_MEAN_SIZE, _PAIR_SIZE, _MARKER_SIZE = 4.5, 3.5, 4.0
-"""Size of the markers of a mean, a single pair and a faulty run (pt)."""
-_JITTER: Final = 0.22
-"""Share of a row by which single pairs are scattered vertically, so that they can be seen apart."""
-
-_FAULT_COLUMNS: Final = 4
-"""Number of panels side by side in the figure of faults."""
-_PANEL_HEIGHT, _LEGEND_HEIGHT = 1.45, 0.5
-"""Heights there of a panel, and of the legend and the title of the axis (in)."""
-_LEGEND_COLUMNS: Final = 6
-"""Every look of a mark, and the mean, stand in one row of that legend."""
-_SPREAD: Final = 0.15
-"""Spread of the runs of one strength to both sides, so that they can be seen apart."""
-_ROOM: Final = 1.15
-"""Factor by which the axis reaches beyond the smallest and the largest ratio."""
-_TITLE_LENGTH: Final = 30
-"""Number of characters at which the title of a panel is broken."""
-
-
-# --- differences -----------------------------------------------------------------------------------------
-
-
-def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
-    """Draw every pair, their mean and its interval: a row for each combination, a panel for each metric.
-
-    Only the first metrics of the study have a panel, and there is none where no run differs.
-    """
-    panels = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
-    panels = [p for p in panels if any(d != 0.0 for contrast in p for d in contrast.differences)]
-    panels = panels[:_MAX_PANELS]
-    if not panels:
-        return None
-    rows = [i for i in range(len(panels[0])) if any(_is_known(panel[i]) for panel in panels)]
-    names = [_name(study, panels[0][i]) for i in rows]
-    with style.figure_context():
-        figure = Figure(figsize=(WIDTH, _LABELS_HEIGHT + _ROW_HEIGHT * len(rows)), layout="constrained")
-        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-        for axes, panel in zip(all_axes, panels, strict=True):
-            _draw_differences(axes, [panel[i] for i in rows])
-        all_axes[0].set_yticks(range(len(rows)), names)
-        all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
-        text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
-        figure.supxlabel(text)
-    return figure
-
-
-def _is_known(contrast: Contrast) -> bool:
-    return contrast.difference is not None and contrast.difference.count > 0
-
-
-def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
-    metric = METRICS[rows[0].metric]
-    rng = np.random.default_rng(0)
-    axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
-    for row, contrast in enumerate(rows):
-        if contrast.difference is None or not contrast.difference.count:
-            continue
-        color = BLUE if contrast.significant else GREY
-        pairs = metric.factor * np.array(contrast.differences)
-        scattered = row + rng.uniform(-_JITTER, _JITTER, len(pairs))
-        axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=_PAIR_SIZE, zorder=2)
-        mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
-        look: dict[str, Any] = {"color": color, "markersize": _MEAN_SIZE, "elinewidth": 1.0}
-        axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", zorder=3, **look)
-    axes.set_title(metric.heading)
-    axes.grid(axis="x")
-
-
-def _name(study: Study, contrast: Contrast) -> str:
-    """Return the names of a combination that others have differently, `sigma_spacing=1` for
-    `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
-    counts = {"noise": study.noise, "estimator": study.estimators, "variant": study.points}
-    several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
-    name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
-    last = {field: field.rpartition(".")[2] for field in study.varied}
-    if len(set(last.values())) == len(last):
-        for field, short in last.items():
-            name = name.replace(f"{field}=", f"{short}=")
-    return name
-
-
-# --- faults ----------------------------------------------------------------------------------------------
-
-
-def plot_faults(study: Study, runs: pd.DataFrame) -> Figure:
-    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said.
-
-    The runs are those of `beside_clean`.
-    """
-    by_kind = groupby(study.noise, key=lambda noise: fault_of(noise).kind)
-    panels = {kind: [*noises] for kind, noises in by_kind if kind != CLEAN}
-    rows = max(1, -(-len(panels) // _FAULT_COLUMNS))
-    with style.figure_context():
-        figure = Figure(figsize=(WIDTH, _LEGEND_HEIGHT + _PANEL_HEIGHT * rows), layout="constrained")
-        every = figure.subplots(rows, _FAULT_COLUMNS, sharey=True, squeeze=False).ravel()
-        for axes, noises in zip(every, panels.values(), strict=False):
-            _draw_fault(axes, noises, runs)
-        for axes in every[len(panels) :]:
-            axes.set_visible(False)
-        ratios = np.append(runs["ratio"].dropna(), 1.0)
-        every[0].set_yscale("log")
-        every[0].set_ylim(ratios.min() / _ROOM, ratios.max() * _ROOM)
-        style.label_logarithms(every[0])
-        figure.supylabel("rmse by that of the clean run")
-        style.shared_legend(figure, columns=_LEGEND_COLUMNS)
-    return figure
-
-
-def _draw_fault(axes: Axes, noises: Sequence[str], runs: pd.DataFrame) -> None:
-    axes.axhline(1.0, color=DARK, linewidth=0.6)
-    means = []
-    for at, noise in enumerate(noises):
-        own = runs[runs["noise"] == noise]
-        means.append(own["ratio"].mean())
-        spread = _SPREAD if len(own) > 1 else 0.0
-        places = at + np.linspace(-spread, spread, len(own))
-        for place, *run in zip(places, own["ratio"], own["lost_at_end"] == 1.0, own["told"], strict=True):
-            _draw_faulty_run(axes, float(place), *run)
-    known = np.flatnonzero(~np.isnan(means))
-    if len(known):
-        axes.plot(known, np.array(means)[known], color=BLUE, linewidth=0.9, label="mean", zorder=1)
-    faults = [fault_of(noise) for noise in noises]
-    axes.set_xticks(range(len(faults)), [f"{fault.value:g}" for fault in faults])
-    axes.set_xlim(-0.5, len(faults) - 0.5)
-    kind, unit = faults[0].kind, faults[0].unit
-    axes.set_title(_broken(f"{kind} [{unit}]" if unit else kind))
-    axes.grid(axis="y")
-
-
-def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool) -> None:
-    """Draw a triangle where the vehicle is lost at the end, a cross at the top where there is no map."""
-    if np.isnan(ratio):
-        edge = axes.get_xaxis_transform()
-        axes.plot(at, 0.95, "x", color=ORANGE, markersize=_MARKER_SIZE, transform=edge, label="no map")
-        return
-    color = ORANGE if lost else GREEN
-    label = f"{'lost at the end' if lost else 'not lost'}{', said so' if told else ''}"
-    look: dict[str, Any] = {"markerfacecolor": color if told else "none", "markersize": _MARKER_SIZE}
-    axes.plot(at, ratio, "^" if lost else "o", color=color, markeredgewidth=0.8, label=label, **look)
-
-
-def _broken(title: str) -> str:
-    if len(title) <= _TITLE_LENGTH:
-        return title
-    cut = title.rfind(" ", 0, _TITLE_LENGTH)
-    return f"{title[:cut]}\n{title[cut + 1 :]}" if cut > 0 else title
-
-
-# --- maps side by side ---------------------------------------------------------------------------------
-
-
+COLUMNS: Final = (2, 3, 4)
+"""Numbers of maps side by side; the first with which the figure fits a page is taken."""
+MAX_HEIGHT: Final = 10.0
+"""Height of a page (in)."""
 DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)
 """Distances (m) within which nothing is mapped at a missed cone, in the order in which they are tried."""
-_MIN_CONES: Final = 2
-"""Least number of cones missed on a stretch that is a good example."""
-_MAX_WEIGHT: Final = 10.0
-"""Cones farther than this (m) from any landmark all have the same weight."""
+CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
+"""Style of a panel that shows a short stretch of a track."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,9 +36,8 @@ class BlindSpot:
     """Stretch of the track, and the true cones in it that maps miss."""
 
     centre: Array
-    """Centre (2,) of the stretch in m, map frame."""
     half_size: tuple[float, float]
-    """Half width and half height of the stretch (m)."""
+    """Centre (2,), half width and half height of the stretch in m, map frame."""
     distance: float
     """Distance (m) within which nothing is mapped at a missed cone."""
     cones: int
@@ -209,11 +48,10 @@ class BlindSpot:
 def find_blind_spot(
     truth: Truth, spline_map: Map, landmark_map: Map, half_size: tuple[float, float] = (17.0, 13.0)
 ) -> BlindSpot | None:
-    """Return the stretch where the landmark map misses the most cones that the spline map doesn't.
+    """Return the stretch where the landmark map misses the most cones that the spline map doesn't, if any.
 
-    The cones are missed at the largest of `DISTANCES` at which a stretch misses several cones, else at the
-    largest at which any cone is missed. It is None where none is missed at any. Among equal stretches the one
-    is chosen whose cones have the largest total distance from their nearest landmarks.
+    They are missed at the largest of `DISTANCES` at which a stretch misses several, else at the largest at
+    which any is missed. Of equal stretches it is the one with the largest total distance, each up to 10 m.
     """
     cones = truth.cones[np.isin(truth.cone_labels, BOUNDARIES)]
     distances = [cone_distances(track, truth) for track in (spline_map, landmark_map)]
@@ -221,41 +59,41 @@ def find_blind_spot(
     for distance in DISTANCES:
         bridged = (distances[0] <= distance) & (distances[1] > distance)
         if bridged.any():
-            centre = _densest(cones[bridged], np.minimum(distances[1][bridged], _MAX_WEIGHT), half_size)
+            points, weights = cones[bridged], np.minimum(distances[1][bridged], 10.0)
+            near: Any = KDTree(points / half_size).query_ball_point(points / half_size, 1.0, p=np.inf)
+            chosen = points[max(near, key=lambda members: (len(members), weights[members].sum()))]
+            centre = 0.5 * (chosen.min(axis=0) + chosen.max(axis=0))
             inside = (np.abs(cones - centre) <= half_size).all(axis=1)
             missed = tuple(cones[inside & (d > distance)] for d in distances)
             spot = BlindSpot(centre, half_size, distance, int(inside.sum()), missed)
-            if len(spot.missed[1]) >= _MIN_CONES:
+            if len(spot.missed[1]) > 1:
                 return spot
             best = best or spot
     return best
 
 
-def _densest(points: Array, weights: Array, half_size: tuple[float, float]) -> Array:
-    """Return the centre (2,) of the points (k, 2) around the one with most neighbours, then most weight."""
-    scaled = points / np.array(half_size)
-    neighbours = KDTree(scaled).query_ball_point(scaled, 1.0, p=np.inf)
-    best = max(neighbours, key=lambda members: (len(members), float(weights[members].sum())))
-    chosen: Array = points[best]
-    return np.asarray(0.5 * (chosen.min(axis=0) + chosen.max(axis=0)))
-
-
-COLUMNS: Final = (2, 3, 4)
-"""Numbers of panels side by side; the first with which the figure fits a page is taken."""
-MAX_HEIGHT: Final = 10.0
-"""Height of a page (in)."""
-CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
-"""Style of a panel that shows a short stretch of a track."""
-
-# heights (in): a panel's title, the outer tick labels with axis titles, more than any legend, gaps
-_TITLE_HEIGHT, _TICK_LABELS, _LEGEND_ROOM, _GAP = 0.6, 0.48, 2.0, 0.12
-_RING_SIZE: Final = 8.0
+def blind_spot_figure(maps: Mapping[str, Map], reference: str, truth: Truth) -> Figure | None:
+    """Return the reference beside the first landmark map that misses cones that it passes, or None."""
+    points = [
+        name
+        for name, track in maps.items()
+        if any(isinstance(boundary, PointBoundary) for boundary in track.boundaries.values())
+    ]
+    for name in points if reference not in points else ():
+        spot = find_blind_spot(truth, maps[reference], maps[name])
+        if spot is not None:
+            return plot_blind_spot(spot, [(reference, maps[reference]), (name, maps[name])], truth)
+    return None
 
 
 def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:
-    """Draw a panel for each map over the truth, all of the same area; failures have no panel."""
+    """Draw a panel for each map over the truth, all of the area of the true cones, or else of all maps."""
     drawn = [(outcome, outcome.result.map) for outcome in outcomes if outcome.result is not None]
-    low, high = _extent([track for _, track in drawn], log.truth)
+    points = [] if log.truth is None else [log.truth.cones]
+    if not sum(map(len, points)):
+        points = [mapped_points(boundary) for _, track in drawn for boundary in track.boundaries.values()]
+    together = np.concatenate([np.zeros((1, 2)), *points])
+    low, high = together.min(axis=0) - MARGIN, together.max(axis=0) + MARGIN
     with style.figure_context():
         figure, panels, columns = _panels(len(drawn), (high - low) / 2.0)
         for axes, (outcome, track) in zip(panels, drawn, strict=False):
@@ -277,7 +115,7 @@ def plot_blind_spot(spot: BlindSpot, maps: Sequence[tuple[str, Map]], truth: Tru
             _draw_map(axes, track, truth, CLOSE_UP)
             if shows_start:
                 map_plot.draw_start(axes, CLOSE_UP)
-            ring = {"markersize": _RING_SIZE, "markerfacecolor": "none", "markeredgewidth": 1.0, "zorder": 8}
+            ring = {"markersize": 8.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "zorder": 8}
             text = f"missed: nothing within {spot.distance:g} m"
             style.draw_points(axes, missed, "o", RED, text, **ring)
             axes.set_title(f"{name}\n{len(missed)} of {spot.cones} true cones missed here")
@@ -288,20 +126,20 @@ def plot_blind_spot(spot: BlindSpot, maps: Sequence[tuple[str, Map]], truth: Tru
 
 def _panels(count: int, half_size: Array) -> tuple[Figure, list[Axes], int]:
     """Return a figure, its panels and columns: `count` panels of that shape, as large as a page allows."""
-    half_width, half_height = half_size
+    title, labels, gap, legend = 0.6, 0.48, 0.12, 2.0  # heights of text, and more than any legend (in)
     for columns in COLUMNS:
         rows = -(-max(count, 1) // columns)
-        width = (WIDTH - _TICK_LABELS) / columns - _GAP
-        height = rows * (width * half_height / half_width + _TITLE_HEIGHT) + _TICK_LABELS
+        width = (WIDTH - labels) / columns - gap
+        height = rows * (width * half_size[1] / half_size[0] + title) + labels
         if height <= MAX_HEIGHT:
             break
-    figure = Figure((WIDTH, float(height) + _LEGEND_ROOM), layout="compressed")
+    figure = Figure((WIDTH, float(height) + legend), layout="compressed")
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     return figure, list(panels.flat), columns
 
 
 def _finish(figure: Figure, panels: list[Axes], used: int, columns: int) -> None:
-    """Add axis titles to the outer panels and a legend, hides unused panels, and cuts the figure."""
+    """Add axis titles to the outer panels and a legend, hide unused panels, and cut the figure."""
     for number, axes in enumerate(panels):
         axes.set_visible(number < used)
         if number % columns == 0:
@@ -324,12 +162,3 @@ def _caption(outcome: Outcome) -> str:
     row = outcome.rows[-1].values
     *words, size = (f"{m.title} {m.text(float(row[m.key]))} {m.unit}".strip() for m in PAPER if m.key in row)
     return "\n".join([outcome.names["estimator"], ", ".join(words), size])
-
-
-def _extent(maps: Sequence[Map], truth: Truth | None) -> tuple[Array, Array]:
-    """Return two corners (2,) around the true cones and a margin, or around all maps without true cones."""
-    points = [truth.cones] if truth is not None and len(truth.cones) else []
-    if not points:
-        points = [mapped_points(boundary) for track in maps for boundary in track.boundaries.values()]
-    together = np.concatenate([np.zeros((1, 2)), *points])
-    return together.min(axis=0) - MARGIN, together.max(axis=0) + MARGIN

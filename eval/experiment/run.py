@@ -1,4 +1,4 @@
-"""Experiments: cells that run in parallel, each kept at once, so that one that was killed goes on."""
+"""Cells that run in parallel, each kept at once, so that an experiment that was killed goes on."""
 
 import os
 import tempfile
@@ -8,7 +8,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, TypeVar
 
 import pandas as pd
 from joblib import Parallel, delayed, parallel_config
@@ -52,39 +52,40 @@ OnCell = Callable[[int, int], None]
 
 
 class WorkerDiedError(RuntimeError):
-    """The process that did the work was killed, ran out of memory or crashed."""
+    """The process that did the work died."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Experiment(Generic[C, R]):
-    """Cells, the work on each, and where its result is kept."""
+def run_cells(
+    cells: Sequence[C],
+    work: Callable[[C], R],
+    died: Callable[[C, WorkerDiedError], R],
+    *,
+    jobs: int = 1,
+    cluster: str | None = None,
+    on_cell: OnCell | None = None,
+    begin: Callable[[], None] = lambda: None,
+    read: Callable[[C], R | None] = lambda _: None,
+    write: Callable[[C, R], None] = lambda *_: None,
+) -> list[R]:
+    """Run the cells that `read` knows no result of, and return all results.
 
-    cells: Sequence[C]
-    work: Callable[[C], R]
-    """Function of a module that runs a cell in any process, and does not raise."""
-    died: Callable[[C, WorkerDiedError], R]
-    """Result of a cell whose process died."""
-    begin: Callable[[], None] = lambda: None
-    """Called once there are workers, before the first cell."""
-    read: Callable[[C], R | None] = lambda _: None
-    """Kept result of a cell, or None where it is to be run."""
-    write: Callable[[C, R], None] = lambda *_: None
-
-    def run(self, jobs: int = 1, cluster: str | None = None, on_cell: OnCell | None = None) -> list[R]:
-        """Run the cells that are missing, in `jobs` processes or on a Dask cluster; return all results."""
-        check_jobs(jobs)
-        known = {cell: self.read(cell) for cell in self.cells}
-        results = {cell: result for cell, result in known.items() if result is not None}
-        remaining = [cell for cell in self.cells if cell not in results]
-        told = on_cell or (lambda done, total: None)
-        with workers(jobs, cluster) if remaining else nullcontext():
-            self.begin()
-            told(0, len(remaining))
-            for done, (cell, result) in enumerate(outcomes(self.work, remaining), start=1):
-                results[cell] = self.died(cell, result) if isinstance(result, WorkerDiedError) else result
-                self.write(cell, results[cell])
-                told(done, len(remaining))
-        return [results[cell] for cell in self.cells]
+    They run in `jobs` processes (-1: one for each core), or on the workers of a Dask scheduler. `work` is a
+    function of a module that does not raise; where its process died, `died` makes the result. `begin` is
+    called once there are workers, and `write` keeps each result at once.
+    """
+    check_jobs(jobs)
+    known = {cell: read(cell) for cell in cells}
+    results = {cell: result for cell, result in known.items() if result is not None}
+    remaining = [cell for cell in cells if cell not in results]
+    told = on_cell or (lambda done, total: None)
+    with workers(jobs, cluster) if remaining else nullcontext():
+        begin()
+        told(0, len(remaining))
+        for done, (cell, result) in enumerate(outcomes(work, remaining), start=1):
+            results[cell] = died(cell, result) if isinstance(result, WorkerDiedError) else result
+            write(cell, results[cell])
+            told(done, len(remaining))
+    return [results[cell] for cell in cells]
 
 
 # --- studies ---------------------------------------------------------------------------------------------
@@ -92,12 +93,11 @@ class Experiment(Generic[C, R]):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A study with its tracks and all of its cells."""
+    """A study with its tracks and all of its cells, in the order of the results."""
 
     study: Study
     tracks: tuple[Track, ...]
     cells: tuple[Cell[Drive], ...]
-    """Runs of the study, in the order of the results."""
 
     def resolved(self) -> dict[str, Any]:
         """Return the content of `study.json`: the study with every default written out."""
@@ -138,23 +138,12 @@ def run_study(study: Study, out: Path | str | None = None, **how: Any) -> pd.Dat
     Finished cells are kept in the folder `out`, if there is one. `how` is that of `run_plan`.
     """
     check_jobs(how.get("jobs", 1))
-    plan = make_plan(study)
-    if out is not None:
-        return run_plan(plan, Path(out), **how)
-    with tempfile.TemporaryDirectory() as folder:
-        return run_plan(plan, Path(folder), **how)
+    with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
+        return run_plan(make_plan(study), Path(folder), **how)
 
 
-def run_plan(
-    plan: Plan,
-    out: Path,
-    *,
-    jobs: int = 1,
-    cluster: str | None = None,
-    retry_failed: bool = False,
-    on_cell: OnCell | None = None,
-) -> pd.DataFrame:
-    """Run a study in `jobs` processes (-1: one for each core), or on a Dask scheduler's workers.
+def run_plan(plan: Plan, out: Path, *, retry_failed: bool = False, **how: Any) -> pd.DataFrame:
+    """Run a study; `how` holds `jobs`, `cluster` and `on_cell` of `run_cells`.
 
     OutputError if the folder belongs to another study.
     """
@@ -165,15 +154,15 @@ def run_plan(
         record = read_record(out, cell)
         return None if record is not None and retry_failed and record["failure"] else record
 
-    experiment = Experiment(
-        cells=plan.cells,
-        work=record_cell,
-        died=lambda cell, error: record_of(cell, Outcome.failed(cell, error)),
+    records = run_cells(
+        plan.cells,
+        record_cell,
+        lambda cell, error: record_of(cell, Outcome.failed(cell, error)),
         begin=lambda: write_json(out / STUDY_FILE, plan.resolved(), indent=1),
         read=kept,
         write=lambda cell, record: write_record(out, cell, record),
+        **how,
     )
-    records = experiment.run(jobs, cluster, on_cell)
     return frame_of(plan.study, list(zip(plan.cells, records, strict=True)))
 
 
@@ -236,22 +225,20 @@ def outcomes(work: Callable[[C], R], items: Sequence[C]) -> Iterator[tuple[C, R 
 
     When a worker dies, nobody knows which item it had, so each item under way is tried again alone.
     """
-    remaining = dict(enumerate(items))
+    remaining, sent = dict(enumerate(items)), dict[int, C]()
     while remaining:
-        sent: list[int] = []
+        sent.clear()
         try:
             for index, result in _run(work, _noted(remaining, sent)):
                 yield remaining.pop(index), result
         except _deaths():
-            for index in sent:
-                if index in remaining:
-                    item = remaining.pop(index)
-                    yield item, _alone(work, item)
+            for index in sent.keys() & remaining:
+                yield sent[index], _alone(work, remaining.pop(index))
 
 
-def _noted(remaining: dict[int, C], sent: list[int]) -> Iterator[tuple[int, C]]:
-    for index, item in list(remaining.items()):
-        sent.append(index)
+def _noted(items: dict[int, C], sent: dict[int, C]) -> Iterator[tuple[int, C]]:
+    for index, item in list(items.items()):
+        sent[index] = item
         yield index, item
 
 

@@ -77,7 +77,16 @@ class Study:
         if self.estimators == (ALL,):
             object.__setattr__(self, "estimators", tuple(known_estimators()))
         self._check_lists()
-        self._check_settings()
+        if not isinstance(self.yardsticks, bool):
+            raise SettingsError(f"yardsticks: expected true or false, found {shown(self.yardsticks)}")
+        if isinstance(self.laps, bool) or not isinstance(self.laps, int):
+            raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
+        if DEFAULT in self.variants:
+            raise SettingsError(f"variants.{DEFAULT}: that name is kept for the settings as they are")
+        for name in self.noise:
+            self.simulation(name)
+        if len(self._named()) != 1 + len(self.variants) + sum(len(_grid(grid)) for grid in self.grids):
+            raise SettingsError("variants: expected every name once, found one of a grid among them")
         check_name(self.baseline.variant, self._named(), "baseline.variant: expected a variant")
         if self.baseline.estimator is not None:
             expected = "baseline.estimator: expected one of the study's estimators"
@@ -89,26 +98,17 @@ class Study:
             if len(values) == 0 or len({repr(value) for value in values}) != len(values):
                 expected = "expected at least one, and none twice"
                 raise SettingsError(f"{name}: {expected}, found {shown(list(values))}")
-        _check_integers("seeds", self.seeds)
-        _check_integers("tracks", [track for track in self.tracks if not isinstance(track, Path)])
+        generated = [track for track in self.tracks if not isinstance(track, Path)]
+        for name, values in {"seeds": self.seeds, "tracks": generated}.items():
+            for value in values:
+                if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+                    raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
         for name in self.estimators:
             check_name(name, known_estimators(), "estimators: expected a known estimator")
         for name in self.metrics:
             check_name(name, METRICS, "metrics: expected a known metric")
         for column in self.columns:
             column_of(column)
-
-    def _check_settings(self) -> None:
-        if not isinstance(self.yardsticks, bool):
-            raise SettingsError(f"yardsticks: expected true or false, found {shown(self.yardsticks)}")
-        if isinstance(self.laps, bool) or not isinstance(self.laps, int):
-            raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
-        if DEFAULT in self.variants:
-            raise SettingsError(f"variants.{DEFAULT}: that name is kept for the settings as they are")
-        for name in self.noise:
-            self.simulation(name)
-        if len(self._named()) != 1 + len(self.variants) + sum(len(_grid(grid)) for grid in self.grids):
-            raise SettingsError("variants: expected every name once, found one of a grid among them")
 
     def simulation(self, noise: str) -> SimulationSettings:
         """Return the settings of the drives under a named noise."""
@@ -121,10 +121,9 @@ class Study:
     @property
     def points(self) -> dict[str, MapperSettings]:
         """Settings to run by name; of variants with equal settings the first."""
-        first: dict[MapperSettings, str] = {}
-        for name, settings in self._named().items():
-            first.setdefault(settings, name)
-        return {name: settings for settings, name in first.items()}
+        named = [*self._named().items()]
+        first = {settings: name for name, settings in reversed(named)}
+        return {name: settings for name, settings in named if first[settings] == name}
 
     @property
     def baseline_variant(self) -> str:
@@ -169,12 +168,6 @@ def _short(value: Any) -> str:
     if isinstance(value, int | float) and float(f"{value:g}") == value and not isinstance(value, bool):
         return f"{value:g}"
     return str(value)
-
-
-def _check_integers(name: str, values: Sequence[Any]) -> None:
-    for value in values:
-        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-            raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
 
 
 # --- files -----------------------------------------------------------------------------------------------

@@ -1,22 +1,39 @@
-"""Tables as text, Markdown and LaTeX, and a study's own: differences from the baseline, columns by track."""
+"""Tables in every form, and the files of a study: its tables, tidy results, and a figure of differences."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from pathlib import Path
+from typing import Any, Final, Self
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
 
-from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, column_of
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, figure_context, save_figures
+from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, Metric, column_of
+from pathspace_graph.io.files import replacing, write_text
 
-from .frame import COMBINATION, CORRECTION, LEVEL, RUN, RUN_OF, Contrast, Estimate, contrasts, last_laps
+from .frame import (
+    COMBINATION,
+    LEVEL,
+    RUN,
+    RUN_OF,
+    Contrast,
+    Estimate,
+    contrasts,
+    last_laps,
+    times_of,
+    without_times,
+)
 from .study import Study
 
-_BORDER: Final = 3
-"""Number of characters between two columns of a terminal's table."""
+MAX_PANELS: Final = 3
+"""Most metrics side by side in the figure of differences."""
+
 _UNICODE: Final = str.maketrans(
     {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
 )
@@ -31,7 +48,6 @@ class TextTable:
     """Sentence above the table, which may be empty."""
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    """Rows, each as long as the header."""
     groups: tuple[int, ...] = ()
     """Row numbers at which a new group of rows begins."""
     names: int = 1
@@ -39,7 +55,8 @@ class TextTable:
 
     def parts(self, width: int) -> list[Self]:
         """Return tables of at most `width` characters, each with the names and some of the other columns."""
-        needed = [max(map(len, column)) + _BORDER for column in zip(self.header, *self.rows, strict=True)]
+        border = 3  # characters between two columns
+        needed = [max(map(len, column)) + border for column in zip(self.header, *self.rows, strict=True)]
         shared = sum(needed[: self.names]) + 1
         parts: list[list[int]] = [[]]
         for number in range(self.names, len(self.header)):
@@ -49,8 +66,8 @@ class TextTable:
         return [self._only([*range(self.names), *part]) for part in parts]
 
     def _only(self, columns: Sequence[int]) -> Self:
-        rows = tuple(tuple(row[k] for k in columns) for row in self.rows)
-        return replace(self, header=tuple(self.header[k] for k in columns), rows=rows)
+        header, *rows = (tuple(row[k] for k in columns) for row in (self.header, *self.rows))
+        return replace(self, header=header, rows=tuple(rows))
 
     def rich(self) -> Table:
         """Return the table for a terminal, without its title; units in brackets aren't taken for markup."""
@@ -98,17 +115,24 @@ def group_starts(rows: Sequence[Sequence[str]]) -> tuple[int, ...]:
     return tuple(k for k in range(1, len(rows)) if rows[k][0] != rows[k - 1][0])
 
 
-SMALLEST_P: Final = 0.001
-"""A p below this is shown as smaller than it."""
-FIGURES: Final = ("runs", "mean", "95 %", "difference", "95 %", "p", "")
-"""Columns of every table after those that name the combination."""
-_EXTREMES: Final = {"all, median": "median", "all, largest": "max"}
-"""Rows below the average over all runs, each made by a function of pandas."""
+# --- tables of studies ---------------------------------------------------------------------------------
 
 
 def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
     """Return a table for each metric of the study that its runs have."""
-    return [_table(study, frame, metric) for metric in study.metrics if metric in frame]
+    several, tables = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"], []
+    for metric in (METRICS[key] for key in study.metrics if key in frame):
+        rows = []
+        for contrast in contrasts(study, frame, metric.key):
+            names = (getattr(contrast, name) for name in several)
+            value, difference = contrast.value, contrast.difference
+            by = ("baseline", "") if difference is None else _figures(metric, difference, "+")
+            p = "" if np.isnan(contrast.p) else f"{contrast.p:.3f}" if contrast.p >= 0.001 else "<0.001"
+            mark = "*" if contrast.significant else ""
+            rows.append((*names, str(value.count), *_figures(metric, value), *by, p, mark))
+        header = (*several, "runs", "mean", "95 %", "difference", "95 %", "p", "")
+        tables.append(TextTable(metric.heading, header, tuple(rows), names=len(several)))
+    return tables
 
 
 def caption(study: Study, frame: pd.DataFrame) -> str:
@@ -120,36 +144,17 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
         f"{study.name}: {study.question} "
         f"{len(runs)} runs ({int((runs != '').sum())} failed) of {study.laps} laps, at the end of the last. "
         f"Mean and {100 * LEVEL:g} % interval (Student's t) over track x seed; difference from {against} "
-        f"paired over track and seed; p of the paired t-test, corrected by {CORRECTION}'s method over all "
+        f"paired over track and seed; p of the paired t-test, corrected by Holm's method over all "
         f"comparisons of the metric; * where p < {1 - LEVEL:.2f}."
     )
 
 
-def _table(study: Study, frame: pd.DataFrame, key: str) -> TextTable:
-    several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"]
-    header = (*several, *FIGURES)
-    metric = METRICS[key]
-    digits = max(metric.digits, MEAN_DIGITS)
-
-    def row(contrast: Contrast) -> tuple[str, ...]:
-        names = tuple(getattr(contrast, name) for name in several)
-        value, difference = contrast.value, contrast.difference
-        by = ("baseline", "") if difference is None else _figures(difference, metric.factor, digits, "+")
-        p = "" if np.isnan(contrast.p) else f"{contrast.p:.3f}"
-        p = f"<{SMALLEST_P:g}" if contrast.p < SMALLEST_P else p
-        figures = (str(value.count), *_figures(value, metric.factor, digits, ""))
-        return (*names, *figures, *by, p, "*" if contrast.significant else "")
-
-    rows = tuple(row(contrast) for contrast in contrasts(study, frame, key))
-    return TextTable(metric.heading, header, rows, names=len(several))
-
-
-def _figures(estimated: Estimate, factor: float, digits: int, sign: str) -> tuple[str, str]:
-    if not estimated.count:
+def _figures(metric: Metric, of: Estimate, sign: str = "") -> tuple[str, str]:
+    if not of.count:
         return "", ""
-    mean = f"{factor * estimated.mean:{sign}.{digits}f}"
-    half = "" if np.isnan(estimated.half) else f"± {factor * estimated.half:.{digits}f}"
-    return mean, half
+    digits = max(metric.digits, MEAN_DIGITS)
+    half = "" if np.isnan(of.half) else f"± {metric.factor * of.half:.{digits}f}"
+    return f"{metric.factor * of.mean:{sign}.{digits}f}", half
 
 
 def as_text(tables: Sequence[TextTable], caption: str) -> str:
@@ -182,13 +187,12 @@ def track_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
 def _rows(columns: Sequence[Column], frame: pd.DataFrame) -> Iterator[tuple[str, ...]]:
     finished = frame.groupby([*RUN], sort=False)["failure"].first() == ""
     values = [_values(column, frame).reindex(finished.index) for column in columns]
-    whole = (f"{int(finished.sum())} of {len(finished)}",)
     for track, done in finished.groupby(level=0, sort=False):
-        texts = (c.average(v.loc[done.index]) for c, v in zip(columns, values, strict=True))
+        texts = (c.text(v.loc[done.index]) for c, v in zip(columns, values, strict=True))
         yield (str(track), f"{int(done.sum())} of {len(done)}", *texts)
-    yield ("all, mean", *whole, *(c.average(v) for c, v in zip(columns, values, strict=True)))
-    for name, over in _EXTREMES.items():
-        yield (name, *whole, *(c.extreme(v, over) for c, v in zip(columns, values, strict=True)))
+    for name, over in {"mean": "mean", "median": "median", "largest": "max"}.items():
+        texts = (c.text(v, over) for c, v in zip(columns, values, strict=True))
+        yield (f"all, {name}", f"{int(finished.sum())} of {len(finished)}", *texts)
 
 
 def _values(column: Column, frame: pd.DataFrame) -> pd.DataFrame:
@@ -202,3 +206,88 @@ def _values(column: Column, frame: pd.DataFrame) -> pd.DataFrame:
     done = done.reindex(columns=[*RUN, *(metric.key for metric in column.metrics)])
     by_run = done.groupby([*RUN], sort=False)
     return pd.DataFrame({m.key: by_run[m.key].agg(m.over) for m in column.metrics})
+
+
+# --- files of studies ------------------------------------------------------------------------------------
+
+
+def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write the tables and the figures of a study, and return the text of its summary."""
+    summary, figure = write_tables(study, frame, out), plot_differences(study, frame)
+    save_figures(out / "figures", {} if figure is None else {"differences": figure})
+    return summary
+
+
+def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
+    """Write `results.csv`, `times.csv` and the summary in three forms, and return its text."""
+    write_results(frame, out)
+    tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
+    for suffix, form in (("txt", as_text), ("md", as_markdown), ("tex", as_latex)):
+        write_text(out / f"summary.{suffix}", form(tables, note))
+    return as_text(tables, note)
+
+
+def write_results(frame: pd.DataFrame, out: Path) -> None:
+    write_csv(out / "results.csv", without_times(frame))
+    write_csv(out / "times.csv", times_of(frame))
+
+
+def write_csv(file: Path, frame: pd.DataFrame) -> None:
+    """Write a frame without its index, whole or not at all."""
+    with replacing(file) as temporary:
+        frame.to_csv(temporary, index=False, lineterminator="\n")
+
+
+def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
+    """Draw every pair, their mean and its interval: a row for each combination, a panel for each metric.
+
+    Only the first metrics of the study have a panel, and there is none where no run differs.
+    """
+    panels = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
+    panels = [p for p in panels if any(d != 0.0 for contrast in p for d in contrast.differences)]
+    panels = panels[:MAX_PANELS]
+    if not panels:
+        return None
+    rows = [i for i in range(len(panels[0])) if any(panel[i].differences for panel in panels)]
+    names = [_name(study, panels[0][i]) for i in rows]
+    with figure_context():
+        figure = Figure(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
+        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, panel in zip(all_axes, panels, strict=True):
+            _draw_differences(axes, [panel[i] for i in rows])
+        all_axes[0].set_yticks(range(len(rows)), names)
+        all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
+        text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
+        figure.supxlabel(text)
+    return figure
+
+
+def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
+    metric = METRICS[rows[0].metric]
+    rng = np.random.default_rng(0)
+    axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
+    for row, contrast in enumerate(rows):
+        if contrast.difference is None or not contrast.difference.count:
+            continue
+        color = BLUE if contrast.significant else GREY
+        pairs = metric.factor * np.array(contrast.differences)
+        scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
+        axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
+        mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
+        look: dict[str, Any] = {"color": color, "markersize": 4.5, "elinewidth": 1.0}
+        axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", zorder=3, **look)
+    axes.set_title(metric.heading)
+    axes.grid(axis="x")
+
+
+def _name(study: Study, contrast: Contrast) -> str:
+    """Return the names of a combination that others have differently, `sigma_spacing=1` for
+    `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
+    counts = {"noise": study.noise, "estimator": study.estimators, "variant": study.points}
+    several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
+    name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
+    last = {field: field.rpartition(".")[2] for field in study.varied}
+    if len(set(last.values())) == len(last):
+        for field, short in last.items():
+            name = name.replace(f"{field}=", f"{short}=")
+    return name

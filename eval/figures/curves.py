@@ -19,11 +19,8 @@ from pathspace_graph.spline.knots import BASELINE, curvature_weighted_breaks, fi
 from . import style
 from .style import BLUE, DARK, LIGHT, ORANGE, PURPLE, THIN_WIDTH, WIDTH
 
-# a curve swings to either side, and cones along it were seen but between two shares of its length (m)
-_CONTROL_POINTS, _SPACING, _SWING = 13, 5.5, 6.0
-_CONES, BLIND = 18, (0.52, 0.74)
-_SIGMA_DETECTION = 0.3  # of a seen cone across the curve
-_SIGMA_BEND, _SIGMA_ANCHOR = 1.0, 2.0  # weak priors of second differences and of control points
+BLIND: Final = (0.52, 0.74)
+"""Shares of the length of the curve between which no cone was seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,23 +34,21 @@ class Uncertainty:
     length: Array
     """Parameters (n,) of the places, and lengths along the curve (m)."""
     joint: Array
-    """(n,) By the joint covariance, B Sigma B'."""
     marginals: Array
-    """(n,) By the paper's formula, the sum of beta_j^2 Sigma_j."""
     sampled: Array
-    """(n,) Of the splines drawn at random."""
+    """Sigmas (n,): B Sigma B', the paper's sum of beta_j^2 Sigma_j, and of splines drawn at random."""
     curves: Array
     """Points (s, n, 2) of the splines drawn at random (m)."""
 
 
 def uncertainty(rng: np.random.Generator, samples: int = 2000) -> Uncertainty:
     """Compute the posterior of a curve that cones hold across itself, and draw splines from it."""
-    x = _SPACING * np.arange(_CONTROL_POINTS)
-    points = np.stack([x, _SWING * np.sin(2.0 * np.pi * x / x[-1])], axis=1)
-    spline = BSpline.open_uniform(points, interval=_SPACING).clamp()
-    share = (np.arange(_CONES) + 0.5) / _CONES
+    x = 5.5 * np.arange(13)
+    points = np.stack([x, 6.0 * np.sin(2.0 * np.pi * x / x[-1])], axis=1)
+    spline = BSpline.open_uniform(points, interval=5.5).clamp()
+    share = (np.arange(18) + 0.5) / 18
     seen = spline.parameters_at(spline.length() * share[(share < BLIND[0]) | (share > BLIND[1])])
-    covariance = posterior(spline, seen, _SIGMA_DETECTION, _SIGMA_BEND, _SIGMA_ANCHOR)
+    covariance = posterior(spline, seen, 0.3, 1.0, 2.0)
     boundary, u = SplineBoundary(spline, covariance), np.linspace(*spline.domain, 301)
     drawn = rng.multivariate_normal(spline.control_points.ravel(), covariance, samples)
     curves = np.einsum("nm,smd->snd", spline.basis_matrix(u), drawn.reshape(samples, -1, 2))
@@ -86,16 +81,9 @@ def posterior(
     return np.asarray(np.linalg.inv(information + np.eye(len(information)) / sigma_anchor**2))
 
 
-_SEED: Final = 0
-_SHOWN: Final = 40
-"""Number of the splines drawn at random that are shown."""
-_EVERY: Final = 6
-"""Stride of the places at which the spread of the samples is marked."""
-
-
 def plot_uncertainty() -> tuple[Figure, str]:
     """Draw (a) the uncertainty of control points and curve, (b) its sigma across itself in three ways."""
-    data = uncertainty(np.random.default_rng(_SEED))
+    data = uncertainty(np.random.default_rng(0))
     with style.figure_context():
         figure = Figure((WIDTH, 4.6), layout="constrained")
         above, below = figure.subplots(2, 1, height_ratios=(1.55, 1.0))
@@ -112,7 +100,7 @@ def plot_uncertainty() -> tuple[Figure, str]:
 
 def _draw_curves(axes: Axes, data: Uncertainty) -> None:
     points = data.boundary.spline.control_points
-    for number, curve in enumerate(data.curves[:_SHOWN]):
+    for number, curve in enumerate(data.curves[:40]):
         label = None if number else "sampled splines"
         axes.plot(*curve.T, color=LIGHT, linewidth=THIN_WIDTH, zorder=1.5, label=label)
     edges = style.uncertainty_band(data.boundary, data.u)
@@ -132,7 +120,7 @@ def _draw_sigmas(axes: Axes, data: Uncertainty) -> None:
     axes.plot(data.length, data.joint, color=BLUE, label="joint covariance, $BΣB^⊤$")
     marginals = r"marginals only, $\Sigma_j\, β_j^2 Σ_{C_j}$"
     axes.plot(data.length, data.marginals, color=ORANGE, linestyle="--", label=marginals)
-    spread = np.stack([data.length, data.sampled], axis=1)[::_EVERY]
+    spread = np.stack([data.length, data.sampled], axis=1)[::6]
     style.draw_points(axes, spread, ".", "black", f"spread of {len(data.curves)} sampled splines", zorder=2)
     axes.set(xlim=(0.0, data.length[-1]), ylim=(0.0, 1.25 * float(data.joint.max())))
     axes.set(xlabel="length along the curve [m]", ylabel="σ [m]")
@@ -141,10 +129,6 @@ def _draw_sigmas(axes: Axes, data: Uncertainty) -> None:
 
 
 # --- simplification --------------------------------------------------------------------------------------
-
-# the left boundary of a generated track of some length (m) gets fewer control points
-_TRACK_SEED, _LAP_LENGTH = 3, (200.0, 260.0)
-_BEFORE, _AFTER, _SAMPLES = 100, 32, 1500
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +150,8 @@ class Simplification:
 
     old: BSpline
     length: Array
-    """Lengths (n,) along the old curve at which the errors are taken (m)."""
     curvature: Array
-    """Old curve's curvature (n,) there (1/m)."""
+    """Lengths (n,) along the old curve at which the errors are taken (m), and its curvature there (1/m)."""
     weighted: Simplified
     uniform: Simplified
     """Curve on as many knots at equal lengths."""
@@ -176,17 +159,15 @@ class Simplification:
 
 def simplification() -> Simplification:
     """Fit a spline of many control points to a generated boundary, and simplify it in two ways."""
-    settings = TrackGeneratorSettings(lap_length=_LAP_LENGTH)
-    track = generate_track(np.random.default_rng(_TRACK_SEED), settings)
-    old = fit_spline(np.asarray(track.left), _BEFORE, periodic=True)
-    length = old.length() * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    track = generate_track(np.random.default_rng(3), TrackGeneratorSettings(lap_length=(200.0, 260.0)))
+    old = fit_spline(np.asarray(track.left), 100, periodic=True)
+    length = old.length() * (np.arange(1500) + 0.5) / 1500
     u = old.parameters_at(length)
     points = old.evaluate(u)
 
     def simplified(baseline: float) -> Simplified:
-        empty = BSpline.periodic_from(
-            curvature_weighted_breaks(old, _AFTER, baseline), np.zeros((_AFTER, 2)), old.degree
-        )
+        breaks = curvature_weighted_breaks(old, 32, baseline)
+        empty = BSpline.periodic_from(breaks, np.zeros((32, 2)), old.degree)
         curve = empty.with_points(refit(old, empty).new_from_old @ old.distinct_control_points)
         return Simplified(curve, np.linalg.norm(points - closest_points(curve, points).position, axis=1))
 

@@ -25,14 +25,16 @@ from . import style
 from .curves import plot_simplification, plot_uncertainty, posterior
 from .style import BLUE, DARK, GREEN, LIGHT, MARKER_SIZE, ORANGE, PURPLE, RED, THIN_WIDTH, WIDTH
 
-# a curve ends at the origin, on a left bend that it leaves to the outside by a share of its length (m)
-_RADIUS, _DRIFT = 30.0, 0.03
-_POINTS, _SPACING = 6, 3.0
-_SIGMA_KNOWN, _SIGMA_BEND, _SIGMA_ANCHOR = 0.3, 0.5, 1.0  # what the curve was made of, and weak priors
-# detections lie on it and beyond its end, at these lengths along the bend and to the inside of it (m)
-_ALONG, _INSIDE = (-5.5, -2.6, 2.2, 4.6, 7.0), (0.1, 0.25, 0.3, 0.05, 0.2)
-SIGMA_DETECTION = 0.2
-_SETTINGS = CkfSettings(threshold=2.0, separation=2.0)
+SIGMA_DETECTION: Final = 0.2
+RIDGE: Final = 0.05
+MARKER: Final = "captions.md"
+"""File by which a folder of these figures is known."""
+_INVISIBLE: Final = 1e-3
+"""Value of a basis function below which it can't be seen."""
+_DIAMOND: Final = 0.8 * MARKER_SIZE
+
+
+# --- expansion -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,24 +42,29 @@ class Expansion:
     """The three steps, on a curve with the joint covariance of its control points."""
 
     detections: Array
-    """(m, 2) Positions (m)."""
     expands: BoolArray
-    """(m,) Detections that mark an expansion of the curve in step (a)."""
+    """Positions (m, 2) of the detections (m), and which mark an expansion of the curve in step (a)."""
     order: IntArray
-    """Proximity chain of those detections; the curve is extended to the last one."""
+    """Proximity chain of those; the curve is extended to the last one."""
     before: SplineBoundary
     extended: SplineBoundary
     updated: SplineBoundary
 
 
 def expansion() -> Expansion:
-    """Classify the detections, extend the curve to the last of their chain, update it with the others."""
-    before = _known_curve()
-    detections = _on_bend(np.array(_ALONG), np.array(_INSIDE))
+    """Classify the detections, extend the curve to the last of their chain, update it with the others.
+
+    Detections lie on the curve and beyond its end.
+    """
+    # a curve along the bend that drifts to its outside and ends beside the origin
+    along, settings = np.linspace(-18.0, 0.0, 13), CkfSettings(threshold=2.0, separation=2.0)
+    spline = fit_spline(_on_bend(along, -0.03 * (along - along[0])), 6, periodic=False)
+    seen = np.linspace(*spline.domain, 12)
+    before = SplineBoundary(spline, posterior(spline, seen, 0.3, 0.5, 1.0))
+    detections = _on_bend(np.array([-5.5, -2.6, 2.2, 4.6, 7.0]), np.array([0.1, 0.25, 0.3, 0.05, 0.2]))
     covariances = np.tile(SIGMA_DETECTION**2 * np.eye(2), (len(detections), 1, 1))
-    spline, high = before.spline, before.spline.domain[1]
     foot_u = spline.foot_points(detections).u
-    expands = beyond_end(detections, foot_u, high, spline.control_points, _SETTINGS)
+    expands = beyond_end(detections, foot_u, spline.domain[1], spline.control_points, settings)
     beyond = np.flatnonzero(expands)
     order = beyond[proximity_chain(detections[beyond], spline.control_points[-1])]
     extended = extend(before, detections[order[-1]], covariances[order[-1]])
@@ -90,22 +97,10 @@ def update(boundary: SplineBoundary, detections: Array, covariances: Array) -> S
     return SplineBoundary(spline.with_points(points), keep @ P @ keep.T + gain @ R @ gain.T)
 
 
-def _known_curve() -> SplineBoundary:
-    """Return a clamped curve along the bend that drifts to its outside and ends beside the origin."""
-    count = _POINTS
-    along = np.linspace(-_SPACING * count, 0.0, 2 * count + 1)
-    row = _on_bend(along, -_DRIFT * (along - along[0]))
-    spline = fit_spline(row, count, periodic=False)
-    seen = np.linspace(*spline.domain, 2 * count)
-    covariance = posterior(spline, seen, _SIGMA_KNOWN, _SIGMA_BEND, _SIGMA_ANCHOR)
-    return SplineBoundary(spline, covariance)
-
-
 def _on_bend(along: Array, inside: Array) -> Array:
-    """Return points (m, 2) of a left bend that passes the origin eastward, m."""
-    angle = along / _RADIUS
-    r = _RADIUS - inside
-    return np.stack([r * np.sin(angle), _RADIUS - r * np.cos(angle)], axis=1)
+    """Return points (m, 2) of a left bend of 30 m that passes the origin eastward, m."""
+    angle, r = along / 30.0, 30.0 - inside
+    return np.stack([r * np.sin(angle), 30.0 - r * np.cos(angle)], axis=1)
 
 
 def plot_expansion() -> tuple[Figure, str]:
@@ -127,7 +122,9 @@ def plot_expansion() -> tuple[Figure, str]:
         for axes, (title, boundary, before) in zip(panels, steps, strict=True):
             _draw_step(axes, data, boundary, data.expands if before is None else interpolated)
             if before is None:
-                _draw_chain(axes, data)
+                ends = (data.before.spline.control_points[-1:], data.detections[data.order])
+                chain: dict[str, Any] = {"linestyle": ":", "zorder": 2, "label": "proximity chain"}
+                axes.plot(*np.concatenate(ends).T, color=RED, linewidth=0.8, **chain)
             else:
                 look: dict[str, Any] = {"linestyle": "--", "zorder": 3.5}
                 style.draw_curve(axes, before.spline, DARK, "spline before the step", 0.9, **look)
@@ -159,16 +156,7 @@ def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: B
     style.set_frame(axes, shown.min(axis=0) - 1.0, shown.max(axis=0) + 0.8)
 
 
-def _draw_chain(axes: Axes, data: Expansion) -> None:
-    chain = np.concatenate([data.before.spline.control_points[-1:], data.detections[data.order]])
-    axes.plot(*chain.T, color=RED, linewidth=0.8, linestyle=":", zorder=2, label="proximity chain")
-
-
-# a curve swings to either side; detections lie to its left, at shares of its length (m)
-_SHAPE = (9, 3.5, 3.0)  # number of control points, their distance, swing
-_SHARES, _OFFSETS = (0.36, 0.47, 0.58, 0.68), (0.5, 1.2, 1.3, 0.6)
-_SIGMAS, _VEHICLE = (0.45, 0.15), (2.0, 5.5)  # along the ray from the vehicle and across it
-RIDGE = 0.05
+# --- the fit of S_z --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,13 +166,11 @@ class Fit:
     curve: BSpline
     """S_mu, the state's curve."""
     detections: Array
-    """(m, 2) Positions z (m)."""
     covariances: Array
-    """(m, 2, 2), m^2."""
+    """Positions z (m, 2) in m, and their covariances (m, 2, 2), m^2."""
     foot_u: Array
-    """Parameters (m,) of the closest points."""
     basis: Array
-    """B (m, n), the basis functions at the closest points."""
+    """Parameters (m,) of the closest points, and the basis functions B (m, n) there."""
     sigma_points: Array
     """Sigma points X (4 m, m, 2) of the detections (m)."""
     fitted_points: Array
@@ -198,14 +184,20 @@ class Fit:
 
 
 def fit() -> Fit:
-    """Compute C = C_mu + (B' B + L)^-1 B' (y - B C_mu) of the detections and of their sigma points."""
-    count, spacing, swing = _SHAPE
-    x = spacing * np.arange(count)
-    points = np.stack([x, -swing * np.cos(2.0 * np.pi * x / x[-1])], axis=1)
-    curve = BSpline.open_uniform(points, interval=spacing).clamp()
-    beside = curve.parameters_at(np.array(_SHARES) * curve.length())
-    detections = curve.evaluate(beside) + np.array(_OFFSETS)[:, None] * style.normals(curve, beside)
-    covariances = _ray_covariances(detections - np.array(_VEHICLE), _SIGMAS)
+    """Compute C = C_mu + (B' B + L)^-1 B' (y - B C_mu) of the detections and of their sigma points.
+
+    The curve swings to either side, and detections lie to its left, seen from the vehicle.
+    """
+    x = 3.5 * np.arange(9)
+    points = np.stack([x, -3.0 * np.cos(2.0 * np.pi * x / x[-1])], axis=1)
+    curve = BSpline.open_uniform(points, interval=3.5).clamp()
+    beside = curve.parameters_at(np.array([0.36, 0.47, 0.58, 0.68]) * curve.length())
+    offsets = np.array([[0.5], [1.2], [1.3], [0.6]])
+    detections = curve.evaluate(beside) + offsets * style.normals(curve, beside)
+    along = unit(detections - np.array([2.0, 5.5]))
+    covariances = np.zeros((len(along), 2, 2))
+    for sigma, axis in ((0.45, along), (0.15, left_normals(along))):
+        covariances += sigma**2 * axis[:, :, None] * axis[:, None, :]
     foot_u = curve.foot_points(detections).u
     basis = curve.basis_matrix(foot_u)
     settings = CkfSettings(ridge=RIDGE)
@@ -215,19 +207,6 @@ def fit() -> Fit:
     innovations = sigma_points - basis @ curve.control_points
     fitted_points = curve.control_points + np.einsum("nm,kmd->knd", measurement.gain, innovations)
     return Fit(curve, detections, covariances, foot_u, basis, sigma_points, fitted_points, measurement)
-
-
-def _ray_covariances(rays: Array, sigmas: tuple[float, float]) -> Array:
-    """Return covariances (m, 2, 2), m^2, of standard deviations (m) along each ray (m, 2) and across it."""
-    along = unit(rays)
-    parts = zip(sigmas, (along, left_normals(along)), strict=True)
-    return np.asarray(sum(s**2 * v[:, :, None] * v[:, None, :] for s, v in parts))
-
-
-_INVISIBLE: Final = 1e-3
-"""Value of a basis function below which it can't be seen."""
-_DETECTIONS: Final = "detections $z$ (a: 2σ)"
-_DIAMOND: Final = 0.8 * MARKER_SIZE
 
 
 def plot_fit() -> tuple[Figure, str]:
@@ -246,7 +225,7 @@ def plot_fit() -> tuple[Figure, str]:
         low = shown.min(axis=0) - np.array([1.0, 1.6])
         high = shown.max(axis=0) + np.array([1.0, 1.9])
         for axes in (closest, sigma, fitted):
-            style.draw_points(axes, data.detections, "o", GREEN, _DETECTIONS)
+            style.draw_points(axes, data.detections, "o", GREEN, "detections $z$ (a: 2σ)")
             style.set_frame(axes, low, high)
             axes.set(xlabel="x [m]", ylabel="y [m]")
         width, height = high - low
@@ -301,8 +280,9 @@ def _draw_basis(axes: Axes, data: Fit) -> None:
     axes.set_title("(d) basis: how freely each control point moves")
 
 
-MARKER: Final = "captions.md"
-"""File by which a folder of these figures is known."""
+# --- all figures -----------------------------------------------------------------------------------------
+
+
 FIGURES: Final[Mapping[str, Callable[[], tuple[Figure, str]]]] = {
     "uncertainty": plot_uncertainty,
     "expansion": plot_expansion,

@@ -11,12 +11,12 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
-from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
+from pathspace_graph.io.map import Map, MapBoundary, PointBoundary
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, POINTS, RIGHT, UNKNOWN
 
 from . import style
@@ -24,19 +24,12 @@ from .style import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, RED, WIDTH, Picture
 
 MARGIN: Final = 3.0
 """Free space around what is drawn (m)."""
-TRUTH_COLOR: Final = DARK
-"""Colour of everything that is true rather than estimated."""
-
-_MAX_HEIGHT: Final = 7.5
-"""Greatest height of a figure (in); a track that is narrower than it is long is drawn smaller."""
-_LABELS_HEIGHT: Final = 0.85
-"""Height of the tick labels and the legend (in)."""
 BOUNDARY_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
 """Colours of the boundaries, those of their cones; yellow is amber, which can be seen on white paper."""
 TRAJECTORY_COLOR: Final = GREEN
 HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
+LABEL_COLORS: Final = {**BOUNDARY_COLORS, UNKNOWN: GREY, **dict.fromkeys(POINTS, RED)}
 BAND_ALPHA: Final = 0.35
-
 TENTATIVE_DASHES: Final = (0, (4, 2))
 """Dashes of the stretch of a curve that is not confirmed."""
 
@@ -57,8 +50,6 @@ class MapStyle:
 
 WHOLE_TRACK: Final = MapStyle()
 """Style of a panel that shows a whole track."""
-AT_ITS_TIME: Final = MapStyle(path_width=0.25)
-"""Style of the poses that were corrected afterwards."""
 
 
 def plot_map(
@@ -91,7 +82,8 @@ def plot_map(
         if log is not None and log.truth is not None:
             draw_truth(axes, log.truth, WHOLE_TRACK)
         if smoothed is not None and trajectory is not None and len(smoothed):
-            draw_trajectory(axes, np.asarray(trajectory), AT_ITS_TIME, "poses as estimated at their time")
+            thin = MapStyle(path_width=0.25)
+            draw_trajectory(axes, np.asarray(trajectory), thin, "poses as estimated at their time")
             trajectory = smoothed
         if trajectory is not None and len(trajectory):
             draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK)
@@ -105,15 +97,20 @@ def draw_boundary(
     axes: Axes, boundary: MapBoundary, label: int, look: MapStyle, band_scale: float = 1.0
 ) -> None:
     """Draw a curve with its band and control points, or landmarks with their ellipses, in the map frame."""
+    color, name = BOUNDARY_COLORS[label], NAMES[label]
+    exaggerated = "" if band_scale == 1.0 else f" (drawn {band_scale:g}× as wide)"
     if isinstance(boundary, PointBoundary):
-        _draw_landmarks(axes, boundary, label, look, band_scale)
-    else:
-        _draw_spline(axes, boundary, label, look, band_scale)
-
-
-def _draw_spline(axes: Axes, boundary: SplineBoundary, label: int, look: MapStyle, band_scale: float) -> None:
-    color, name, spline = BOUNDARY_COLORS[label], NAMES[label], boundary.spline
-    text = f"{name} {_band_name(band_scale)}"
+        area = {"alpha": BAND_ALPHA, "linewidth": 0.0}
+        own = style.point_blocks(boundary.covariance)
+        style.draw_ellipses(axes, boundary.points, own, color, band_scale, zorder=2, **area)
+        # a collection of ellipses has no key of its own in a legend: an empty patch lends it one
+        key = PathPatch(Outline(np.zeros((0, 2))), facecolor=color, **area)
+        key.set_label(f"{name} {style.SIGMAS:g}σ ellipses{exaggerated}")
+        axes.add_patch(key)
+        look_of = {"markersize": look.landmark_size, "zorder": 4}
+        style.draw_points(axes, boundary.points, "o", color, f"{name} landmarks", **look_of)
+        return
+    spline, text = boundary.spline, f"{name} {style.SIGMAS:g}σ band{exaggerated}"
     if boundary.covariance.size:  # the outline of a map has none
         style.draw_band(axes, boundary, color, text, band_scale, look.widest_band, alpha=BAND_ALPHA)
     until = boundary.confirmed_until
@@ -126,31 +123,11 @@ def _draw_spline(axes: Axes, boundary: SplineBoundary, label: int, look: MapStyl
     style.draw_control_points(axes, points, color, text, polygon=False, **squares)
 
 
-def _draw_landmarks(
-    axes: Axes, boundary: PointBoundary, label: int, look: MapStyle, band_scale: float
-) -> None:
-    color, name = BOUNDARY_COLORS[label], NAMES[label]
-    area = {"alpha": BAND_ALPHA, "linewidth": 0.0}
-    own = style.point_blocks(boundary.covariance)
-    style.draw_ellipses(axes, boundary.points, own, color, band_scale, zorder=2, **area)
-    # a collection of ellipses has no key of its own in a legend: an empty patch lends it one
-    key = PathPatch(Outline(np.zeros((0, 2))), facecolor=color, **area)
-    key.set_label(f"{name} {_band_name(band_scale, 'ellipses')}")
-    axes.add_patch(key)
-    size = look.landmark_size
-    style.draw_points(axes, boundary.points, "o", color, f"{name} landmarks", markersize=size, zorder=4)
-
-
 def draw_orange(axes: Axes, points: Array, label: int, look: MapStyle) -> None:
     """Draw orange cones (n, 2) as triangles, those of gates larger, map frame (m)."""
     size = (2.0 if label == BIG_ORANGE else 1.2) * look.landmark_size
     name = NAMES[label].replace("_", " ")
     style.draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
-
-
-def _band_name(scale: float, shape: str = "band") -> str:
-    exaggerated = "" if scale == 1.0 else f" (drawn {scale:g}× as wide)"
-    return f"{style.SIGMAS:g}σ {shape}{exaggerated}"
 
 
 def draw_trajectory(axes: Axes, trajectory: Array, look: MapStyle, label: str = "trajectory") -> None:
@@ -174,10 +151,10 @@ def draw_truth(axes: Axes, truth: Truth, look: MapStyle) -> None:
     """Draw the true path dashed and the true cones as crosses, as far as they are known, map frame (m)."""
     if len(truth.poses):
         line: dict[str, Any] = {"linewidth": 0.6 * look.path_width, "linestyle": (0, (5, 3)), "zorder": 3.5}
-        axes.plot(*truth.poses[:, :2].T, color=TRUTH_COLOR, label="true path", **line)
+        axes.plot(*truth.poses[:, :2].T, color=DARK, label="true path", **line)
     if len(truth.cones):
         cross = {"markersize": look.marker_size, "markeredgewidth": 0.6}
-        style.draw_points(axes, truth.cones, "x", TRUTH_COLOR, "true cones", **cross)
+        style.draw_points(axes, truth.cones, "x", DARK, "true cones", **cross)
 
 
 def draw_start(axes: Axes, look: MapStyle) -> None:
@@ -193,16 +170,10 @@ def finish(figure: Figure, axes: Axes, title: str | None) -> None:
     drawn = np.array([axes.get_xlim(), axes.get_ylim()])
     low, high = drawn[:, 0] - MARGIN, drawn[:, 1] + MARGIN
     style.set_frame(axes, low, high)
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    if title:
-        axes.set_title(title)
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=title or "")
     style.grouped_legend(figure)
     width, height = high - low
-    figure.set_size_inches(WIDTH, min(_MAX_HEIGHT, WIDTH * height / width + _LABELS_HEIGHT))
-
-
-LABEL_COLORS = {**BOUNDARY_COLORS, UNKNOWN: GREY, **dict.fromkeys(POINTS, RED)}
+    figure.set_size_inches(WIDTH, min(7.5, WIDTH * height / width + 0.85))
 
 
 def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
@@ -218,7 +189,13 @@ def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
         axes = figure.add_subplot()
         # a cycle lies between two odometry stamps: its pose is interpolated, which a picture can bear
         at = np.column_stack([np.interp(stamps, odometry.t, column) for column in poses.T])
-        _draw_detections(axes, log, at)
+        seen = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)])
+        labels = np.concatenate([np.zeros(0, int), *(cycle.labels for cycle in log.cycles)])
+        points = to_map(seen, np.repeat(at, [len(cycle.labels) for cycle in log.cycles], axis=0))
+        dots = {"markersize": 1.2, "zorder": 2, "alpha": 0.4}
+        for label in (label for label in LABEL_COLORS if (labels == label).any()):
+            text, own = f"{NAMES[label].replace('_', ' ')} detections", points[labels == label]
+            style.draw_points(axes, own, ".", LABEL_COLORS[label], text, **dots)
         line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": WHOLE_TRACK.path_width, "zorder": 3}
         axes.plot(*poses[:, :2].T, label="odometry alone", **line)
         if log.truth is not None:
@@ -226,17 +203,3 @@ def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
         draw_start(axes, WHOLE_TRACK)
         finish(figure, axes, title)
     return figure
-
-
-def _draw_detections(axes: Axes, log: Log, poses: Array) -> None:
-    """Draw the detections of all cycles, seen from the poses (n, 3) of the cycles."""
-    counts = [len(cycle.labels) for cycle in log.cycles]
-    seen = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)])
-    points = to_map(seen, np.repeat(poses, counts, axis=0))
-    labels: IntArray = np.concatenate([np.zeros(0, int), *(cycle.labels for cycle in log.cycles)])
-    for label, color in LABEL_COLORS.items():
-        if (labels == label).any():
-            text = f"{NAMES[label].replace('_', ' ')} detections"
-            style.draw_points(
-                axes, points[labels == label], ".", color, text, markersize=1.2, zorder=2, alpha=0.4
-            )

@@ -27,7 +27,6 @@ from pathspace_graph.spline.bspline import BSpline
 
 WIDTH: Final = 7.0
 """Width of a figure (in): two columns of a paper."""
-FONT_SIZE, LEGEND_SIZE = 8.0, 7.5
 CURVE_WIDTH, THIN_WIDTH = 1.3, 0.5
 """Widths of a curve, and of the line of one sample among many (pt)."""
 MARKER_SIZE: Final = 4.0
@@ -47,23 +46,29 @@ PALETTE: Final = (BLUE, ORANGE, RED, PURPLE, GREEN, DARK)
 MARKERS: Final = "os^Dv*<>PXphd"
 
 _RC: Final = {
-    "font.size": FONT_SIZE,
-    "figure.labelsize": FONT_SIZE,
-    "axes.titlesize": FONT_SIZE,
+    **dict.fromkeys(("font.size", "figure.labelsize", "axes.titlesize"), 8.0),
     "axes.titlelocation": "left",
     "axes.linewidth": 0.6,
     "grid.linewidth": 0.3,
     "grid.alpha": 0.5,
     **{f"{axis}tick.major.width": 0.6 for axis in "xy"},
     **{f"{axis}tick.major.size": 2.5 for axis in "xy"},
-    "legend.fontsize": LEGEND_SIZE,
+    "legend.fontsize": 7.5,
     "legend.frameon": False,
     "legend.handlelength": 1.8,
     "legend.columnspacing": 1.4,
 }
-REST_COLUMNS: Final = 3
-"""Most columns of a legend beside those of the boundaries."""
-_SIDES: Final = tuple(NAMES[label] for label in BOUNDARIES)
+SIGMAS: Final = 2.0
+"""Standard deviations to the edge of a band across its curve, and of an ellipse along its axes."""
+FORMATS: Final = (".png", ".pdf", ".svg")
+"""Suffixes under which a figure can be saved."""
+SUFFIXES: Final = (".png", ".pdf")
+"""Formats of each figure of commands that write several, to look at and to print."""
+DPI: Final = 200.0
+"""Resolution of a png (dots per inch)."""
+# what would differ from one run to the next is left out, and text stays text in vector formats
+_METADATA: Final = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+_FILE_RC: Final = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "pathspace"}
 
 
 @contextmanager
@@ -94,18 +99,18 @@ def label_logarithms(axes: Axes) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def shared_legend(figure: Figure, columns: int = 1, loc: str = "outside lower center") -> None:
-    """Add one legend for all panels, below them by default, with each entry once."""
+def shared_legend(figure: Figure, columns: int = 1) -> None:
+    """Add one legend for all panels, below them, with each entry once."""
     entries = _entries(figure.axes)
-    figure.legend(entries.values(), entries.keys(), loc=loc, ncols=columns)
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)
 
 
 def grouped_legend(figure: Figure) -> None:
     """Add a legend below all panels: a column for the left boundary, one for the right, then the rest."""
-    entries = _entries(figure.axes)
-    sides = [[label for label in entries if label.startswith(side)] for side in _SIDES]
-    rest = [label for label in entries if not label.startswith(_SIDES)]
-    rows = max(1, ceil(len(rest) / REST_COLUMNS), *(len(side) for side in sides))
+    entries, names = _entries(figure.axes), tuple(NAMES[label] for label in BOUNDARIES)
+    sides = [[label for label in entries if label.startswith(side)] for side in names]
+    rest = [label for label in entries if not label.startswith(names)]
+    rows = max(1, ceil(len(rest) / 3), *(len(side) for side in sides))
     columns = [*(side for side in sides if side), *(rest[i : i + rows] for i in range(0, len(rest), rows))]
     padded = [label for column in columns for label in column + [""] * (rows - len(column))]
     blank = Line2D([], [], linestyle="none")
@@ -129,13 +134,10 @@ def fit_height(figure: Figure, margin: float = 0.05) -> None:
         figure.set_size_inches(width, figure.get_tightbbox().height + 2.0 * margin)
 
 
-SIGMAS: Final = 2.0
-"""Standard deviations to the edge of a band across its curve, and of an ellipse along its axes."""
-SAMPLES_PER_SPAN: Final = 24
-"""Lines that each span of a spline is drawn as."""
+# --- marks -----------------------------------------------------------------------------------------------
 
 
-def curve_parameters(spline: BSpline, samples_per_span: int = SAMPLES_PER_SPAN) -> Array:
+def curve_parameters(spline: BSpline, samples_per_span: int = 24) -> Array:
     """Return parameters (k,) at equal steps on each span, both ends of the domain included."""
     breaks = spline.breaks
     fractions = np.arange(samples_per_span) / samples_per_span
@@ -246,17 +248,7 @@ def draw_ellipses(
     axes.add_collection(EllipseCollection(widths, heights, angles, units="xy", **place, **look))
 
 
-FORMATS: Final = (".png", ".pdf", ".svg")
-"""Suffixes under which a figure can be saved."""
-SUFFIXES: Final = (".png", ".pdf")
-"""Formats of each figure of commands that write several, to look at and to print."""
-DPI: Final = 200.0
-"""Resolution of a png (dots per inch)."""
-
-_METADATA: Final = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-"""Metadata that is left out, since it would differ from one run to the next."""
-_FILE_RC: Final = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "pathspace"}
-"""Settings by which text stays text in vector formats, and identifiers don't change from run to run."""
+# --- files -----------------------------------------------------------------------------------------------
 
 
 def check_plot_file(file: Path | str) -> str:
@@ -277,10 +269,7 @@ def save_plot(figure: Figure, file: Path | str, dpi: float = DPI) -> None:
 
 
 def save_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
-    """Write every figure under its name in `folder`, as a picture to look at and as vectors to print.
-
-    Each file takes the place of an earlier one.
-    """
+    """Write every figure under its name in `folder`, in the place of an earlier one."""
     for name, figure in figures.items():
         for suffix in SUFFIXES:
             with replacing(folder / f"{name}{suffix}") as temporary:

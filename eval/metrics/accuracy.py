@@ -9,21 +9,26 @@ import scipy  # which imports its modules when they are used
 from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
+from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.settings.checked import Positive
 from pathspace_graph.sim.curves import along_polyline, arc_lengths
 from pathspace_graph.spline.bspline import BSpline
 
-MISSED_DISTANCE = 3.0
+MISSED_DISTANCE: Final = 3.0
 """Distance from its mapped boundary beyond which a true cone is missed (m; paper, Table 1)."""
-
-GRID_PER_SPAN = 64
+TRUE_STEP: Final = 0.02
+"""Largest distance of points of a true curve (m): a distance of 0.1 m is at most 0.5 mm too long."""
+MAPPED_STEP: Final = 0.1
+"""Largest distance of the points of a mapped curve from which distances are measured (m)."""
+GRID_PER_SPAN: Final = 64
 """Grid points on each span from which closest points are searched, about every 0.1 m of a track."""
+_OVERLAP: Final = 3
+"""Cones beyond the seam that Akima's tangents of a closed curve need."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,29 +105,10 @@ def root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-PATH_STEP: Final = 0.1
-"""Largest distance of the points of the true path by which cones are ordered (m)."""
-TRUE_STEP: Final = 0.02
-"""Largest distance of points of a true curve (m): a distance of 0.1 m is at most 0.5 mm too long."""
-MAPPED_STEP: Final = 0.1
-"""Largest distance of the points of a mapped curve from which distances are measured (m)."""
-CENTRE_STEP: Final = 1.0
-"""Distance of the points at which the centre line is compared with the true one (m)."""
-CHORD: Final = 0.25
-"""Length of the chords whose crossings are counted (m)."""
-ROUND_OFF: Final = 1e-9
-"""Share of a step by which a length may exceed whole steps without a further one."""
-_OVERLAP: Final = 3
-"""Cones beyond the seam that Akima's tangents of a closed curve need."""
-_CACHED: Final = 16
-"""Number of true curves in the cache, since every map of a log is compared with the same ones."""
-_MIN_CONES: Final = 2
-
-
 # --- points on curves ------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=_CACHED)
+@lru_cache(maxsize=16)  # every map of a log is compared with the same ones
 def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     """Return points (k, 2) in m, at most `step` apart, on the curve through the true cones of a boundary.
 
@@ -131,7 +117,7 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     The array is cached and must not be written to.
     """
     cones = driving_order(truth, label)
-    if len(cones) < _MIN_CONES:
+    if len(cones) < 2:
         return cones
     closed = len(cones) > _OVERLAP and len(truth.poses) > 0 and len(lap_end_indices(truth.poses)) > 0
     nodes = np.concatenate([cones[-_OVERLAP:], cones, cones[: _OVERLAP + 1]]) if closed else cones
@@ -151,18 +137,13 @@ def driving_order(truth: Truth, label: int) -> Array:
     cones: Array = truth.cones[truth.cone_labels == label]
     if len(truth.poses) < 2 or len(cones) == 0:
         return cones
-    nearest: IntArray = np.asarray(KDTree(_first_lap(truth)).query(cones)[1])
-    by_path: Array = cones[np.argsort(nearest, kind="stable")]
-    return by_path if _perimeter(by_path) < _perimeter(cones) else cones
-
-
-def _first_lap(truth: Truth) -> Array:
-    """Return points (n, 2) of the true path up to the end of lap 1, at most PATH_STEP apart."""
     ends = lap_end_indices(truth.poses)
     path = truth.poses[: ends[0] + 1 if len(ends) else None, :2]
     length = arc_lengths(path)
-    samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / PATH_STEP)) + 1)
-    return along_polyline(samples, length, path)
+    samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / 0.1)) + 1)  # every 0.1 m
+    nearest = np.asarray(KDTree(along_polyline(samples, length, path)).query(cones)[1])
+    by_path: Array = cones[np.argsort(nearest, kind="stable")]
+    return by_path if _perimeter(by_path) < _perimeter(cones) else cones
 
 
 def _perimeter(points: Array) -> float:
@@ -175,7 +156,7 @@ def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
         return boundary.points
     spline = boundary.spline
     length = spline.length()
-    count = max(int(np.ceil(length / step - ROUND_OFF)), 1)
+    count = max(int(np.ceil(length / step - 1e-9)), 1)  # round-off makes no further one
     return spline.evaluate(spline.parameters_at((np.arange(count) + 0.5) * length / count))
 
 
@@ -218,7 +199,7 @@ def crossings(track: Map) -> tuple[int, int]:
     chords, owner = [np.zeros((0, 2, 2))], [np.zeros(0)]
     for label, boundary in track.boundaries.items():
         if isinstance(boundary, SplineBoundary):
-            points = mapped_points(boundary, CHORD)
+            points = mapped_points(boundary, 0.25)
             ends = np.roll(points, -1, axis=0) if boundary.spline.periodic else points[1:]
             chords.append(np.stack([points[: len(ends)], ends], axis=1))
             owner.append(np.full(len(ends), label))
@@ -239,42 +220,25 @@ def _apart(begin: Array, end: Array, a: Array, b: Array) -> BoolArray:
     return np.asarray(sides * others < 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class CentreLineErrors:
-    """Errors of a mapped centre line at its n points, along their normals, and their claimed sigmas (n,), m.
+def centre_line_errors(track: Map, truth: Truth) -> dict[str, tuple[Array, Array]]:
+    """Return errors of the mapped `centre` line and its `half_width` (n,), and their claimed sigmas (n,), m.
 
-    A value is NaN where a true boundary does not cross the normal near the mapped one.
-    """
-
-    across: Array
-    """Distance of the true centre to the left of the mapped one."""
-    across_sigma: Array
-    width: Array
-    """Width by which the true track is wider to each side than the mapped one."""
-    width_sigma: Array
-
-
-def centre_line_errors(track: Map, truth: Truth, step: float = CENTRE_STEP) -> CentreLineErrors | None:
-    """Return the errors of the centre line at points `step` (m) apart; None where the map has no such line.
-
-    The normal of a point crosses the true boundaries at offsets o_l and o_r: the true centre is at their
-    mean, half the width is half their difference.
+    The normal of each point, 1 m apart, crosses the true boundaries at offsets o_l and o_r: the true centre
+    is at their mean, half the width is half their difference. An error is NaN where a true boundary does not
+    cross the normal near the mapped one. Empty where the map has no centre line.
     """
     try:
-        line = track.centre_line(step)
+        line = track.centre_line(1.0)
     except SettingsError:
-        return None
+        return {}
     normals = np.column_stack([-np.sin(line.heading), np.cos(line.heading)])
     left, right = (
         _crossings(line.points, normals, offsets, true_curve(truth, label, MAPPED_STEP))
         for label, offsets in zip(BOUNDARIES, (line.width_left, -line.width_right), strict=True)
     )
-    return CentreLineErrors(
-        across=0.5 * (left + right),
-        across_sigma=line.points_sigma,
-        width=0.5 * (left - right - line.width_left - line.width_right),
-        width_sigma=0.5 * (line.width_left_sigma + line.width_right_sigma),
-    )
+    width = 0.5 * (left - right - line.width_left - line.width_right)
+    width_sigma = 0.5 * (line.width_left_sigma + line.width_right_sigma)
+    return {"centre": (0.5 * (left + right), line.points_sigma), "half_width": (width, width_sigma)}
 
 
 def _crossings(points: Array, normals: Array, expected: Array, curve: Array) -> Array:
@@ -325,18 +289,13 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> d
         all_ghosts.append(is_ghost)
         if isinstance(boundary, SplineBoundary):
             metres += float(np.mean(is_ghost)) * boundary.spline.length()
-        else:
-            landmarks += int(is_ghost.sum())
-            duplicates += _duplicates(boundary, truth.cones[truth.cone_labels == label], settings.distance)
+            continue
+        landmarks += int(is_ghost.sum())
+        cones = truth.cones[truth.cone_labels == label]
+        if len(cones) and boundary.size:
+            distances, nearest = KDTree(cones).query(boundary.points)
+            matched = np.asarray(nearest)[np.asarray(distances) <= settings.distance]
+            duplicates += len(matched) - len(np.unique(matched))
     share = mean_of(np.concatenate(all_ghosts))
     found = {"ghost_landmarks": landmarks, "ghost_metres": metres, "ghost_share": share}
     return {**found, "duplicates": duplicates}
-
-
-def _duplicates(boundary: PointBoundary, cones: Array, distance: float) -> int:
-    """Return how many landmarks within `distance` of their nearest cone share it with an earlier one."""
-    if len(cones) == 0 or boundary.size == 0:
-        return 0
-    distances, nearest = KDTree(cones).query(boundary.points)
-    matched = np.asarray(nearest)[np.asarray(distances) <= distance]
-    return int(len(matched) - len(np.unique(matched)))

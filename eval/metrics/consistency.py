@@ -132,12 +132,11 @@ def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array
 
 @dataclass(frozen=True, eq=False)
 class NormalErrors:
-    """Errors of a map's curves at the true cones, and the standard deviations that they claim."""
+    """Errors of a map's curves at k true cones along the normals at their foot points, left positive."""
 
     errors: Array
-    """(k,) Signed distance (m) of each true cone along the normal at its foot point, left positive."""
     sigmas: Array
-    """(k,) Standard deviation (m) of the curve along that normal."""
+    """Errors and their claimed standard deviations (k,) in m."""
 
     def share_inside(self, factor: float = 2.0) -> float:
         """Return the share of the cones with |error| <= factor * sigma; NaN without cones."""
@@ -201,10 +200,7 @@ def with_marginals(track: Map) -> Map:
     return Map(track.closed, {k: replace(b, covariance=b.covariance * blocks[k]) for k, b in splines.items()})
 
 
-MOST_ROUNDS: Final = 50
-"""Most rounds in which points are paired with the map."""
-TOLERANCE: Final = 1e-9
-"""Change of the turn in a round below which it is found (rad)."""
+# --- the turn about the start ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -235,14 +231,14 @@ def turn(track: Map, points: Mapping[int, Array]) -> Turn:
     joint covariance gives its variance.
     """
     angle, (error, lever, gradient) = 0.0, _rows(track, points, 0.0)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(50):
         moment = float(lever @ lever)
         if moment == 0.0:
             return Turn(float("nan"), float("nan"))
         change = -float(lever @ error) / moment
         angle += change
         error, lever, gradient = _rows(track, points, angle)
-        if abs(change) < TOLERANCE:
+        if abs(change) < 1e-9:
             break
     joint = track.joint_covariance
     variance = float("nan") if joint is None else float(gradient @ joint @ gradient)

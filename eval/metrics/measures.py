@@ -8,6 +8,7 @@ import numpy as np
 
 from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.mapper import BatchResult
+from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
@@ -23,6 +24,8 @@ from .summary import has_cones, lap_times
 
 WHOLE: Final = "whole"
 """Name of the whole cycle among its stages."""
+EARLY: Final = 30.0
+"""How far before the true drive is back at the start a loop may close (m), as the sensor sees ahead."""
 
 
 def stage_times(cycles: Sequence[CycleRecord]) -> list[dict[str, Any]]:
@@ -44,26 +47,17 @@ def stage_times(cycles: Sequence[CycleRecord]) -> list[dict[str, Any]]:
     return times
 
 
-DOUBLE_BYTES: Final = 8
-
-
 def map_bytes(track: Map) -> int:
     """Return 8 (2 m + knots) bytes for each spline, with one period of its knots, 8 (2 m) for landmarks."""
     splines = [b.spline for b in track.boundaries.values() if isinstance(b, SplineBoundary)]
     knots = sum(len(spline.breaks if spline.periodic else spline.knots) for spline in splines)
-    return DOUBLE_BYTES * (2 * sum(boundary.size for boundary in track.boundaries.values()) + knots)
+    return 8 * (2 * sum(boundary.size for boundary in track.boundaries.values()) + knots)
 
 
 def covariance_bytes(track: Map) -> int:
     """Return 8 n (n + 1) / 2 bytes for each boundary's symmetric joint covariance, n = 2 m."""
     sizes = [2 * boundary.size for boundary in track.boundaries.values()]
-    return DOUBLE_BYTES * sum(n * (n + 1) // 2 for n in sizes)
-
-
-EARLY: Final = 30.0
-"""How far before the true drive is back at the start a loop may close (m), as the sensor sees ahead."""
-UNHEALTHY: Final = ("degraded", "lost")
-"""Conditions of cycles that are not good (FORMATS)."""
+    return 8 * sum(n * (n + 1) // 2 for n in sizes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +96,11 @@ def measure(
     values = _map_values(run.map, log.truth, ghost_settings, marginals)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
     values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
-    health = [getattr(record, "health", "") for record in run.cycles]
+    health = [record.health for record in run.cycles]
     if any(health):
-        values |= {f"told_{level}": health.count(level) / len(health) for level in UNHEALTHY}
-    state = run.vehicle
-    if state is not None:
-        values |= {f"{name}_by_prior": value for name, value in by_prior(state, run.settings).items()}
+        values |= {f"told_{level}": health.count(level) / len(health) for level in (DEGRADED, LOST)}
+    if run.vehicle is not None:
+        values |= {f"{name}_by_prior": value for name, value in by_prior(run.vehicle, run.settings).items()}
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
     if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):
@@ -150,8 +143,17 @@ def _map_values(
     }
     if truth is None or not has_cones(truth):
         return values
-    values |= _cone_values(track, truth) | accuracy.curve_distance(track, truth)
-    values |= accuracy.ghosts(track, truth, ghost_settings)
+    distances = accuracy.cone_distances(track, truth)
+    values |= {
+        "rmse": accuracy.root_mean_square(distances[distances <= accuracy.MISSED_DISTANCE]),
+        "missed": accuracy.missed_share(distances),
+        "cones": len(distances),
+        "size_share": track.size / len(distances),
+        "missed_2m": accuracy.missed_share(distances, 2.0),
+        "missed_1m": accuracy.missed_share(distances, 1.0),
+        "rmse_capped": accuracy.capped_rmse(distances),
+    }
+    values |= accuracy.curve_distance(track, truth) | accuracy.ghosts(track, truth, ghost_settings)
     values |= _consistency_values(track, truth) | _centre_values(track, truth)
     turn = turn_from_truth(track, truth)
     turns = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
@@ -161,19 +163,6 @@ def _map_values(
         keys = ("nees", "inside", "normalized_error")
         values |= {f"{key}_marginals": by_marginals[key] for key in keys}
     return values
-
-
-def _cone_values(track: Map, truth: Truth) -> dict[str, float]:
-    paper, distances = accuracy.lap_metrics(track, truth, 0), accuracy.cone_distances(track, truth)
-    return {
-        "rmse": paper.rmse,
-        "missed": paper.missed,
-        "cones": len(distances),
-        "size_share": track.size / len(distances),
-        "missed_2m": accuracy.missed_share(distances, 2.0),
-        "missed_1m": accuracy.missed_share(distances, 1.0),
-        "rmse_capped": accuracy.capped_rmse(distances),
-    }
 
 
 def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
@@ -186,14 +175,8 @@ def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
 
 def _centre_values(track: Map, truth: Truth) -> dict[str, float]:
     """Return the rms errors (m) of the centre line and of its widths, and mean e^2 / sigma^2 of each."""
-    errors = accuracy.centre_line_errors(track, truth)
-    if errors is None:
-        return {}
     values = {}
-    for name, error, sigma in (
-        ("centre", errors.across, errors.across_sigma),
-        ("half_width", errors.width, errors.width_sigma),
-    ):
+    for name, (error, sigma) in accuracy.centre_line_errors(track, truth).items():
         known = ~np.isnan(error)
         if known.any():
             values[name] = accuracy.root_mean_square(error[known])
@@ -208,9 +191,8 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
     values: dict[str, float] = {}
     if truth is None or len(run.trajectory) == 0:
         return values
-    state = run.vehicle
-    if state is not None:
-        values |= trajectory.vehicle_errors(state, float(run.trajectory_t[-1]), truth)
+    if run.vehicle is not None:
+        values |= trajectory.vehicle_errors(run.vehicle, float(run.trajectory_t[-1]), truth)
     if len(truth.poses):
         values["false_closing"] = closes_falsely(run, truth)
         values |= trajectory.end_of_trajectory(run.trajectory_t, run.trajectory, truth)

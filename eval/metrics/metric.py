@@ -23,7 +23,6 @@ EVERY_LAP: Final = "all"
 LATER_LAPS: Final = "later"
 """Suffix of a column that is the average over the laps from the second on, such as `rmse@later`."""
 _SLOPE: Final = re.compile(r"slope\((\w+), (\w+)\)")
-_SLOPE_DIGITS: Final = 2
 
 
 @dataclass(frozen=True)
@@ -192,20 +191,19 @@ class Column:
     def metrics(self) -> list[Metric]:
         return [self.metric] if self.given is None else [self.metric, self.given]
 
-    def average(self, values: pd.DataFrame) -> str:
-        """Return the text of the average over runs, whose metrics are columns by key, or of the slope."""
-        of = values[self.metric.key].astype(float)
-        if self.given is None:
-            return self.metric.text(self.metric.over(of))
-        slope = slope_of(of.to_numpy(), values[self.given.key].astype(float).to_numpy())
-        return UNKNOWN if np.isnan(slope) else f"{slope:.{_SLOPE_DIGITS}f}"
+    def text(self, values: pd.DataFrame, over: str = "mean") -> str:
+        """Return the text of the average over runs, whose metrics are columns by key, or of the slope.
 
-    def extreme(self, values: pd.DataFrame, name: str) -> str:
-        """Return the text of the `median` or the `max` over runs, of magnitudes where there are signs."""
-        if self.given is not None:
-            return UNKNOWN
+        `median` and `max` are of magnitudes where there are signs; a slope has none.
+        """
         of = values[self.metric.key].astype(float)
-        return self.metric.text(float((of.abs() if self.metric.average == "rms" else of).agg(name)))
+        if self.given is not None:
+            given = values[self.given.key].astype(float)
+            slope = slope_of(of.to_numpy(), given.to_numpy()) if over == "mean" else np.nan
+            return UNKNOWN if np.isnan(slope) else f"{slope:.2f}"
+        if over == "mean":
+            return self.metric.text(self.metric.over(of))
+        return self.metric.text(float((of.abs() if self.metric.average == "rms" else of).agg(over)))
 
 
 def column_of(text: str) -> Column:

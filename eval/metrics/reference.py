@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from itertools import repeat
+from typing import Any
 
 import numpy as np
 
@@ -31,11 +32,10 @@ from .trajectory import pose_errors
 
 
 def limit(log: Log, track: Map) -> dict[str, float]:
-    """Return the least error (m) to be expected of a simulated log and a map of it.
+    """Return the least error (m) to be expected of a simulated log and a map of it; ValueError for others.
 
     `l` is the rmse in the plane of the landmark batch with oracle association, `f` that of the true cones to
-    splines of the mapped size that are fitted to them, `limit` both. ValueError without truth or
-    associations.
+    splines of the mapped size that are fitted to them, `limit` both.
     """
     truth = _truth(log)
     landmarks, fit = landmark_rmse(solve_oracle_landmarks(log)[1], truth), fit_rmse(track, truth)
@@ -153,12 +153,7 @@ def _truth(log: Log) -> Truth:
     return log.truth
 
 
-STEP: Final = 0.5
-"""Distance of the points of curves by which maps are aligned (m)."""
-STARTS: Final = (0.0, -4.0, -2.0, 2.0, 4.0)
-"""Distances by which the vehicle may have started farther ahead in one of two maps (m)."""
-ROUNDS: Final = 30
-"""Rounds in which their points are paired."""
+# --- another run -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -168,11 +163,9 @@ class Gap:
     curves: dict[str, float]
     """Two-way distance (m) of the two curves of each boundary that both runs have mapped."""
     along: float
-    """Root mean square distance (m) of the poses along the reference's heading."""
     across: float
-    """Root mean square distance (m) of the poses across it."""
     heading: float
-    """Root mean square difference (rad) of the headings."""
+    """Root mean square errors of the poses in the reference's frame (m, m, rad)."""
 
 
 def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
@@ -190,10 +183,8 @@ def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str,
 def gap(run: RunResult, reference: RunResult) -> Gap:
     """Return the gap of a run from a reference over the same log."""
     shared = sorted(set(run.map.boundaries) & set(reference.map.boundaries))
-    curves = {
-        NAMES[label]: two_way_distance(run.map.boundaries[label], reference.map.boundaries[label])
-        for label in shared
-    }
+    own, others = run.map.boundaries, reference.map.boundaries
+    curves = {NAMES[label]: two_way_distance(own[label], others[label]) for label in shared}
     errors = pose_errors(run.trajectory_t, run.trajectory, reference.trajectory_t, reference.trajectory)
     return Gap(curves, *(root_mean_square(column) for column in errors.T))
 
@@ -201,23 +192,17 @@ def gap(run: RunResult, reference: RunResult) -> Gap:
 def aligned_distance(track: Map, reference: Map) -> float:
     """Return the mean two-way distance (m) of a map from another one of the same cones, rigidly aligned.
 
-    Each drive has its own map frame. The least distance by closest points from several starts counts; it is
-    infinite where the maps share no boundary.
+    Each drive has its own map frame, and may have started farther ahead. The least distance by closest points
+    from several starts counts; it is infinite where the maps share no boundary.
     """
     shared = sorted(set(track.boundaries) & set(reference.boundaries))
-    own = [mapped_points(track.boundaries[label], STEP) for label in shared]
-    other = [mapped_points(reference.boundaries[label], STEP) for label in shared]
+    first, second = ([of.boundaries[label] for label in shared] for of in (track, reference))
+    points, others = ([mapped_points(boundary, 0.5) for boundary in of] for of in (first, second))
     best = np.inf
-    for start in STARTS if shared else ():
-        motion = _aligning(own, [reference.boundaries[label] for label in shared], start)
-        distances = [
-            boundary_distances(boundaries[label], to_map(points, way[None]))
-            for boundaries, all_points, way in (
-                (reference.boundaries, own, motion),
-                (track.boundaries, other, inverse(motion)),
-            )
-            for label, points in zip(shared, all_points, strict=True)
-        ]
+    for start in (0.0, -4.0, -2.0, 2.0, 4.0) if shared else ():
+        motion = _aligning(points, second, start)
+        ways = [*zip(second, points, repeat(motion)), *zip(first, others, repeat(inverse(motion)))]
+        distances = [boundary_distances(boundary, to_map(of, way[None])) for boundary, of, way in ways]
         best = min(best, float(np.mean(np.concatenate(distances))))
     return float(best)
 
@@ -225,7 +210,7 @@ def aligned_distance(track: Map, reference: Map) -> float:
 def _aligning(points: list[Array], boundaries: list[MapBoundary], start: float) -> Array:
     """Return the motion (3,) that lays points (k, 2) of curves on the boundaries of another map."""
     motion = np.array([start, 0.0, 0.0])
-    for _ in range(ROUNDS):
+    for _ in range(30):
         rows, errors = [np.zeros((0, 3))], [np.zeros(0)]
         for own, boundary in zip(points, boundaries, strict=True):
             point, normal, position, _ = near_pairs(boundary, to_map(own, motion[None]))

@@ -15,7 +15,7 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, Stretch, counts, stretches
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.lengths import scaled
@@ -29,7 +29,6 @@ from .trajectory import position_rms, trajectory_errors
 
 GATE: Final = ("dropped", "late", "refused")
 """Counts of the gate in each cycle."""
-LIBRARIES: Final = ("pathspace-graph", "gtsam", "numpy", "scipy")
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
@@ -37,7 +36,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
 
     Hints about the log are in it as well.
     """
-    seconds = np.array([record.seconds for record in result.cycles])
+    seconds = [record.seconds for record in result.cycles]
     summary: dict[str, Any] = {
         "estimator": result.estimator,
         "settings": result.settings,
@@ -49,9 +48,12 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "size": result.map.size,
         "not_mapped": not_mapped(result.map, log),
         "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
-        "seconds": _timing(seconds) if len(seconds) else None,
+        "seconds": None,
         "gate": {name: sum(getattr(record, name) for record in result.cycles) for name in GATE},
     }
+    if seconds:
+        p99 = float(np.quantile(seconds, 0.99))
+        summary["seconds"] = {"mean": float(np.mean(seconds)), "p99": p99, "max": max(seconds)}
     if result.batches is not None:
         summary["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
     if hints:
@@ -72,23 +74,14 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         summary |= {"notes": notes} if notes else {}
     state = result.vehicle
     if state is not None:
-        summary |= _vehicle(state)
+        summary["calibration"] = {name: value for name, (value, _) in state.by_name.items()}
+        summary["calibration"] |= {f"{name}_sigma": sigma for name, (_, sigma) in state.by_name.items()}
+        summary["heading_sigma"] = float(state.sigmas[2])
         found = diagnose(state, result.settings)
         summary |= {"diagnosis": found} if found else {}
     if log.truth is not None:
         summary |= _map_errors(result, log, log.truth) | _trajectory_errors(result, log.truth)
     return summary
-
-
-def _vehicle(state: VehicleState) -> dict[str, Any]:
-    """Return the calibrations with their standard deviations, and that of the last heading (rad).
-
-    Those of the odometry are in (-, rad/s), those of the sensor in the units of `factors.sensor:SENSOR`.
-    """
-    known = state.by_name
-    calibration = {name: value for name, (value, _) in known.items()}
-    calibration |= {f"{name}_sigma": sigma for name, (_, sigma) in known.items()}
-    return {"calibration": calibration, "heading_sigma": float(state.sigmas[2])}
 
 
 def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
@@ -128,7 +121,8 @@ def health_of(record: CycleRecord) -> Health:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and the libraries that a result depends on."""
-    return {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}}
+    libraries = {name: version(name) for name in ("pathspace-graph", "gtsam", "numpy", "scipy")}
+    return {"python": platform.python_version(), **libraries}
 
 
 def lap_times(log: Log) -> Array:
@@ -172,11 +166,6 @@ def not_mapped(track: Map, log: Log) -> list[str]:
 
 def has_cones(truth: Truth) -> bool:
     return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
-
-
-def _timing(seconds: Array) -> dict[str, float]:
-    mean, p99, most = np.mean(seconds), np.quantile(seconds, 0.99), np.max(seconds)
-    return {"mean": float(mean), "p99": float(p99), "max": float(most)}
 
 
 def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:

@@ -1,8 +1,7 @@
 """Errors of a trajectory, and the reach: how far ahead of the vehicle the map is right."""
 
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -20,12 +19,16 @@ from pathspace_graph.sim.curves import arc_lengths
 
 from .accuracy import boundary_distances, root_mean_square
 
-LOST: Final = 5.0
-"""Position error beyond which a vehicle is lost (m)."""
-ASTRAY: Final = 1.0
-"""Position error beyond which a vehicle is astray (m)."""
-END: Final = 1.0
-"""Length of the end of a log (s)."""
+LOST, ASTRAY = 5.0, 1.0
+"""Position errors beyond which a vehicle is lost, or astray (m)."""
+MOST: Final = 35.0
+"""Greatest length of a reach (m)."""
+ON_CURVE: Final = 0.5
+"""Distance of a true cone from the mapped boundary at which the reach ends (m)."""
+SHORT: Final = 4.0
+"""Reach below which no planner can work (m)."""
+STARTING: Final = 0.03
+"""Share of lap 1 on which the map has only begun, and cycles don't count."""
 
 
 def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
@@ -67,7 +70,7 @@ def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
     if len(errors) == 0:
         return {}
     known = t[(t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])]
-    error_end = position_rms(errors[known >= known[-1] - END])
+    error_end = position_rms(errors[known >= known[-1] - 1.0])
     return {
         "error_max": float(np.linalg.norm(errors[:, :2], axis=1).max()),
         "error_end": error_end,
@@ -120,73 +123,65 @@ def position_rms(errors: Array) -> float:
     return root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
 
 
-MOST: Final = 35.0
-"""Greatest length of a reach (m)."""
-ON_CURVE: Final = 0.5
-"""Distance of a true cone from the mapped boundary at which the reach ends (m)."""
-SHORT: Final = 4.0
-"""Reach below which no planner can work (m)."""
-STARTING: Final = 0.03
-"""Share of lap 1 on which the map has only begun, and cycles don't count."""
+# --- reach -----------------------------------------------------------------------------------------------
 
 
-# --- the true road ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class TrueRoad:
-    """True drive by its length, and the true cones in the order in which the drive passes them."""
-
-    t: Array
-    """Stamps (N,) of the true poses (s)."""
-    drive: Array
-    """(N, 4) Rows [station, x, y, theta] (m, rad): length driven and true pose; theta isn't wrapped."""
-    stations: Array
-    """(P,) Lengths at which the drive passes a true cone in m, ascending; every lap passes every cone."""
-    cones: Array
-    """(P, 2) Cone passed at each station in m, map frame."""
-    labels: IntArray
-    """(P,) Boundary of each cone that is passed."""
-    counted: tuple[float, float]
-    """Stations (m) between which cycles count."""
-
-    def at(self, t: float) -> tuple[float, Array]:
-        """Return the station (m) and the true pose (3,) at a stamp (s)."""
-        station, *pose = (float(np.interp(t, self.t, column)) for column in self.drive.T)
-        return station, np.array(pose)
-
-    def counts(self, t: float, station: float) -> bool:
-        """Return whether the cycle at a stamp (s), whose true station (m) is known, counts."""
-        return bool(self.t[0] <= t <= self.t[-1]) and self.counted[0] <= station <= self.counted[1]
-
-    def ahead(self, station: float) -> slice:
-        """Return which of the cones are passed within the next `MOST` metres."""
-        first, stop = np.searchsorted(self.stations, [station, station + MOST])
-        return slice(int(first), int(stop))
-
-
-def true_road(truth: Truth) -> TrueRoad:
-    """Return the road of a truth that has poses and cones.
+class ReachObserver:
+    """Observer of `run.run_online` that measures the reach in every cycle; the truth has poses and cones.
 
     The last lap's cones are passed once more, so that the road goes on behind the drive's end. Without a
     complete lap, cones beside the drive's two ends and cycles less than `MOST` metres before its end don't
     count.
     """
-    driven = arc_lengths(truth.poses[:, :2])
-    own = np.isin(truth.cone_labels, BOUNDARIES)
-    cones, ends = truth.cones[own], driven[lap_end_indices(truth.poses)]
-    stations, cone = _passes(truth.poses[:, :2], driven, cones, ends)
-    order = np.argsort(stations, kind="stable")
-    lap = float(ends[0]) if len(ends) else float(driven[-1])
-    heading = np.unwrap(truth.poses[:, 2])
-    return TrueRoad(
-        t=truth.pose_t,
-        drive=np.column_stack([driven, truth.poses[:, :2], heading]),
-        stations=stations[order],
-        cones=cones[cone[order]],
-        labels=truth.cone_labels[own][cone[order]],
-        counted=(STARTING * lap, np.inf if len(ends) else float(driven[-1]) - MOST),
-    )
+
+    def __init__(self, truth: Truth) -> None:
+        path, heading = truth.poses[:, :2], np.unwrap(truth.poses[:, 2])
+        driven, own = arc_lengths(path), np.isin(truth.cone_labels, BOUNDARIES)
+        ends = driven[lap_end_indices(truth.poses)]
+        stations, cone = _passes(path, driven, truth.cones[own], ends)
+        order = np.argsort(stations, kind="stable")
+        self._t, self._drive = truth.pose_t, np.column_stack([driven, path, heading])
+        self._stations = stations[order]
+        self._cones, self._labels = truth.cones[own][cone[order]], truth.cone_labels[own][cone[order]]
+        lap, whole = (ends[0], np.inf) if len(ends) else (driven[-1], driven[-1] - MOST)
+        self._counted = float(STARTING * lap), float(whole)  # stations between which cycles count (m)
+        self._rows: list[tuple[float, float, int]] = []
+
+    def __call__(self, cycle: ObservedCycle) -> None:
+        t, (first, last) = cycle.result.t, self._counted
+        station, pose_true = self.at(t)
+        if self._t[0] <= t <= self._t[-1] and first <= station <= last:
+            self._rows.append(self.reach(station, pose_true, cycle.result.pose, cycle.outline))
+        else:
+            self._rows.append((np.nan, 0.0, 0))
+
+    @property
+    def rows(self) -> Array:
+        """Return the rows (n, 3) of `RunResult.reach`."""
+        return np.array(self._rows, float).reshape(-1, 3)
+
+    def at(self, t: float) -> tuple[float, Array]:
+        """Return the length driven (m) and the true pose (3,) at a stamp (s)."""
+        station, *pose = (float(np.interp(t, self._t, column)) for column in self._drive.T)
+        return station, np.array(pose)
+
+    def reach(self, station: float, pose_true: Array, pose: Array, track: Map) -> tuple[float, float, int]:
+        """Return the reach of a map at a true station (m), seen from the true and the estimated pose (3,).
+
+        The cones are placed by `map_T_vehicle * vehicle_T_cones`, with the estimated and with the true pose,
+        so that only what the vehicle would see ahead of itself counts. The sum of their squared distances
+        (m^2) and their number are of the stretch in reach.
+        """
+        ahead = slice(*np.searchsorted(self._stations, [station, station + MOST]))
+        cones, labels, away = self._cones[ahead], self._labels[ahead], self._stations[ahead] - station
+        each = (len(cones), 3)
+        points = to_map(to_vehicle(cones, np.broadcast_to(pose_true, each)), np.broadcast_to(pose, each))
+        distances = np.full(len(points), np.inf)
+        for label, boundary in track.boundaries.items():
+            distances[labels == label] = _distances(boundary, points[labels == label])
+        reach = float(away[distances > ON_CURVE].min(initial=MOST))
+        on_stretch = distances[away < reach]
+        return reach, float(on_stretch @ on_stretch), len(on_stretch)
 
 
 def _passes(path: Array, driven: Array, cones: Array, ends: Array) -> tuple[Array, IntArray]:
@@ -204,64 +199,11 @@ def _passes(path: Array, driven: Array, cones: Array, ends: Array) -> tuple[Arra
     return np.concatenate(laps), np.tile(np.arange(len(cones)), len(laps))
 
 
-class CycleReach(NamedTuple):
-    """Reach of the map in one cycle, a row of `RunResult.reach`."""
-
-    reach: float
-    """Length ahead of the vehicle (m) over which the road is mapped on both sides."""
-    squares: float
-    """Sum of squared distances (m^2) of the true cones on that stretch from the mapped boundaries."""
-    cones: int
-    """Number of true cones on that stretch."""
-
-
-NOT_COUNTED: Final = CycleReach(np.nan, 0.0, 0)
-
-
-def cycle_reach(road: TrueRoad, station: float, pose_true: Array, pose: Array, track: Map) -> CycleReach:
-    """Return the reach of a map at a true station (m), seen from the true and from the estimated pose (3,).
-
-    The cones are placed by `map_T_vehicle * vehicle_T_cones`, with the estimated and with the true pose, so
-    that only what the vehicle would see ahead of itself counts.
-    """
-    ahead = road.ahead(station)
-    cones, labels, away = road.cones[ahead], road.labels[ahead], road.stations[ahead] - station
-    each = (len(cones), 3)
-    points = to_map(to_vehicle(cones, np.broadcast_to(pose_true, each)), np.broadcast_to(pose, each))
-    distances = np.full(len(points), np.inf)
-    for label, boundary in track.boundaries.items():
-        distances[labels == label] = _distances(boundary, points[labels == label])
-    reach = float(away[distances > ON_CURVE].min(initial=MOST))
-    on_stretch = distances[away < reach]
-    return CycleReach(reach, float(on_stretch @ on_stretch), len(on_stretch))
-
-
 def _distances(boundary: MapBoundary, points: Array) -> Array:
     """Return the distance (k,) in m of each point (k, 2) from a mapped boundary, on a coarser grid."""
     if isinstance(boundary, SplineBoundary):
         return np.asarray(np.linalg.norm(points - boundary.spline.foot_points(points).position, axis=1))
     return boundary_distances(boundary, points)
-
-
-class ReachObserver:
-    """Observer that measures the reach in every cycle of `run.run_online`."""
-
-    def __init__(self, truth: Truth) -> None:
-        self._road = true_road(truth)
-        self._rows: list[CycleReach] = []
-
-    def __call__(self, cycle: ObservedCycle) -> None:
-        result = cycle.result
-        station, pose_true = self._road.at(result.t)
-        counts = self._road.counts(result.t, station)
-        row = (
-            cycle_reach(self._road, station, pose_true, result.pose, cycle.outline) if counts else NOT_COUNTED
-        )
-        self._rows.append(row)
-
-    @property
-    def rows(self) -> Array:
-        return np.array(self._rows, float).reshape(-1, 3)
 
 
 def reach_values(rows: Array) -> dict[str, float]:

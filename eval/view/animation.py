@@ -4,7 +4,7 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol, cast
+from typing import Any, Final, Protocol, cast
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter
@@ -31,32 +31,25 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES
 from pathspace_graph.run import ObservedCycle, Readings
 from pathspace_graph.settings.output import FilmSettings
 
+SUFFIXES: Final = (".gif", ".mp4")
 DPI: Final = 100.0
 """Resolution of a frame (dots per inch), which decides how large the text is."""
 VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
 """Arrow that stands for the vehicle (m, vehicle frame), larger than it is, so that it is seen."""
-NOTICE_SECONDS: Final = 2.0
-"""Time (s) of the film for which a frame shows what happened."""
-LEAST_TURN: Final = 0.75
-"""Share of a full turn below which an odometry has driven no lap."""
-
+Pixels = NDArray[np.uint8]
 _STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8, widest_band=5.0)
 """Lines are wider than on paper, since a film has few pixels."""
 _MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)
 """Place of the map: left, bottom, width, height, as shares of the frame."""
 _TEXT_PLACE: Final = (0.775, 0.085, 0.212, 0.845)
-_LINE: Final = 0.062
-"""Height of a line of text as a share of that place."""
 _FRAME_STEP: Final = 10.0
 """Step (m) by which the part of the plane that is shown grows."""
-_LEAST_FRAME: Final = 30.0
-"""Least length (m) around the start that is shown in each direction."""
 
 
 def lap_seconds(log: Log) -> float:
     """Return how long a lap of the log takes (s), by its truth, or by how far the odometry turns.
 
-    A log of less than `LEAST_TURN` of a turn is taken as one lap.
+    A log of less than three quarters of a turn is taken as one lap.
     """
     if not log.cycles:
         return 1.0
@@ -65,14 +58,7 @@ def lap_seconds(log: Log) -> float:
         return float(ends[0] - begin)
     driven = log.odometry.between(begin, end)
     turns = abs(float(driven.twist[:, 2] @ np.diff(np.append(driven.t, end)))) / (2.0 * np.pi)
-    return ((end - begin) / (turns if turns > LEAST_TURN else 1.0)) or 1.0
-
-
-Pixels = NDArray[np.uint8]
-
-SUFFIXES: Final = (".gif", ".mp4")
-_COLORS: Final = 255
-"""Number of colours of a frame of a .gif; one index of its palette is left for what does not change."""
+    return ((end - begin) / (turns if turns > 0.75 else 1.0)) or 1.0
 
 
 class Film(Protocol):
@@ -126,7 +112,8 @@ class GifFilm:
         The format counts in hundredths of a second, whose rounding must not add up.
         """
         picture = Image.fromarray(pixels_of(figure))
-        self._frames.append(picture.quantize(_COLORS, dither=Image.Dither.NONE))
+        # one index of the palette is left for what does not change
+        self._frames.append(picture.quantize(255, dither=Image.Dither.NONE))
         before, self._time = self._time, self._time + seconds
         self._durations.append(10 * (round(100.0 * self._time) - round(100.0 * before)))
 
@@ -164,14 +151,6 @@ class _FfmpegFilm:
 # --- frames ----------------------------------------------------------------------------------------------
 
 
-class Moment(NamedTuple):
-    """Figure of the moment, its value with the unit."""
-
-    name: str
-    value: str
-    color: str = "black"
-
-
 class Animation:
     """Draws a frame of a film at equal steps of the log's time; it is an observer of `run.run_online`.
 
@@ -196,7 +175,7 @@ class Animation:
         self._seconds: list[float] = []
         self._notice, self._notice_until = "", -np.inf
         self._was_closed, self._size = False, 0
-        self._low, self._high = np.full(2, -_LEAST_FRAME), np.full(2, _LEAST_FRAME)
+        self._low, self._high = np.full(2, -30.0), np.full(2, 30.0)
         self._cones = np.zeros((0, 2)) if truth is None else truth.cones
         self._show(self._cones)
         self._figure = Figure(figsize=(self.settings.width / DPI, self.settings.height / DPI), dpi=DPI)
@@ -231,7 +210,7 @@ class Animation:
         if result.jump is not None:
             told.append(f"the lap was solved again: the pose moves by {np.hypot(*result.jump[:2]):.2f} m")
         if told:
-            self._notice, self._notice_until = "\n".join(told), film_time + NOTICE_SECONDS
+            self._notice, self._notice_until = "\n".join(told), film_time + 2.0
         self._was_closed, self._size = result.closed, sum(result.sizes)
 
     # --- a frame -----------------------------------------------------------------------------------------
@@ -271,50 +250,45 @@ class Animation:
         axes.set_title(self._title, fontsize=10.0)
         if film_time < self._notice_until:
             frame = {"boxstyle": "round,pad=0.5", "facecolor": "white", "edgecolor": DARK, "alpha": 0.9}
-            place: dict[str, Any] = {
-                "ha": "center",
-                "va": "center",
-                "transform": axes.transAxes,
-                "zorder": 20,
-            }
-            axes.text(0.5, 0.5, self._notice, fontsize=10.0, bbox=frame, **place)
+            place: dict[str, Any] = {"ha": "center", "va": "center", "transform": axes.transAxes}
+            axes.text(0.5, 0.5, self._notice, fontsize=10.0, bbox=frame, zorder=20, **place)
 
     def _write(self, cycle: ObservedCycle) -> None:
         axes = self._text
         axes.clear()
         axes.set_axis_off()
-        moments = [*_moments(cycle, self._seconds), *_against_truth(cycle.map, self._truth)]
+        moments = _moments(cycle, self._seconds) | _against_truth(cycle.map, self._truth)
         self._seconds.clear()
-        for number, (name, value, color) in enumerate(moments):
-            y = 1.0 - _LINE * (number + 0.5)
+        for number, (name, value) in enumerate(moments.items()):
+            y = 1.0 - 0.062 * (number + 0.5)
+            color = map_plot.HEALTH_COLORS.get(value, TRAJECTORY_COLOR) if name == "health" else "black"
             axes.text(0.0, y, name, color=DARK, va="center", fontsize=8.5)
             axes.text(1.0, y, value, color=color, va="center", ha="right", fontsize=8.5)
         handles = _legend(self._truth, bool(cycle.map.points))
         axes.legend(handles=handles, loc="lower left", borderaxespad=0.0, borderpad=0.0)
 
 
-def _moments(cycle: ObservedCycle, seconds: Sequence[float]) -> list[Moment]:
+def _moments(cycle: ObservedCycle, seconds: Sequence[float]) -> dict[str, str]:
+    """Return the figures of the moment, each with its unit."""
     result, condition = cycle.result, cycle.result.health.condition
     points = any(isinstance(one, PointBoundary) for one in cycle.map.boundaries.values())
-    moments = [
-        Moment("time", f"{result.t:.1f} s"),
-        Moment("lap", str(cycle.lap)),
-        Moment("loop", "closed" if result.closed else "open"),
-        Moment("landmarks" if points else "control points", " + ".join(map(str, result.sizes))),
-        Moment("readings used", f"{result.readings} of {len(cycle.detections.labels)}"),
-        Moment("update", f"{1e3 * float(np.mean(seconds)):.1f} ms"),
-    ]
-    if condition:
-        moments.append(Moment("health", condition, map_plot.HEALTH_COLORS.get(condition, TRAJECTORY_COLOR)))
-    return moments
+    moments = {
+        "time": f"{result.t:.1f} s",
+        "lap": str(cycle.lap),
+        "loop": "closed" if result.closed else "open",
+        "landmarks" if points else "control points": " + ".join(map(str, result.sizes)),
+        "readings used": f"{result.readings} of {len(cycle.detections.labels)}",
+        "update": f"{1e3 * float(np.mean(seconds)):.1f} ms",
+    }
+    return moments | ({"health": condition} if condition else {})
 
 
-def _against_truth(track: Map, truth: Truth | None) -> list[Moment]:
+def _against_truth(track: Map, truth: Truth | None) -> dict[str, str]:
     if truth is None or not has_cones(truth):
-        return []
+        return {}
     metrics = lap_metrics(track, truth, 0)
     rmse = "" if np.isnan(metrics.rmse) else f"{metrics.rmse:.2f} m"
-    return [Moment("rmse", rmse), Moment("cones missed", f"{100.0 * metrics.missed:.0f} %")]
+    return {"rmse": rmse, "cones missed": f"{100.0 * metrics.missed:.0f} %"}
 
 
 def _draw_readings(axes: Axes, readings: Readings | None, pose: Array) -> None:

@@ -28,15 +28,11 @@ from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 
 from .animation import Animation, check_film_file, film, lap_seconds
 
-APPLICATION: Final = "pathspace_graph"
-"""Name by which the viewer keeps what a user arranges."""
 SUFFIX: Final = ".rrd"
 DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 """Variables of the environment of which one is set where there is a display, on Linux."""
 PORT: Final = 9876
 """The viewer's port, rerun's own; a viewer that is there already is used."""
-_TIMEOUT: Final = 2.0
-"""Time within which a viewer that was started answers (s)."""
 
 
 def import_rerun(option: str) -> Any:
@@ -88,20 +84,16 @@ def recording(
     rerun = import_rerun("recording")
     with ExitStack() as stack:
         path = None if target is None else stack.enter_context(atomic_file(target))
-        stream = rerun.RecordingStream(APPLICATION)
+        stream = rerun.RecordingStream("pathspace_graph")
         stack.callback(stream.disconnect)  # before the file gets its name
-        _connect(rerun, stream, path, window)
+        sinks = [] if path is None else [rerun.FileSink(str(path))]
+        if window:
+            _open_window(rerun, stream)
+            sinks.append(rerun.GrpcSink(f"rerun+http://127.0.0.1:{PORT}/proxy"))
+        stream.set_log_time_enabled(False)
+        stream.set_log_tick_enabled(False)
+        stream.set_sinks(*sinks, default_blueprint=blueprint(rerun))
         yield Recorder(rerun, stream, settings or RecordingSettings(), truth)
-
-
-def _connect(rerun: Any, stream: Any, path: Path | None, window: bool) -> None:
-    if window:
-        _open_window(rerun, stream)
-    sinks = [] if path is None else [rerun.FileSink(str(path))]
-    sinks += [rerun.GrpcSink(f"rerun+http://127.0.0.1:{PORT}/proxy")] if window else []
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
-    stream.set_sinks(*sinks, default_blueprint=blueprint(rerun))
 
 
 def _open_window(rerun: Any, stream: Any) -> None:
@@ -114,18 +106,16 @@ def _open_window(rerun: Any, stream: Any) -> None:
         reason = str(error).splitlines()[0]
         raise SettingsError(f"--view: the viewer could not be started: {reason}") from error
     try:
-        socket.create_connection(("127.0.0.1", PORT), _TIMEOUT).close()
+        socket.create_connection(("127.0.0.1", PORT), 2.0).close()
     except OSError as error:
         raise SettingsError(f"--view: expected the viewer on port {PORT}, found none: {error}") from error
 
 
 # --- what is shown --------------------------------------------------------------------------------------
 
-TIMELINE: Final = "cycle"
-"""Timeline that counts the perception cycles, from 0."""
-TIME: Final = "time"
-"""Timeline of the log's time (s)."""
-TIMELINES: Final = (TIMELINE, TIME)
+TIMELINES: Final = ("cycle", "time")
+"""Timelines of the perception cycles, from 0, and of the log's time (s)."""
+TIMELINE, TIME = TIMELINES
 
 MAP: Final = "map"
 """Entity above all that has a place, in the map frame (m)."""
@@ -148,14 +138,10 @@ SIZES: Final = "size"
 READING_COUNTS: Final = "readings"
 """Entity above the numbers of detections that were offered and used."""
 
-WIDEST_BAND: Final = 5.0
-"""Largest width of a band on either side of its curve (m)."""
 OUTLINE: Final = np.array([[1.8, 0.0], [-0.9, 0.7], [-0.9, -0.7], [1.8, 0.0]])
 """Triangle that stands for the vehicle (m, vehicle frame)."""
 LOW, MIDDLE, HIGH, TOP = 10.0, 20.0, 30.0, 40.0
 """Order of drawing, the last one on top."""
-WHITE: Final = (255, 255, 255)
-"""Background of the map, as in all our figures, since the colours are made for it."""
 _SERIES: Final = {
     f"{UPDATE}/milliseconds": BLUE,
     f"{SIZES}/left": BLUE,
@@ -179,7 +165,7 @@ def blueprint(rerun: Any) -> Any:
     )
     begin, now = rerun.TimeRangeBoundary.infinite(), rerun.TimeRangeBoundary.cursor_relative()
     ranges = [rerun.VisibleTimeRange(name, start=begin, end=now) for name in TIMELINES]
-    look = {"background": WHITE, "overrides": {TRAJECTORY: views.VisibleTimeRanges(ranges)}}
+    look = {"background": (255, 255, 255), "overrides": {TRAJECTORY: views.VisibleTimeRanges(ranges)}}
     track = views.Spatial2DView(origin="/", contents=f"{MAP}/**", name="map", **look)
     return views.Blueprint(
         views.Horizontal(track, beside, column_shares=[3, 2]),
@@ -278,7 +264,7 @@ class Recorder:
     def _band(self, boundary: MapBoundary) -> list[Array]:
         if isinstance(boundary, SplineBoundary):
             u = style.curve_parameters(boundary.spline, self._settings.samples_per_span)
-            return list(style.uncertainty_band(boundary, u, widest=WIDEST_BAND))
+            return list(style.uncertainty_band(boundary, u, widest=5.0))
         return list(style.ellipse_outlines(boundary.points, boundary.covariance))
 
     def _show_vehicle(self, cycle: ObservedCycle) -> None:

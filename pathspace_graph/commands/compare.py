@@ -11,8 +11,14 @@ from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment.cells import run_estimator
-from pathspace_graph.eval.experiment.compare import Comparison, compare, side_by_side, tables
-from pathspace_graph.eval.experiment.output import MARKER, write_comparison
+from pathspace_graph.eval.experiment.compare import (
+    MARKER,
+    Comparison,
+    compare,
+    side_by_side,
+    tables,
+    write_comparison,
+)
 from pathspace_graph.eval.experiment.run import check_jobs, workers
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import save_plot

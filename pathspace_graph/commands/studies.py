@@ -15,12 +15,17 @@ from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT, ONLINE, check_online
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
-from pathspace_graph.eval.benchmark.scaling import measure_scaling
-from pathspace_graph.eval.benchmark.scaling_output import MARKER, scaling_table, stops, write_scaling
-from pathspace_graph.eval.experiment.faults import only, strongest, suite
-from pathspace_graph.eval.experiment.output import write_study, write_suite
+from pathspace_graph.eval.benchmark.scaling import (
+    MARKER,
+    measure_scaling,
+    scaling_table,
+    stops,
+    write_scaling,
+)
+from pathspace_graph.eval.experiment.faults import only, strongest, suite, write_suite
 from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study
+from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figures, render_pages, to_json
 from pathspace_graph.io.files import check_target, write_json, write_manifest, write_text
 from pathspace_graph.settings.mapper import MapperSettings

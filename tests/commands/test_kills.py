@@ -97,17 +97,17 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
         "commands.compare.Compare._report": None,
         "commands.studies.make_drives": Roads(),
         "commands.studies.measure_scaling": scaling(),
-        "eval.experiment.output.plot_maps": picture,
-        "eval.experiment.output.comparison_tables": {"table": TextTable("", ("a",), (("1",),))},
-        "eval.benchmark.scaling_output.plot_laps": picture,
-        "eval.benchmark.scaling_output.plot_scaling": picture,
-        "eval.benchmark.scaling_output._process_megabytes": 1.0,
+        "eval.experiment.compare.plot_maps": picture,
+        "eval.experiment.compare.tables": {"table": TextTable("", ("a",), (("1",),))},
+        "eval.benchmark.scaling.plot_laps": picture,
+        "eval.benchmark.scaling.plot_scaling": picture,
+        "eval.benchmark.scaling._process_megabytes": 1.0,
     }
     judged = recorded.log, []
     answers["commands.estimate.read_plausible_log"] = judged
     answers["commands.plot.read_log"] = recorded.log
-    answers |= {f"{room}.summarize": {} for room in ("commands.compare", "commands.estimate")}
-    answers |= {"eval.experiment.output.summarize": {}}
+    rooms = ("commands.compare", "commands.estimate", "eval.experiment.compare")
+    answers |= {f"{room}.summarize": {} for room in rooms}
     for name, answer in answers.items():
         monkeypatch.setattr(f"pathspace_graph.{name}", lambda *_, _answer=answer, **__: _answer)
     monkeypatch.setattr("pathspace_graph.eval.figures.isolated.FIGURES", figures)
@@ -221,8 +221,8 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}]
     monkeypatch.setattr(f"{study}.cells.Drive.load", lambda _: recorded.log)
     monkeypatch.setattr(f"{study}.cells.lap_rows", lambda *_, **__: rows)
-    monkeypatch.setattr(f"{study}.output.plot_differences", lambda *_: Figure())
-    monkeypatch.setattr(f"{study}.output.plot_faults", lambda *_: Figure())
+    monkeypatch.setattr(f"{study}.tables.plot_differences", lambda *_: Figure())
+    monkeypatch.setattr(f"{study}.faults.plot_faults", lambda *_: Figure())
     track = write_round_track(tmp_path)
     (tmp_path / "small.toml").write_text(STUDY.format(track=track))
     folder = tmp_path / "folder"

@@ -9,7 +9,9 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.eval.hints import CAUSES, GOOD, causes_of, judged, main, outcome, summary
+from pathspace_graph.io.overrides import override
 from pathspace_graph.sim.mistakes import MISTAKES
+from pathspace_graph.sim.simulate import SimulationSettings
 
 from ..scenes.drives import short_drive
 
@@ -18,6 +20,11 @@ def test_every_mistake_has_its_causes_by_the_longest_beginning() -> None:
     assert all(causes_of(mistake) for mistake in MISTAKES)
     assert causes_of("speeds in km/h") == ("speeds",)
     assert causes_of("speeds in the map frame") == CAUSES["speeds in the map frame"] == ("odometry",)
+
+
+def test_every_good_log_has_known_settings() -> None:
+    for name, good in GOOD.items():
+        override(SimulationSettings(), good.overrides, name)
 
 
 def test_a_wrong_cause_does_not_count_as_told() -> None:

@@ -42,7 +42,7 @@ def test_only_ratios_are_compared() -> None:
     worse = {metric.key: metric.worse_than(before) for metric, before in found}
     assert worse == {"a": True, "new": False, "gone": True}
     console = Console(width=100, file=io.StringIO(), record=True)
-    console.print(baseline_table(found))
+    console.print(baseline_table(found).rich())
     lines = console.export_text().splitlines()
     assert any("a" in line and "+25 %" in line and "WORSE" in line for line in lines)
     assert any("new" in line and "WORSE" not in line for line in lines)

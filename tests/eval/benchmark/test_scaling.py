@@ -11,8 +11,16 @@ import pytest
 from pathspace_graph import cli
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.benchmark.roads import ScalingSettings, make_drives
-from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, READINGS, measure_scaling
-from pathspace_graph.eval.benchmark.scaling_output import MARKER, scaling_table, stops, write_scaling
+from pathspace_graph.eval.benchmark.scaling import (
+    CONES,
+    LAPS,
+    MARKER,
+    READINGS,
+    measure_scaling,
+    scaling_table,
+    stops,
+    write_scaling,
+)
 
 from ...scenes.timing import SMALL
 

@@ -9,9 +9,15 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.eval.experiment.frame import contrasts, last_laps
-from pathspace_graph.eval.experiment.plots import plot_differences
 from pathspace_graph.eval.experiment.study import Baseline, Study
-from pathspace_graph.eval.experiment.tables import as_latex, as_markdown, as_text, caption, summary_tables
+from pathspace_graph.eval.experiment.tables import (
+    as_latex,
+    as_markdown,
+    as_text,
+    caption,
+    plot_differences,
+    summary_tables,
+)
 
 STUDY = Study(
     tracks=(0, 1, 2, 3),

@@ -15,9 +15,9 @@ from pathspace_graph.eval.experiment.faults import (
     beside_clean,
     fault_table,
     outcomes,
+    plot_faults,
+    write_suite,
 )
-from pathspace_graph.eval.experiment.output import write_suite
-from pathspace_graph.eval.experiment.plots import plot_faults
 from pathspace_graph.eval.experiment.study import Study
 
 NOISE = {

@@ -16,9 +16,9 @@ from pathspace_graph.eval.experiment import cells as drives
 from pathspace_graph.eval.experiment import run as study_run
 from pathspace_graph.eval.experiment.cells import Drive
 from pathspace_graph.eval.experiment.frame import TIMES, without_times
-from pathspace_graph.eval.experiment.output import write_study, write_tables
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study
+from pathspace_graph.eval.experiment.tables import write_study, write_tables
 from pathspace_graph.io.log import Log
 
 from ...scenes.pretenders import Fragile, Pretender, contents, register, write_round_track

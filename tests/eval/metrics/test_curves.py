@@ -107,25 +107,24 @@ def rings(left: float, right: float) -> Truth:
 def test_the_errors_of_a_centre_line() -> None:
     """The map is a ring of 18 m and 22 m; the true centre is 0.2 m to its right, and 0.1 m wider each way."""
     errors = centre_line_errors(ring_map(), rings(18.1, 22.3))
-    assert errors is not None
-    known = ~np.isnan(errors.across)
+    (across, across_sigma), (width, width_sigma) = errors["centre"], errors["half_width"]
+    known = ~np.isnan(across)
     assert known.sum() >= len(known) - 2  # the rings of cones are open curves
-    np.testing.assert_allclose(errors.across[known], -0.2, atol=1e-3)
-    np.testing.assert_allclose(errors.width[known], 0.1, atol=1e-3)
+    np.testing.assert_allclose(across[known], -0.2, atol=1e-3)
+    np.testing.assert_allclose(width[known], 0.1, atol=1e-3)
     line = ring_map().centre_line(1.0)
-    np.testing.assert_array_equal(errors.across_sigma, line.points_sigma)
-    np.testing.assert_allclose(errors.width_sigma, line.width_left_sigma, rtol=0.2)
-    assert (errors.across_sigma < SIGMA).all()
+    np.testing.assert_array_equal(across_sigma, line.points_sigma)
+    np.testing.assert_allclose(width_sigma, line.width_left_sigma, rtol=0.2)
+    assert (across_sigma < SIGMA).all()
 
 
 def test_a_true_boundary_far_away_has_no_errors() -> None:
-    errors = centre_line_errors(ring_map(), rings(18.0, 26.0))
-    assert errors is not None
-    assert np.isnan(errors.across).all()
+    across, _ = centre_line_errors(ring_map(), rings(18.0, 26.0))["centre"]
+    assert np.isnan(across).all()
 
 
 def test_a_map_of_points_has_no_centre_line() -> None:
-    assert centre_line_errors(point_map(), rings(18.0, 22.0)) is None
+    assert centre_line_errors(point_map(), rings(18.0, 22.0)) == {}
 
 
 def test_boundaries_that_cross_each_other_or_themselves_are_counted() -> None:

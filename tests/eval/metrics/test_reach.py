@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.trajectory import MOST, ReachObserver, cycle_reach, reach_values, true_road
+from pathspace_graph.eval.metrics.trajectory import MOST, ReachObserver, reach_values
 from pathspace_graph.factors.se2 import compose, to_map
 from pathspace_graph.io.log import Detections, Odometry, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
@@ -142,14 +142,14 @@ def ring_truth(laps: float) -> Truth:
 
 @pytest.mark.parametrize("laps", [1.0, 1.2, 2.0])
 def test_a_closed_road_goes_on_behind_the_line(laps: float) -> None:
-    road, closed = true_road(ring_truth(laps)), Map(True, {LEFT: ring(18.0), RIGHT: ring(22.0)})
+    road, closed = ReachObserver(ring_truth(laps)), Map(True, {LEFT: ring(18.0), RIGHT: ring(22.0)})
     lap = 2 * np.pi * 20.0
     for station in (10.0, lap - 10.0, laps * lap - 5.0):
         _, pose = road.at(station / 10.0)
-        found = cycle_reach(road, station, pose, pose, closed)
-        assert found.reach == MOST
-        assert found.cones == pytest.approx(2 * 36 * MOST / lap, abs=2)
-        assert np.sqrt(found.squares / found.cones) < 0.1
+        reach, squares, cones = road.reach(station, pose, pose, closed)
+        assert reach == MOST
+        assert cones == pytest.approx(2 * 36 * MOST / lap, abs=2)
+        assert np.sqrt(squares / cones) < 0.1
 
 
 def test_the_values_of_cycles() -> None:
