@@ -201,11 +201,13 @@ def _ray_noise(
 ) -> RayNoise:
     """Return the noise along or across the ray by range, and how long it stays, from `_residuals` (k,)."""
     ranges = cones.ranges[rows]
-    order = np.argsort(ranges)
-    bins = np.array_split(order, max(min(BINS, len(order) // (MIN_ROWS // 2)), 2))
-    middle = np.array([ranges[one].mean() for one in bins])
-    scatter = np.array([(MAD * np.median(np.abs(off[one]))) ** 2 for one in bins])
-    known = np.array([reference[one].mean() for one in bins])
+    order, bins = np.argsort(ranges), np.arange(max(min(BINS, len(rows) // (MIN_ROWS // 2)), 2))
+    counts = len(rows) // len(bins) + (bins < len(rows) % len(bins))  # as equal as can be, by range
+    begins, size = counts.cumsum() - counts, np.abs(off[order])
+    middle, known = (np.add.reduceat(of[order], begins) / counts for of in (ranges, reference))
+    size = size[np.lexsort((size, np.repeat(bins, counts)))]
+    medians = 0.5 * (size[begins + (counts - 1) // 2] + size[begins + counts // 2])
+    scatter = (MAD * medians) ** 2
     sigma = np.sqrt(np.clip(scatter - known, 0.25 * scatter, 4.0 * scatter))
     found = RayNoise(np.maximum(_line(middle, sigma), least))
     cone = cones.table.cone[rows]
@@ -242,14 +244,10 @@ def _staying(cone: IntArray, t: Array, off: Array, reference: Array, sigma: Arra
     lags, correlations = (
         np.bincount(place, values)[enough] / counts[enough] for values in (lag, product / scale)
     )
-    weights = np.sqrt(counts[enough])
-    best = (np.inf, 0.0, 1.0)
-    for time in TIMES:
-        model = np.exp(-lags / time)
-        share = float(np.clip((weights * model) @ correlations / ((weights * model) @ model), 0.0, 1.0))
-        misfit = float((weights * (correlations - share * model) ** 2).sum())
-        best = min(best, (misfit, share, time))
-    return best[1], best[2]
+    weights, model = np.sqrt(counts[enough]), np.exp(-lags / np.array(TIMES)[:, None])  # a row for each time
+    shares = np.clip((weights * model) @ correlations / (weights * model**2).sum(axis=1), 0.0, 1.0)
+    best = int((weights * (correlations - shares[:, None] * model) ** 2).sum(axis=1).argmin())
+    return float(shares[best]), TIMES[best]
 
 
 class Measurement:
