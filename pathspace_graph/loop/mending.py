@@ -91,6 +91,8 @@ class Contradictions:
                 continue
             chosen = chosen[_is_new(loop, label, tracks.points[chosen])]
             chosen = chosen[self._undisputed(label, chosen)]
+            if len(chosen) < CONES:
+                continue
             points, passed = tracks.points[chosen], tracks.last_t[chosen] < t - SETTLE
             for row in (row for row in in_rows(points, ROW) if len(row) >= CONES):
                 if not passed[row].all() and passed[row].sum() < MOST:
