@@ -77,6 +77,12 @@ class SensorSettings:
     """Probability that a detected boundary cone has the other boundary's label."""
     false_positives: float = 0.03
     """Expected number of detections of nothing in a cycle."""
+    range_bias: bool = False
+    """Whether ranges have a systematic error, as those of cameras do."""
+    range_bias_at: tuple[float, ...] = (4.0, 9.0)
+    """Increasing ranges of the given systematic errors (m), which are linear between them."""
+    range_bias_values: tuple[float, ...] = (0.02, 0.34)
+    """Systematic errors at those ranges (m), typical of cameras."""
     slow_range: float = field(default=0.0, repr=False)
     """Share of a range's variance in the slow error of its cone (-)."""
     slow_bearing: float = field(default=0.0, repr=False)
@@ -102,6 +108,10 @@ class SensorSettings:
         least, greatest = self.overlap
         if not 0.0 <= least < greatest:
             raise SettingsError(f"sensor.overlap: expected 0 <= least < greatest, found {self.overlap}")
+        at, values = self.range_bias_at, self.range_bias_values
+        if len(at) != len(values) or not np.all(np.diff(at) > 0):
+            expected = "expected increasing ranges, one for each of range_bias_values"
+            raise SettingsError(f"sensor.range_bias_at: {expected}")
 
     def range_sigmas(self, ranges: FloatArray) -> FloatArray:
         return self.range_sigma + self.range_sigma_growth * ranges
@@ -172,7 +182,9 @@ class ConeSensor:
         hit = chance < np.clip(probability, 0.0, 1.0)
         overlap = np.digitize(np.abs(bearings), settings.overlap) == 1
         rows = np.stack([hit, hit & overlap & (again < settings.duplicates)])
-        ranges = (1.0 + scale) * ranges + bias
+        biased = settings.range_bias and len(settings.range_bias_at) > 0
+        systematic = np.interp(ranges, settings.range_bias_at, settings.range_bias_values) if biased else 0.0
+        ranges = (1.0 + scale) * ranges + bias + systematic
         errors = self._errors(np.stack([first, second]), cones)
         ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]
         bearings = bearings + settings.bearing_sigma * errors[:, 1]

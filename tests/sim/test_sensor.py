@@ -105,7 +105,7 @@ def test_a_switch_of_one_stream_does_not_shift_the_others(track: Track) -> None:
     a = simulate(track, base, 0)
     b = simulate(track, replace(base, odometry=OdometryNoise(white=(1.0, 1.0, 1.0))), 0)
     np.testing.assert_array_equal(rows(a)[0], rows(b)[0])
-    c = simulate(track, replace(base, sensor=SensorSettings(range_sigma=0.3)), 0)
+    c = simulate(track, replace(base, sensor=SensorSettings(range_bias=True)), 0)
     np.testing.assert_array_equal(a.odometry.twist, c.odometry.twist)
     np.testing.assert_array_equal(truth_of(a)[1], truth_of(c)[1])
     d = simulate(track, replace(base, sensor=SensorSettings(false_positives=0.0)), 0)
@@ -217,6 +217,17 @@ def test_false_positives_are_in_the_field_at_their_rate() -> None:
     assert set(labels.tolist()) == {LEFT, RIGHT}
 
 
+def test_range_bias_can_be_switched_on() -> None:
+    cones = np.array([[3.0, 0.0], [12.0, 0.0]])
+    for bias, expected in ((False, [0.0, 0.0]), (True, [0.02, 0.34])):
+        settings = replace(CLEAN, range_bias=bias, detection_falloff=0.0, detection_probability=1.0)
+        sensor = ConeSensor(cones, np.zeros(2, dtype=int), settings, np.random.default_rng(0))
+        measured = [
+            np.linalg.norm(sensor.detect(0.0, np.zeros(3))[0].points_vehicle, axis=1) for _ in range(2000)
+        ]
+        np.testing.assert_allclose(np.mean(measured, axis=0) - [3.0, 12.0], expected, atol=0.015)
+
+
 def test_detections_at_odd_rates_are_posed_between_odometry_stamps(track: Track) -> None:
     sensor = replace(CLEAN, rate=13.0, range_sigma=1e-6, range_sigma_growth=0.0, bearing_sigma=1e-7)
     log = simulate(track, SimulationSettings(laps=1, sensor=sensor), 0)
@@ -238,6 +249,7 @@ def test_bad_settings(track: Track) -> None:
         {"rate": 0.0},
         {"wrong_colour": 1.5},
         {"bearing_sigma": 0.0},
+        {"range_bias_at": (1.0,)},
         {"fov": 7.0},
     ):
         with pytest.raises(SettingsError, match="sensor"):
