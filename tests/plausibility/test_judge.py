@@ -167,5 +167,5 @@ def test_files_of_different_clocks_are_told() -> None:
 
 
 def test_every_kind_of_good_log_has_settings_of_its_own() -> None:
-    kinds = [(kind.simulation, kind.edit, kind.open_road) for kind in GOOD.values()]
+    kinds = [(kind.overrides, kind.road, kind.edit) for kind in GOOD.values()]
     assert all(kinds.count(kind) == 1 for kind in kinds)
