@@ -136,7 +136,7 @@ class Batch:
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
     start: Start | None = None
-    """Where the optimization begins: an online map, or odometry alone; by default as `batch.start` says."""
+    """Where the optimization begins; by default as `batch.start` says."""
     settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
     """Settings of the estimator."""
 
@@ -152,8 +152,7 @@ class Batch:
             estimator = make_batch(name, self.settings, log)
             options = (self.start, advance) if isinstance(estimator, BatchMapper) else ()
             result: BatchRun = estimator.solve(log, *options)
-        start = self.start or self.settings.batch.start
-        write_result(self.out, result, summarize_batch(result, log, start, hints))
+        write_result(self.out, result, summarize_batch(result, log, hints))
         report(result, log)
         say(f"written to {self.out}")
         known = result if isinstance(result, BatchResult) else None
@@ -165,8 +164,9 @@ class Batch:
             raise SystemExit(NOT_CONVERGED)
 
 
-def summarize_batch(result: BatchRun, log: Log, start: Start, hints: Sequence[Hint] = ()) -> dict[str, Any]:
-    """Return the summary of a run, how its optimization ended, and its gap from its online start."""
+def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
+    """Return the summary of a run, how its optimization began and ended, and its gap from an online start."""
+    start = "odometry" if isinstance(result, BatchResult) and result.online is None else "online"
     summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
         return summary

@@ -180,6 +180,7 @@ def test_the_command_writes_its_result(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert summary["convergence"]["converged"]
     assert set(summary["gap"]["curves"]) == {"left", "right"}
+    assert summary["start"] == "online"
     assert read_map(tmp_path / "map").closed
 
 
@@ -195,6 +196,7 @@ def test_a_run_that_did_not_converge_is_written_and_reported(
     summary = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert not summary["convergence"]["converged"]
     assert summary["convergence"]["reason"] == "no round left"
+    assert (summary["start"], summary["gap"]) == ("odometry", None)
     assert read_map(tmp_path / "map").size > 0
 
 
