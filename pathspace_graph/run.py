@@ -192,9 +192,9 @@ class Stopwatch:
         return sum(self.laps.values())
 
     def lap(self, name: str) -> None:
-        """Assign the time since the last call to the stage `name`."""
+        """Add the time since the last call to the stage `name`."""
         now = time.perf_counter()
-        self.laps[name] = now - self._last
+        self.laps[name] = self.laps.get(name, 0.0) + now - self._last
         self._last = now
 
 

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_info
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import LEFT
-from pathspace_graph.run import CycleResult, ObservedCycle, run_online, split_odometry
+from pathspace_graph.run import CycleResult, ObservedCycle, Stopwatch, run_online, split_odometry
 
 
 def detections(t: float) -> Detections:
@@ -258,3 +258,13 @@ class Forbidden:
 def test_the_truth_is_not_read() -> None:
     log = replace(make_log(np.array([0.0]), np.arange(5) / 10), truth=Forbidden())
     assert len(run_online(log, Counting()).cycles) == 5
+
+
+def test_a_stage_that_comes_twice_keeps_the_time_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter([0.0, 1.0, 3.0, 6.0])
+    monkeypatch.setattr("pathspace_graph.run.time.perf_counter", lambda: next(times))
+    watch = Stopwatch()
+    for stage in ("optimum", "start", "optimum"):
+        watch.lap(stage)
+    assert watch.laps == {"optimum": 4.0, "start": 2.0}
+    assert watch.spent == 6.0
