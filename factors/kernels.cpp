@@ -727,7 +727,8 @@ Ints spread(const Ints& starts, const Ints& widths) {
   return out;
 }
 
-py::tuple laid_out(const Ints& keys, Index sensor_key, Index first_pose, const py::tuple& sizes) {
+py::tuple laid_out(const Ints& keys, Index sensor_key, Index first_pose, const py::tuple& sizes,
+                   const Ints& bounds) {
   const Index count = keys.shape(0);
   const Index point = sizes[0].cast<Index>(), sensor = sizes[1].cast<Index>(), pose = sizes[2].cast<Index>();
   Ints widths(count), starts(count);
@@ -737,7 +738,12 @@ py::tuple laid_out(const Ints& keys, Index sensor_key, Index first_pose, const p
     starts.mutable_data()[i] = total;
     total += widths.mutable_data()[i] = key >= first_pose ? pose : key == sensor_key ? sensor : point;
   }
-  return py::make_tuple(widths, starts, total);
+  py::list begins(bounds.shape(0));
+  for (Index b = 0; b < bounds.shape(0); ++b) {
+    const Index place = std::lower_bound(keys.data(), keys.data() + count, bounds.data()[b]) - keys.data();
+    begins[b] = place < count ? starts.data()[place] : total;
+  }
+  return py::make_tuple(widths, starts, total, begins);
 }
 
 // --- detections -------------------------------------------------------------------------------------------

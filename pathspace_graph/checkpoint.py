@@ -21,7 +21,7 @@ Copier = Callable[[Any, Memo], Any]
 class Recovery:
     """Return of an estimator to what it was before its newest call, by a copy and the calls since then."""
 
-    EVERY: Final = 50  # number of calls from one copy to the next, so that its time hardly counts
+    EVERY: Final = 100  # number of calls from one copy to the next, so that its time hardly counts
 
     def __init__(self, failures: int = 0) -> None:
         self.failures = failures

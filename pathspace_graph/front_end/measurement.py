@@ -30,6 +30,7 @@ FIRST_ACROSS: Final = (0.05, 0.016)  # noise that the iteration begins with: m a
 PASSES: Final = 4  # times that cones are followed
 FOLLOWED: Final = 40  # cycles in which cones are followed in a step
 ROUNDS: Final = 5  # times that errors, noise and weights are found in turn
+ROUNDS_AGAIN: Final = 3  # the same from noise that was found before, which is as close to convergence
 STRETCH: Final = 3.0  # time (s) over which errors of the odometry are alike
 COUNTED: Final = 0.8  # share of `MAX_RANGE` beyond which cones are followed only where they seem nearer
 HARDLY: Final = 1e-6  # weight of sightings beyond: a cone seen only there still has a place
@@ -289,8 +290,11 @@ class Measurement:
         self._cones = _cones(self._sightings[0])
         if self._cones is None:
             return self._passed(self._found)
-        self._noise = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
-        self._weights, self._rounds = np.ones(len(self._cones.ranges)), ROUNDS
+        self._weights, along, across = np.ones(len(self._cones.ranges)), self._found.along, self._found.across
+        if along is None or across is None:
+            self._noise, self._rounds = (RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))), ROUNDS
+        else:
+            self._noise, self._rounds = (along, across), ROUNDS_AGAIN
         return None
 
     def _round(self, cones: _Cones) -> MeasuredNoise | None:

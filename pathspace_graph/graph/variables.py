@@ -105,21 +105,22 @@ def are_poses(keys: IntArray) -> BoolArray:
 
 def sizes(keys: IntArray) -> IntArray:
     """Return the number of entries of each key's variable, which its letter determines."""
-    return _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES)[0]
+    return _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES, _LETTER_ENDS)[0]
 
 
 @compiled
 def _laid_out(
-    keys: IntArray, sensor_key: int, first_pose: int, sizes: tuple[int, int, int]
-) -> tuple[IntArray, IntArray, int]:
+    keys: IntArray, sensor_key: int, first_pose: int, sizes: tuple[int, int, int], bounds: IntArray
+) -> tuple[IntArray, IntArray, int, list[int]]:
     """Return the widths (k,) and the first columns (k,) of variables, and their number of columns.
 
-    The sizes are those of a point, of the sensor's calibration, and of a pose.
+    The sizes are those of a point, of the sensor's calibration, and of a pose. The last result has the column
+    from which on the variables have keys of at least each of the bounds.
     """
     point, sensor, pose = sizes
     widths = np.where(keys >= first_pose, pose, np.where(keys == sensor_key, sensor, point))
-    ends = widths.cumsum()
-    return widths, ends - widths, int(widths.sum())
+    ends = np.append(0, widths.cumsum())
+    return widths, ends[:-1], int(ends[-1]), ends[keys.searchsorted(bounds)].tolist()
 
 
 def name(key: int) -> str:
@@ -146,7 +147,8 @@ class Layout:
 
     def __init__(self, keys: IntArray) -> None:
         self.keys = keys
-        self.widths, self.starts, self.size = _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES)
+        laid_out = _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES, _LETTER_ENDS)
+        self.widths, self.starts, self.size, self._letter_ends = laid_out
         """Each key has this number of columns (K,), and begins at this one (K,)."""
 
     @cached_property
@@ -193,12 +195,8 @@ class Layout:
 
     def block(self, letter: str) -> slice:
         """Return the columns of all keys of a letter."""
-        return self._blocks[letter]
-
-    @cached_property
-    def _blocks(self) -> dict[str, slice]:
-        begins = np.append(self.starts, self.size)[self.keys.searchsorted(_LETTER_ENDS)].tolist()
-        return dict(zip(_LETTERS, map(slice, begins[::2], begins[1::2]), strict=True))
+        first = 2 * _LETTERS.index(letter)
+        return slice(*self._letter_ends[first : first + 2])
 
     def begin(self, key: int) -> int:
         """Return the first column of a key, or where it would be if the layout held the key."""

@@ -136,7 +136,7 @@ class KnownLoop:
         if self._laid_out is None or self._laid_out[0] != boundaries:
             values = state.variables.values.copy()
             self._smoother.refresh()
-            self._laid_out = boundaries, lay_out_loop(state, self.is_mapped)
+            self._laid_out = boundaries, lay_out_loop(state, self._lie_between_cones)
             state.variables.values[:] = values
         return self._laid_out[1]
 
@@ -151,7 +151,12 @@ class KnownLoop:
         return [label for label, mapped in self.get().mapped.items() if not mapped.all()]
 
     def is_mapped(self, label: int, u: Array) -> BoolArray:
-        """Return which parameters (m,) of a boundary lie between cones that were detected."""
+        """Return which parameters (m,) of a boundary are nearest to a sample between cones that were detected."""
+        low = self._smoother.map.state.boundaries[label].tables.low
+        nearest = np.rint((u - low) / SAMPLE).astype(np.intp)
+        return self.get().mapped[label].take(nearest, mode="wrap")
+
+    def _lie_between_cones(self, label: int, u: Array) -> BoolArray:
         track = self._smoother.map
         cones, length = track.cones.get(label, np.zeros(0)), track.state.boundaries[label].length
         return is_mapped(u, cones, length, GAP, track.settings.growth.merge_radius)

@@ -39,7 +39,7 @@ CERTAIN: Final = 1.0  # most sigma of a detection that may contradict the map (m
 ROW: Final = 11.0  # most distance of neighbours in a row (m): two regular gaps, since one cone may be missed
 SETTLE: Final = 1.5  # time without detections of its cones after which the vehicle has passed a stretch (s)
 MOST: Final = 20  # number of contradictions passed after which enough of a stretch is seen, whatever the time
-INTERVAL: Final = 0.5  # time after which contradictions are looked for again (s)
+INTERVAL: Final = 1.0  # time after which contradictions are looked for again (s)
 ATTEMPTS: Final = 8  # largest number of attempts to mend a map
 EXPLAINED: Final = 0.5  # least share of the contradictions that a mended map explains, or the old one stays
 
@@ -64,8 +64,9 @@ class Contradictions:
         detections, rows = track.detections, np.arange(new.start, new.stop)
         unexplained = ~detections.used[new]
         for label in known.with_gaps():
-            on = rows[detections.boundary[new] == label]
-            unexplained[on - new.start] |= ~known.is_mapped(label, detections.u[on])
+            on = np.flatnonzero(detections.used[new] & (detections.boundary[new] == label))
+            if len(on):
+                unexplained[on] = ~known.is_mapped(label, detections.u[rows[on]])
         rows = rows[unexplained]
         if len(rows):
             covariances = detections.covariances_map(rows, track.variables)

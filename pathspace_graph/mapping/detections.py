@@ -50,14 +50,18 @@ class DetectionColumns:
         """
         counts = [len(one.labels) for one in cycles]
         moving = np.zeros((len(cycles), 3)) if twists is None else twists
-        table = cls(
-            cycle=first + np.repeat(np.arange(len(cycles)), counts),
-            measured=np.concatenate([np.zeros((0, 2)), *(one.points_vehicle for one in cycles)]),
-            twist=np.repeat(moving, counts, axis=0),
-            covariance=np.concatenate([np.zeros((0, 2, 2)), *(one.covariances for one in cycles)]),
-            label=np.concatenate([np.zeros(0, np.intp), *(one.labels for one in cycles)]).astype(np.intp),
-            changed=np.zeros(sum(counts), bool),
+        return cls._unused(
+            first + np.repeat(np.arange(len(cycles)), counts),
+            np.concatenate([np.zeros((0, 2)), *(one.points_vehicle for one in cycles)]),
+            np.repeat(moving, counts, axis=0),
+            np.concatenate([np.zeros((0, 2, 2)), *(one.covariances for one in cycles)]),
+            np.concatenate([np.zeros(0, np.intp), *(one.labels for one in cycles)]),
         )
+
+    @classmethod
+    def _unused(cls, cycle: IntArray, measured: Array, twist: Array, covariance: Array, label: IntArray) -> Self:
+        """Build the table of columns whose detections are not in use."""
+        table = cls(cycle, measured, twist, covariance, label.astype(np.intp), np.zeros(len(cycle), bool))
         table._clear_associations()
         return table
 
@@ -69,12 +73,16 @@ class DetectionColumns:
 
         The vehicle moved with this twist (3,), in m/s, m/s and rad/s; by default it stood still.
         """
-        start, columns = int(self.cycle.searchsorted(cycle, side="right")), vars(self)
-        new = vars(type(self).of([detections], cycle, None if twist is None else twist[None]))
+        start, count = int(self.cycle.searchsorted(cycle, side="right")), len(detections.labels)
+        twists = np.zeros((count, 3))
+        if twist is not None:
+            twists[:] = twist
+        measured = detections.points_vehicle, twists, detections.covariances, detections.labels
+        columns, new = vars(self), vars(self._unused(np.full(count, cycle), *measured))
         for column in self._columns():
             known = columns[column]
             columns[column] = np.concatenate([known[:start], new[column], known[start:]])
-        return slice(start, start + len(detections.labels))
+        return slice(start, start + count)
 
     @classmethod
     @cache

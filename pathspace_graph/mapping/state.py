@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from operator import is_
 from typing import Final, Self
 
 import numpy as np
@@ -63,13 +64,10 @@ class Curves:
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
         """Return whether boundaries, whose active control points are all unless given, are these curves."""
-        if len(boundaries) != len(self.boundaries):
-            return False
-        laid_out = zip(self.tables, self.active, strict=True)
-        for (label, boundary), (tables, indices) in zip(boundaries.items(), laid_out, strict=True):
-            if boundary.tables is not tables or active.get(label, boundary.everything) is not indices:
-                return False
-        return True
+        tables = [boundary.tables for boundary in boundaries.values()]
+        stretches = [active.get(label, boundary.everything) for label, boundary in boundaries.items()]
+        known = *self.tables, *self.active
+        return len(tables) == len(self.tables) and all(map(is_, (*tables, *stretches), known))
 
     @cached_property
     def pairs(self) -> tuple[IntArray, Array, IntArray, IntArray]:

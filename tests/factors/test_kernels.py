@@ -164,7 +164,7 @@ CASES: dict[str, Arguments] = {
         rng.integers(0, 9, COUNT),
         np.array([2, 3, 7, 20]),
     ),
-    "laid_out": lambda rng: (np.sort(rng.integers(0, 50, COUNT)), 5, 40, (2, 5, 3)),
+    "laid_out": lambda rng: (np.sort(rng.integers(0, 50, COUNT)), 5, 40, (2, 5, 3), np.arange(0, 60, 7)),
     "columns_of": some_columns,
     "spread": lambda rng: (rng.integers(0, 99, COUNT), rng.integers(0, 4, COUNT)),
     "by_sensor": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng)),

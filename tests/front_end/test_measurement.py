@@ -18,6 +18,7 @@ from pathspace_graph.front_end.measurement import (
     MODEL_ERROR,
     PASSES,
     ROUNDS,
+    ROUNDS_AGAIN,
     Measurement,
     measure,
 )
@@ -165,4 +166,4 @@ def test_in_steps_it_is_the_same_and_none_is_long() -> None:
         steps += 1
     np.testing.assert_array_equal(found.sensor, whole.sensor)
     follows = -(-len(cycles) // FOLLOWED)
-    assert steps + 1 == PASSES * (follows + ROUNDS)
+    assert steps + 1 == PASSES * follows + ROUNDS + (PASSES - 1) * ROUNDS_AGAIN
