@@ -290,11 +290,11 @@ class Measurement:
         self._cones = _cones(self._sightings[0])
         if self._cones is None:
             return self._passed(self._found)
-        self._weights, along, across = np.ones(len(self._cones.ranges)), self._found.along, self._found.across
+        along, across, self._rounds = self._found.along, self._found.across, ROUNDS_AGAIN
         if along is None or across is None:
-            self._noise, self._rounds = (RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))), ROUNDS
-        else:
-            self._noise, self._rounds = (along, across), ROUNDS_AGAIN
+            along, across = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
+            self._rounds = ROUNDS
+        self._noise, self._weights = (along, across), np.ones(len(self._cones.ranges))
         return None
 
     def _round(self, cones: _Cones) -> MeasuredNoise | None:

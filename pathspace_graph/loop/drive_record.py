@@ -27,6 +27,7 @@ from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
@@ -70,7 +71,9 @@ class DriveRecord:
         self.unsolvable: str | None = None  # why the drive cannot be solved as a batch; None if it can be
         self.poses: list[Array] = []  # (3,) of each cycle, map frame, as of then or the newest batch
         self.stamps: list[float] = []  # stamp of each cycle (s)
-        self._readings: list[Reading] = []  # whose detections have their stated covariances
+        self._motions: list[MeasuredMotion] = []  # that lead to each cycle
+        self._seen: list[Detections] = []  # of each cycle, with their stated covariances
+        self._orange: list[Detections] = []  # those of orange cones
         self._beside: dict[int, list[float]] = {}  # parameter on each curve by cycle, NaN before it
         self._reckoned: list[Array] = []
         self._prepared = False
@@ -79,15 +82,17 @@ class DriveRecord:
         """Drop the measurements, since the lap cannot be solved for this reason."""
         if self.unsolvable is None:
             self.unsolvable = reason
-        self._readings = []
+        self._motions, self._seen, self._orange = [], [], []
 
     def measured(self, reading: Reading) -> None:
         """Add the motion that leads to a pose, and the detections there with their stated covariances."""
         self.stamps.append(reading.detections.t)
         if self.unsolvable is not None:
             return
-        stated = replace(reading.detections, covariances=reading.stated)
-        self._readings.append(replace(reading, detections=stated))
+        seen = reading.detections
+        self._motions.append(reading.motion)
+        self._seen.append(Detections(seen.t, seen.points_vehicle, reading.stated, seen.labels))
+        self._orange.append(reading.orange)
         last = self._reckoned[-1] if self._reckoned else np.zeros(3)
         self._reckoned.append(_kept(compose(last, reading.motion.odometry.delta)))
         if len(self.stamps) > self.settings.open_lap.max_cycles:
@@ -96,8 +101,7 @@ class DriveRecord:
     def measured_late(self, cycle: int, detections: Detections) -> None:
         """Add detections to those of an earlier cycle, as they would be seen from its pose."""
         if self.unsolvable is None:
-            known = self._readings[cycle]
-            self._readings[cycle] = replace(known, detections=_together(known.detections, detections))
+            self._seen[cycle] = _together(self._seen[cycle], detections)
 
     def estimated(self, state: State) -> None:
         """Add the newest pose, and its parameter on each of the curves."""
@@ -123,9 +127,8 @@ class DriveRecord:
 
     def seen(self, cycle: int, sensor: Array) -> Detections:
         """Return all detections of a cycle, corrected by the calibration (5,) of the sensor, or (0,)."""
-        reading = self._readings[cycle]
-        seen = _together(self._noise.for_map(reading.detections), reading.orange)
-        twists = np.tile(reading.motion.odometry.twist, (len(seen.labels), 1))
+        seen = _together(self._noise.for_map(self._seen[cycle]), self._orange[cycle])
+        twists = np.tile(self._motions[cycle].odometry.twist, (len(seen.labels), 1))
         return replace(seen, points_vehicle=corrected(seen.points_vehicle, twists, sensor))
 
     def recurrence(self) -> Recurrence | None:
@@ -159,8 +162,7 @@ class DriveRecord:
 
     def lap(self, first_kept: int, start: ClosedMap | Recurrence, settings: MapperSettings) -> OpenLap:
         """Return the lap; the priors of its calibrations are those of the settings, which may be wide."""
-        measured = [one.motion for one in self._readings], [one.detections for one in self._readings]
-        motions, detections = self._noise.for_lap(*measured)
+        motions, detections = self._noise.for_lap(self._motions, self._seen)
         chain = chained(self.stamps, motions, settings.odometry)
         return OpenLap(settings, chain, DetectionTable.of(detections, twists=chain.twists), first_kept, start)
 

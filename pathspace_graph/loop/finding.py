@@ -151,7 +151,7 @@ class KnownLoop:
         return [label for label, mapped in self.get().mapped.items() if not mapped.all()]
 
     def is_mapped(self, label: int, u: Array) -> BoolArray:
-        """Return which parameters (m,) of a boundary are nearest to a sample between cones that were detected."""
+        """Return which parameters (m,) of a boundary lie between detected cones, to the nearest sample."""
         low = self._smoother.map.state.boundaries[label].tables.low
         nearest = np.rint((u - low) / SAMPLE).astype(np.intp)
         return self.get().mapped[label].take(nearest, mode="wrap")

@@ -59,7 +59,9 @@ class DetectionColumns:
         )
 
     @classmethod
-    def _unused(cls, cycle: IntArray, measured: Array, twist: Array, covariance: Array, label: IntArray) -> Self:
+    def _unused(
+        cls, cycle: IntArray, measured: Array, twist: Array, covariance: Array, label: IntArray
+    ) -> Self:
         """Build the table of columns whose detections are not in use."""
         table = cls(cycle, measured, twist, covariance, label.astype(np.intp), np.zeros(len(cycle), bool))
         table._clear_associations()
