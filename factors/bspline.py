@@ -230,6 +230,11 @@ class SpanPolynomials:
         return self.high - self.low
 
     @property
+    def size(self) -> int:
+        """Return the number of distinct control points."""
+        return len(self.starts) if self.periodic else len(self.starts) + self.degree
+
+    @property
     def occupied(self) -> int:
         """Return the number of spans up to the last one that is not empty."""
         return len(self._breaks) + 1

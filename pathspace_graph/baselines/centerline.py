@@ -15,11 +15,11 @@ from pathspace_graph.batch.start import CurveMapper
 from pathspace_graph.batch.system import CurveGauge
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.gtsam_factors import pose_array, ribbon_factor
+from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.graph.gaussian import sparse_marginal
-from pathspace_graph.graph.variables import POSE, pose_key
+from pathspace_graph.graph.variables import POSE, pose_key, pose_keys
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, LapBatches, RunNoise, VehicleState
@@ -127,34 +127,30 @@ def ribbon_keys(ribbon: Ribbon) -> list[int]:
     return [int(gtsam.symbol(RIBBON_LETTER, j)) for j in range(ribbon.size)]
 
 
-def edge_factors(
-    start: BatchResult, line: CentreCurve, settings: MapperSettings
-) -> Iterator[gtsam.CustomFactor]:
-    """Yield a factor for each cycle with detections that the batch of both boundaries uses."""
-    table, parts = start.system.detections, []
+def edge_factors(start: BatchResult, line: CentreCurve, settings: MapperSettings) -> list[gtsam.CustomFactor]:
+    """Return a factor for each cycle with detections that the batch of both boundaries uses."""
+    table, variables, parts = start.system.detections, start.optimum.state.variables, []
     for side, (label, projected) in enumerate(start.optimum.projected.items()):
         used = start.system.scale(projected) > 0.0
         u = line.ribbon_parameters(side, projected.foot.u[used])
         parts.append((projected.rows[used], np.full(len(u), SIDE[label]), u))
     rows, sides, u = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.argsort(rows)
-    for own in np.split(order, np.flatnonzero(np.diff(table.cycle[rows[order]])) + 1):
-        if len(own):
-            row = rows[own]
-            yield ribbon_factor(
-                pose_key(table.cycle[row[0]]),
-                ribbon_keys(line.ribbon),
-                line.ribbon.tables,
-                points_vehicle=table.measured[row],
-                covariances=table.covariance[row],
-                sides=sides[own],
-                low=u[own] - ROOM,
-                high=u[own] + ROOM,
-                sigma_model=settings.batch.sigma_model,
-                huber=settings.gate.huber,
-                sensor_key=start.optimum.state.variables.sensor_key,
-                twists=table.twist[row],
-            )
+    rows, u = rows[order], u[order]
+    return spline_projection_factors(
+        pose_keys(table.cycle[rows]),
+        ribbon_keys(line.ribbon),
+        line.ribbon.tables,
+        points_vehicle=table.measured[rows],
+        covariances=table.covariance[rows],
+        low=u - ROOM,
+        high=u + ROOM,
+        sigma_model=settings.batch.sigma_model,
+        huber=settings.gate.huber,
+        sensor_key=variables.sensor_key,
+        twists=table.twist[rows],
+        sides=sides[order],
+    )
 
 
 def shape_factors(ribbon: Ribbon, poses: Array, settings: MapperSettings) -> Iterator[gtsam.CustomFactor]:

@@ -12,8 +12,8 @@ from scipy.linalg import block_diag
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import scatter
 from pathspace_graph.factors.residuals import project
-from pathspace_graph.factors.se2 import rotation, to_map, to_vehicle
-from pathspace_graph.factors.sensor import SENSOR_SIZE, in_vehicle
+from pathspace_graph.factors.se2 import in_vehicle, rotation, to_map, to_vehicle
+from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN

@@ -146,7 +146,7 @@ class HeldMap:
 
 def jacobian_factor(keys: IntArray, A: Array, b: Array) -> gtsam.GaussianConditional:
     """Return the factor `1/2 |A d - b|^2` on any number of keys (k,), with whitened A (m, n), b (m,)."""
-    return linear_factor(keys.tolist(), sizes(keys).tolist(), A, b)
+    return linear_factor(keys, sizes(keys), A, b)
 
 
 def absolute_factor(
