@@ -25,10 +25,7 @@ def domain(knots: Array, degree: int) -> tuple[float, float]:
 
 
 def wrap(knots: Array, degree: int, u: Array) -> Array:
-    """Return u modulo the period, inside the domain of a periodic spline.
-
-    The right end of the domain is reached by round-off only.
-    """
+    """Return u modulo the period, in the domain of a periodic spline; its right end by round-off only."""
     low, high = domain(knots, degree)
     period = high - low
     wrapped = u - period * np.floor((u - low) / period)
@@ -38,8 +35,7 @@ def wrap(knots: Array, degree: int, u: Array) -> Array:
 def find_span(knots: Array, degree: int, u: Array) -> IntArray:
     """Return the span i (m,), in [p, n - 1], of each u (m,), so that knots[i] <= u < knots[i + 1].
 
-    Values of u outside the domain are treated as if they were clipped to it. The right end of the domain
-    belongs to the last non-empty span. knots has shape (n + p + 1,).
+    u is clipped to the domain, whose right end belongs to the last non-empty span.
     """
     end = len(knots) - degree - 1
     last = int(np.searchsorted(knots[degree:end], knots[end], side="left")) - 1
@@ -104,9 +100,9 @@ def divisors(width: Array) -> Array:
 
 
 def scatter(values: Array, first: IntArray, size: int, periodic: bool = False) -> Array:
-    """Return dense rows (m, size) of local values (m, p + 1), whose first columns belong to `first` (m,).
+    """Return dense rows (m, size) of local values (m, p + 1), which begin in the columns `first` (m,).
 
-    Columns of a periodic spline are taken modulo `size`, and values that fall on the same column are added.
+    Columns of a periodic spline are taken modulo `size`, and values in the same column are added.
     """
     matrix = np.zeros((len(values), size))
     columns = first[:, None] + np.arange(values.shape[1])
@@ -133,48 +129,35 @@ def clamped_knots(breaks: Array, degree: int) -> Array:
 
 
 def periodic_knots(breaks: Array, degree: int) -> Array:
-    """Return one period of m + 1 > p breaks with p more knots on either side.
-
-    They are the knots of m + p unwrapped control points.
-    """
+    """Return one period of m + 1 > p breaks with p more on either side: knots of m + p control points."""
     period = breaks[-1] - breaks[0]
     before = breaks[-1 - degree : -1] - period
     after = breaks[1 : degree + 1] + period
     return np.concatenate([before, breaks, after])
 
 
-_PERIODS_LAID_OUT: Final = (-1.0, 0.0, 1.0)
-"""A periodic curve lies on the axis of `Spans` once for each of these shifts, in periods."""
-_GAP_OF_CURVES: Final = 1.0
-"""Curves on the axis of `Spans` are at least this far apart, in units of the parameter."""
+_PERIODS_LAID_OUT: Final = (-1.0, 0.0, 1.0)  # shifts at which a periodic curve lies on the axis of `Spans`
+_GAP_OF_CURVES: Final = 1.0  # least distance of curves on the axis of `Spans`, in units of the parameter
 
 
 @dataclass(frozen=True, eq=False)
 class SpanPolynomials:
-    """Basis functions on each span as polynomials of s = (u - t_i) / (t_{i+1} - t_i).
+    """Basis functions as polynomials of s = (u - t_i) / (t_{i+1} - t_i): the values of `basis`, faster."""
 
-    It gives the same values as `basis`, but faster.
-    """
-
-    knots: Array
-    """The knots (n + p + 1,) do not decrease; they are unwrapped where the curve is periodic."""
+    knots: Array  # (n + p + 1,) not decreasing, and unwrapped where the curve is periodic
     degree: int
-    periodic: bool = False
-    """If true, parameters are taken modulo the length of the domain instead of being clipped to it."""
-    known: Array | None = field(default=None, repr=False)
-    """Coefficients of the first spans, which are taken over instead of being computed again."""
+    periodic: bool = False  # parameters are taken modulo the length of the domain instead of being clipped
+    known: Array | None = field(default=None, repr=False)  # coefficients of the first spans
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", np.ascontiguousarray(self.knots, dtype=np.float64))
 
     @cached_property
     def low(self) -> float:
-        """Left end of the domain."""
         return domain(self.knots, self.degree)[0]
 
     @cached_property
     def high(self) -> float:
-        """Right end of the domain."""
         return domain(self.knots, self.degree)[1]
 
     @cached_property
@@ -246,10 +229,7 @@ class SpanPolynomials:
         return np.minimum(np.maximum(u, self.low), self.high)
 
     def locate(self, u: Array) -> tuple[IntArray, Array]:
-        """Return the span number span - p (m,), in [0, n - p), and s (m,), in [0, 1], of each u (m,).
-
-        u is wrapped or clipped first.
-        """
+        """Return the span number (m,), in [0, n - p), and s (m,), in [0, 1], of each u (m,), put `inside`."""
         inside = self.inside(u)
         number = self._breaks.searchsorted(inside, side="right")
         return number, (inside - self.starts.take(number)) * self.inverse_widths.take(number)
@@ -261,10 +241,7 @@ class SpanPolynomials:
         return int(self._breaks.searchsorted(min(max(u, self.low), self.high), side="right"))
 
     def evaluate(self, u: Array, derivatives: int = 0) -> tuple[Array, IntArray]:
-        """Return values (derivatives + 1, m, p + 1) and spans (m,) as `basis` does, by Horner's rule.
-
-        u is wrapped or clipped first.
-        """
+        """Return values (derivatives + 1, m, p + 1) and spans (m,) as `basis` does; u is put `inside`."""
         number, s = self.locate(u)
         values = horner(self._stack(derivatives).take(number, axis=1), s[:, None])
         by_order = values.reshape(len(s), derivatives + 1, self.degree + 1).transpose(1, 0, 2)
@@ -285,37 +262,25 @@ class SpanPolynomials:
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """Spans of several curves of one degree, laid out one curve after the other on an axis v.
+    """Spans of several curves of one degree on one axis v: rows on any of them are evaluated in one call.
 
-    Rows on any of the curves are then located and evaluated in one call. Parameter u of curve k lies at
-    `v = u + shift[k]`. A periodic curve is laid out for three periods, so that a stretch across the seam need
-    not be wrapped.
+    Parameter u of curve k lies at `v = u + shift[k]`. A periodic curve is laid out for three periods, so that
+    a stretch across the seam need not be wrapped.
     """
 
     degree: int
-    periodic: bool
-    """If true, all curves are closed; otherwise none is."""
+    periodic: bool  # all curves are closed, or none is
     low: Array
-    high: Array
-    """Limits (k,) of the curves' domains on the axis."""
-    shift: Array
-    """Each shift (k,) leads from a curve's own parameter to the axis; it is zero for the first curve."""
-    interval: Array
-    """Mean knot intervals (k,) of the curves."""
-    first: int
-    """The control points of the first curve begin at this place of the common array."""
-    columns: IntArray
-    """Each row (n, p + 1) holds the control points that matter on a span."""
-    starts: Array
-    """Left ends (l,) of the spans, in order: l is n, or 3 n for periodic curves."""
-    inverse_widths: Array
-    """Each entry (l,) is one over the width of a span."""
-    number: IntArray
-    """Each entry (l,) is the number of the span, in [0, n)."""
-    by_span: Array
-    """The array (n, 3 (p + 1), p + 1) holds the polynomials of the basis and of two derivatives."""
-    values: Array
-    """The array (p + 1, n, p + 1) holds the polynomials of the basis, power after power."""
+    high: Array  # limits (k,) of the curves' domains on the axis
+    shift: Array  # (k,) from a curve's own parameter to the axis; zero for the first curve
+    interval: Array  # (k,) mean knot intervals
+    first: int  # where the control points of the first curve begin in the common array
+    columns: IntArray  # (n, p + 1) control points that matter on each span
+    starts: Array  # (l,) left ends of the spans, in order: l is n, or 3 n for periodic curves
+    inverse_widths: Array  # (l,) one over the width of each span
+    number: IntArray  # (l,) number of each span, in [0, n)
+    by_span: Array  # (n, 3 (p + 1), p + 1) polynomials of the basis and of two derivatives
+    values: Array  # (p + 1, n, p + 1) polynomials of the basis, power after power
 
     def locate(self, v: Array) -> tuple[IntArray, Array]:
         """Return the span number in [0, n), and s in [0, 1], of each place v (m,) on the axis."""
@@ -349,9 +314,8 @@ def lay_out(
 ) -> Spans:
     """Return the spans of curves, all periodic or none, laid out on one axis.
 
-    The control points of each curve begin at its entry of `offsets` in a common array. Where `sizes` is
-    given, the array holds this many distinct control points of each periodic curve; otherwise it holds
-    unwrapped ones.
+    The control points of each curve begin at its entry of `offsets` in a common array, which holds unwrapped
+    ones, or as many distinct ones of each periodic curve as `sizes` tells.
     """
     periodic, counts = curves[0].periodic, [curve.occupied for curve in curves]
     periods = np.array(_PERIODS_LAID_OUT) if periodic else np.zeros(1)
@@ -385,10 +349,7 @@ def lay_out(
 
 
 def _shifts(curves: Sequence[SpanPolynomials], periods: Array) -> list[float]:
-    """Return the shift of each curve at which no two overlap; the first curve is not shifted.
-
-    Shifts are whole numbers, which add the least round-off.
-    """
+    """Return the shift of each curve at which no two overlap: whole numbers, which add little round-off."""
     shifts, end = [0.0], curves[0].high + curves[0].length * periods[-1]
     for curve in curves[1:]:
         shifts.append(float(np.ceil(end - (curve.low + curve.length * periods[0]) + _GAP_OF_CURVES)))
