@@ -39,7 +39,7 @@ def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: 
     variance = (
         nx * nx * covariances[:, 0, 0] + 2.0 * nx * ny * covariances[:, 0, 1] + ny * ny * covariances[:, 1, 1]
     )
-    return np.sqrt(variance + sigma_model**2)
+    return np.asarray(np.sqrt(variance + sigma_model**2))
 
 
 def project(
@@ -163,7 +163,7 @@ def landmark_residuals(poses: Array, landmarks: Array, points_vehicle: Array) ->
 
 
 def pair_residuals(first: Array, second: Array, nominal: Array) -> tuple[Array, Array]:
-    """Return `r_j = |b_j - a_j| - nominal_j` (k,) of pairs of points a, b (k, 2), in m, and directions (k, 2).
+    """Return `r_j = |b_j - a_j| - nominal_j` (k,) of points a, b (k, 2), and directions (k, 2), in m.
 
     dr/db_j = -dr/da_j is the direction, which is zero for coinciding points.
     """
