@@ -119,7 +119,7 @@ class WindowFactors(Generic[M_co]):
         return at_reference([*self._rows(cycles), *self._weak(False)], self.variables)
 
     def fresh(self, cycles: IntArray, whole: bool) -> list[gtsam.GaussianFactor]:
-        """Return factors, linearized now, of some cycles and the weak priors on active or `whole` map points."""
+        """Return factors of some cycles and weak priors, on all points if `whole`, linearized now."""
         measured = at_reference(self._rows(cycles), self.variables)
         factors = jacobian_factors(measured, self.variables.layout)
         return [*factors.values(), *stacked_factor(self._weak(whole), self.variables)]
