@@ -33,10 +33,10 @@ from pathspace_graph.spline.centre_line import SIDE, CentreCurve, Ribbon, find_l
 NAME: Final = "centerline"
 ONLINE_NAME: Final = "centerline-fixed-lag"  # names of the estimators on the command line
 ROOM: Final = 4.0  # distance along the line within which a foot point is searched for (m)
-RIBBON_LETTER: Final = "a"  # letter of the keys of a ribbon's control points, which hold `Point3` (x, y, h)
+RIBBON_LETTER: Final = "a"  # of the keys of a ribbon's control points, which hold `Point3` (x, y, h)
 ROUNDS: Final = 2  # optimizations; before each, the control points are held beside the poses anew
 MAX_ITERATIONS: Final = 15  # most iterations of one of them
-TOLERANCE: Final = 1e-5  # share by which an iteration lowers the error at least, or it is the last one
+TOLERANCE: Final = 1e-5  # largest relative gain of its last iteration
 
 
 def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
@@ -63,8 +63,7 @@ def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: 
 def ribbon_of(track: Map, settings: MapperSettings) -> tuple[Ribbon, Array | None, dict[int, float]]:
     """Return the ribbon between the boundaries of a map, or raise a SettingsError.
 
-    With it come its covariance (3m, 3m), if that of the map is known, and the parameter up to which each open
-    edge is confirmed.
+    With it come its covariance (3m, 3m), if known, and the parameter up to which each open edge is confirmed.
     """
     curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
     P = track.covariance_of(*curves.values())
@@ -79,11 +78,9 @@ def ribbon_of(track: Map, settings: MapperSettings) -> tuple[Ribbon, Array | Non
 
 @at_scale
 class CenterlineMapper:
-    """Maps a track online as a ribbon.
+    """Maps a track online as a ribbon, from the joint Gaussian of the boundaries of `FixedLagMapper`.
 
-    The fixed-lag smoother holds what all detections say as a joint Gaussian of both boundaries, from which
-    the ribbon is estimated whenever the map is asked for. Where there is no line between the boundaries, the
-    map is theirs. What isn't described is that of `FixedLagMapper`.
+    Where there is no line between the boundaries, the map is theirs.
     """
 
     def __init__(
@@ -91,7 +88,6 @@ class CenterlineMapper:
     ) -> None:
         self.settings = settings or MapperSettings()
         self.boundaries = FixedLagMapper(replace(self.settings, scale=1.0), odometry_sigma)
-        """Mapper of both boundaries and of the poses."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         return self.boundaries.update(odometry, detections)
@@ -186,10 +182,7 @@ Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 def _of_ribbon(terms: Terms, weights: Array) -> Terms:
-    """Return terms of control points of a ribbon (k, 3), with a row for each of the weights (r, k) of widths.
-
-    The other rows are those of the centre line, which `terms` are.
-    """
+    """Return the terms of a centre line and weights (r, k) of widths as those of a ribbon's points (k, 3)."""
 
     def of_ribbon(points: Array, pose: Array) -> tuple[Array, Array, Array]:
         residual, by_points, by_pose = terms(points[:, :2], pose)
