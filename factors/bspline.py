@@ -1,4 +1,4 @@
-"""B-spline bases on plain arrays: the Cox-de Boor recurrence, and polynomials on each span, which are faster.
+"""B-spline bases on plain arrays: the Cox-de Boor recurrence, as polynomials on each span.
 
 A spline of degree p over n control points has n + p + 1 non-decreasing knots and the domain
 [knots[p], knots[n]]. On the span knots[i] <= u < knots[i + 1] only the control points i - p to i matter.
@@ -24,76 +24,6 @@ def domain(knots: Array, degree: int) -> tuple[float, float]:
     return float(knots[degree]), float(knots[len(knots) - degree - 1])
 
 
-def wrap(knots: Array, degree: int, u: Array) -> Array:
-    """Return u modulo the period, in the domain of a periodic spline; its right end by round-off only."""
-    low, high = domain(knots, degree)
-    period = high - low
-    wrapped = u - period * np.floor((u - low) / period)
-    return np.minimum(np.maximum(wrapped, low), high)
-
-
-def find_span(knots: Array, degree: int, u: Array) -> IntArray:
-    """Return the span i (m,), in [p, n - 1], of each u (m,), so that knots[i] <= u < knots[i + 1].
-
-    u is clipped to the domain, whose right end belongs to the last non-empty span.
-    """
-    end = len(knots) - degree - 1
-    last = int(np.searchsorted(knots[degree:end], knots[end], side="left")) - 1
-    inner = knots[degree + 1 : degree + 1 + max(last, 0)]
-    return np.searchsorted(inner, u, side="right") + degree
-
-
-def basis(knots: Array, degree: int, u: Array, derivatives: int = 0) -> tuple[Array, IntArray]:
-    """Return basis values and derivatives (derivatives + 1, m, p + 1) at u (m,), and the spans (m,) of u.
-
-        N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}
-
-    knots (n + p + 1,) must have a non-empty domain, and u is clipped to it. Column j belongs to the control
-    point span - p + j. A derivative at a knot is the one from the right, and at the right end of the domain
-    the one from the left. The span of a parameter is never empty, so no divisor is zero. See de Boor (1972).
-    """
-    low, high = domain(knots, degree)
-    u = np.minimum(np.maximum(u, low), high)
-    span = find_span(knots, degree, u)
-    window = knots[span + np.arange(1 - degree, degree + 1)[:, None]]
-    orders = min(derivatives, degree)
-    levels = _levels(window, degree, u)
-    values = np.zeros((derivatives + 1, degree + 1, len(u)))
-    values[0] = levels[degree]
-    for order in range(1, orders + 1):
-        level = levels[degree - order]
-        for q in range(degree - order + 1, degree + 1):
-            level = _differentiate(window, degree, q, level)
-        values[order] = level
-    return values.transpose(0, 2, 1), span
-
-
-def _levels(window: Array, degree: int, u: Array) -> list[Array]:
-    """Return the basis values (q + 1, m) of each degree q <= p, from the knots (2 p, m) around each u."""
-    levels = [np.ones((1, len(u)))]
-    for q in range(1, degree + 1):
-        lower, upper = window[degree - q : degree], window[degree : degree + q]
-        ratio = levels[-1] / (upper - lower)
-        level = np.empty((q + 1, len(u)))
-        np.multiply(upper - u, ratio, out=level[:-1])
-        level[-1] = 0.0
-        level[1:] += (u - lower) * ratio
-        levels.append(level)
-    return levels
-
-
-def _differentiate(window: Array, degree: int, q: int, level: Array) -> Array:
-    """Return q (N_i^{q-1} / (t_{i+q} - t_i) - N_{i+1}^{q-1} / (t_{i+q+1} - t_{i+1})) (q + 1, m).
-
-    level (q, m) holds the functions, or derivatives, of degree q - 1.
-    """
-    ratio = q * level / (window[degree : degree + q] - window[degree - q : degree])
-    raised = np.zeros((q + 1, ratio.shape[1]))
-    raised[1:] = ratio
-    raised[:-1] -= ratio
-    return raised
-
-
 def divisors(width: Array) -> Array:
     """Return each width, or infinity where it is zero, so that 0 / 0 is taken as 0."""
     return np.where(width > 0.0, width, np.inf)
@@ -110,12 +40,6 @@ def scatter(values: Array, first: IntArray, size: int, periodic: bool = False) -
         columns %= size
     np.add.at(matrix, (np.arange(len(values))[:, None], columns), values)
     return matrix
-
-
-def basis_matrix(knots: Array, degree: int, u: Array, n: int, derivative: int = 0) -> Array:
-    """Return B (m, n) with B[k, i] = d^r/du^r N_i^p(u_k), so that d^r S/du^r = B c for n control points."""
-    values, span = basis(knots, degree, u, derivative)
-    return scatter(values[derivative], span - degree, n)
 
 
 def uniform_knots(count: int, degree: int, interval: float = 1.0, start: float = 0.0) -> Array:
@@ -142,7 +66,7 @@ _GAP_OF_CURVES: Final = 1.0  # least distance of curves on the axis of `Spans`, 
 
 @dataclass(frozen=True, eq=False)
 class SpanPolynomials:
-    """Basis functions as polynomials of s = (u - t_i) / (t_{i+1} - t_i): the values of `basis`, faster."""
+    """Basis functions as polynomials of s = (u - t_i) / (t_{i+1} - t_i) on each span i."""
 
     knots: Array  # (n + p + 1,) not decreasing, and unwrapped where the curve is periodic
     degree: int
@@ -225,7 +149,7 @@ class SpanPolynomials:
     def inside(self, u: Array) -> Array:
         """Return u wrapped into the domain of a periodic curve, or clipped to the domain of an open one."""
         if self.periodic:
-            return wrap(self.knots, self.degree, u)
+            u = u - self.length * np.floor((u - self.low) / self.length)
         return np.minimum(np.maximum(u, self.low), self.high)
 
     def locate(self, u: Array) -> tuple[IntArray, Array]:
@@ -241,7 +165,11 @@ class SpanPolynomials:
         return int(self._breaks.searchsorted(min(max(u, self.low), self.high), side="right"))
 
     def evaluate(self, u: Array, derivatives: int = 0) -> tuple[Array, IntArray]:
-        """Return values (derivatives + 1, m, p + 1) and spans (m,) as `basis` does; u is put `inside`."""
+        """Return basis values and derivatives (derivatives + 1, m, p + 1) at u (m,), and the spans (m,) of u.
+
+        u is put `inside`. Column j belongs to the control point span - p + j. A derivative at a knot is the
+        one from the right, and at the right end of the domain the one from the left.
+        """
         number, s = self.locate(u)
         values = horner(self._stack(derivatives).take(number, axis=1), s[:, None])
         by_order = values.reshape(len(s), derivatives + 1, self.degree + 1).transpose(1, 0, 2)
@@ -358,7 +286,10 @@ def _shifts(curves: Sequence[SpanPolynomials], periods: Array) -> list[float]:
 
 
 def _span_coefficients(knots: Array, degree: int) -> Array:
-    """Return the coefficients (p + 1 powers, n - p spans, p + 1) by Cox-de Boor on polynomials of s."""
+    """Return the coefficients (p + 1 powers, n - p spans, p + 1) by Cox-de Boor (de Boor 1972) in s:
+
+    N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}
+    """
     spans = np.arange(degree, len(knots) - degree - 1)
     start = knots[spans]
     width = knots[spans + 1] - start

@@ -165,26 +165,6 @@ def joint_foot_points(
     return FootPoints(*_searched(spans, control_points, points, curve, u_low, u_high, *search))
 
 
-def refine_foot_points(
-    tables: SpanPolynomials,
-    control_points: Array,
-    points: Array,
-    u_start: Array,
-    u_low: Array,
-    u_high: Array,
-    iterations: int = REFINE_ITERATIONS,
-) -> FootPoints:
-    """Return the local minimum of |S(u) - p_i| downhill from u_start, by a few safeguarded Newton steps.
-
-    The arguments are those of `foot_points`. A start (m,) outside its stretch is moved into it first. A step
-    is never longer than one mean knot interval, and no row ends farther from the curve than it began.
-    """
-    curve = np.zeros(len(points), np.intp)
-    return refine_joint_foot_points(
-        tables.alone, control_points, points, curve, u_start, u_low, u_high, iterations
-    )
-
-
 def refine_joint_foot_points(
     spans: Spans,
     control_points: Array,
@@ -195,7 +175,11 @@ def refine_joint_foot_points(
     u_high: Array,
     iterations: int = REFINE_ITERATIONS,
 ) -> FootPoints:
-    """Return `refine_foot_points` on several curves; `curve` (m,) is the number of each row's own."""
+    """Return the local minimum of |S(u) - p_i| downhill from u_start, by a few safeguarded Newton steps.
+
+    The arguments are those of `joint_foot_points`. A start (m,) outside its stretch is moved into it first. A
+    step is never longer than one mean knot interval, and no row ends farther from the curve than it began.
+    """
     search = iterations, SEARCH_ITERATIONS, TOLERANCES
     return FootPoints(*_refined(spans, control_points, points, curve, u_start, u_low, u_high, *search))
 

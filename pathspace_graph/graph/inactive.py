@@ -36,9 +36,7 @@ from .gaussian import (
     square_root_form,
 )
 from .relative import RelativeFactor, by_frame_of, from_frame, relative_factor, rotations, to_frame
-from .variables import ORIGIN_KEY, POSE, Layout, Variables, are_poses, pose_key, sizes, spread
-
-_NO_KEYS: IntArray = np.zeros(0, np.intp)
+from .variables import NO_KEYS, ORIGIN_KEY, POSE, Layout, Variables, are_poses, pose_key, sizes, spread
 
 
 class InactiveMap:
@@ -46,12 +44,10 @@ class InactiveMap:
 
     def __init__(self) -> None:
         self.net = gtsam.GaussianBayesNet()  # conditionals, in the order of their deactivation
-        self.keys: IntArray = _NO_KEYS  # (k,) of the inactive variables, ascending
-        self.anchors: IntArray = (
-            _NO_KEYS  # (a,) poses that the last conditional depends on, which stay active
-        )
-        self._old_anchors: IntArray = _NO_KEYS  # they were eliminated with the next conditional
-        self._given: IntArray = _NO_KEYS  # active variables that the conditionals depend on
+        self.keys: IntArray = NO_KEYS  # (k,) of the inactive variables, ascending
+        self.anchors: IntArray = NO_KEYS  # (a,) poses that the last conditional depends on
+        self._old_anchors: IntArray = NO_KEYS  # they were eliminated with the next conditional
+        self._given: IntArray = NO_KEYS  # active variables that the conditionals depend on
         self._shared: list[gtsam.GaussianFactor] = []
         self._active: tuple[Layout, Layout, IntArray] | None = None
         """Layout of all variables, that of the active ones, and their columns in the former."""
@@ -210,7 +206,7 @@ class InactiveChain(InactiveMap):
 
     def _changed(self) -> None:
         leaving = [link.leaving.keys for link in self.links]
-        keys = np.concatenate([np.zeros(0, np.intp), *leaving])
+        keys = np.concatenate([NO_KEYS, *leaving])
         self.keys = np.sort(keys[~are_poses(keys)])
         self.anchors = np.array([link.factor.frame for link in self.links[-1:]], np.intp)
         self._active = None

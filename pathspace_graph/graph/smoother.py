@@ -40,7 +40,6 @@ from .window import M_co, SmootherSettings, UserFactors, WindowFactors, check_fa
 
 STIFFNESS: Final = 1e4  # information about a gauge that is held, by that from measurements
 TIME_TOLERANCE: Final = 1e-9  # by which a pose must be older than the lag (s), since stamps have round-off
-NO_KEYS: Final = np.zeros(0, np.intp)
 
 
 class FixedLagSmoother(Generic[M_co]):
@@ -467,16 +466,17 @@ class FixedLagSmoother(Generic[M_co]):
         """
         self.submaps, self.inactive = None, InactiveMap()
         self.held, self.prior = None, gtsam.GaussianFactorGraph()
-        self._drop_before(first_cycle, np.append(self.variables.keyframes, removed))
+        self.variables.remove(np.append(self.variables.keyframes, removed))
+        self._drop_before(first_cycle)
         self.variables.insert(added, points.ravel())
 
-    def _drop_before(self, first_cycle: int, also: IntArray = NO_KEYS) -> None:
-        """Remove the poses before a cycle, other variables (k,) with them, and all factors of the window."""
+    def _drop_before(self, first_cycle: int) -> None:
+        """Remove the poses before a cycle, and all factors of the window."""
         leaving = np.arange(self.first_cycle, first_cycle)
         for cycle in leaving.tolist():
             self._drop_oldest(cycle)
         self.variables.first_cycle = first_cycle
-        self.variables.remove(np.append(also, pose_keys(leaving)))
+        self.variables.remove(pose_keys(leaving))
         self.window.clear()
 
     def set_prior(self, keys: IntArray, mean: Array, information: Array) -> None:

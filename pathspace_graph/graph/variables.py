@@ -17,12 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from functools import cached_property
-from typing import ClassVar, Final, TypeVar, cast
+from typing import ClassVar, Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
@@ -37,6 +37,7 @@ POSE: Final = 3  # entries of a pose: x, y, theta
 POINT: Final = 2  # entries of every other variable but the sensor's calibration
 INDEX_BITS: Final = 56  # low bits of a key, which hold its index; its letter is in the highest byte
 UNKNOWN: Final = -1  # column of a key that a layout does not hold
+NO_KEYS: Final = np.zeros(0, np.intp)
 _NAMES_IN_MESSAGE: Final = 3
 
 
@@ -116,9 +117,6 @@ def names(keys: IntArray) -> str:
     return ", ".join(name(key) for key in keys[:_NAMES_IN_MESSAGE].tolist())
 
 
-T = TypeVar("T", bound=NDArray[np.generic])
-
-
 class Layout:
     """Columns of a flat vector by ascending keys (K,): their widths (K,) and first columns (K,)."""
 
@@ -176,11 +174,6 @@ class Layout:
         begins = np.append(self.starts, self.size)[self.keys.searchsorted(_LETTER_ENDS)].tolist()
         return dict(zip(_LETTERS, map(slice, begins[::2], begins[1::2]), strict=True))
 
-    def begin(self, key: int) -> int:
-        """Return the first column of a key, or where it would be if the layout held the key."""
-        place = int(self.keys.searchsorted(key))
-        return int(self.starts[place]) if place < len(self.keys) else self.size
-
 
 @compiled
 def spread(starts: IntArray, widths: IntArray) -> IntArray:
@@ -198,11 +191,6 @@ def rotation_blocks(size: int, columns: IntArray, angles: Array) -> Array:
     return matrix
 
 
-def _inserted(array: T, at: int, values: T) -> T:
-    """Return an array with values inserted before an index; `np.insert` takes ten times as long."""
-    return cast(T, np.concatenate([array[:at], values, array[at:]]))
-
-
 class Variables:
     """Value for each key, and the reference that its unknown is measured from.
 
@@ -211,7 +199,7 @@ class Variables:
     """
 
     def __init__(self) -> None:
-        self.layout = Layout(np.zeros(0, np.intp))
+        self.layout = Layout(NO_KEYS)
         self.values: Array = np.zeros(0)  # (n,) calibrations, points (m) and poses (m, m, rad)
         self.reference: Array = np.zeros(0)  # (n,) first values
         self.linearized: Array = np.zeros(0)  # (n,) values at which the factors were linearized last
@@ -220,10 +208,8 @@ class Variables:
 
     def copy(self) -> Variables:
         """Return variables with the same keys and copies of the values."""
-        other = Variables()
-        other.layout, other.reference = self.layout, self.reference
+        other = copy(self)
         other.values, other.linearized = self.values.copy(), self.linearized.copy()
-        other.first_cycle = self.first_cycle
         return other
 
     @property
@@ -236,23 +222,20 @@ class Variables:
 
         References are the values, unless `reference` (n,) is given for variables that come back.
         """
-        reference = values if reference is None else reference
         if len(keys) == 0:
             return
-        if (self.layout.positions(keys) >= 0).any():
+        known, added = self.layout, Layout(keys)
+        both = np.concatenate([known.keys, keys])
+        order = both.argsort(kind="stable")
+        ascending = both[order]
+        if (ascending[1:] == ascending[:-1]).any():
             raise ValueError(f"expected new keys, found {name(int(keys[0]))} or a later one of them known")
-        place = int(self.layout.keys.searchsorted(keys[0]))
-        if place != self.layout.keys.searchsorted(keys[-1]):  # known keys lie between the new ones
-            half = len(keys) // 2
-            width = int(sizes(keys[:half]).sum())
-            self.insert(keys[:half], values[:width], reference[:width])
-            self.insert(keys[half:], values[width:], reference[width:])
-            return
-        at = self.layout.begin(int(keys[0]))
-        self.layout = Layout(_inserted(self.layout.keys, place, keys))
-        self.values = _inserted(self.values, at, values)
-        self.reference = _inserted(self.reference, at, reference)
-        self.linearized = _inserted(self.linearized, at, values)
+        starts = np.concatenate([known.starts, added.starts + known.size])
+        entries = spread(starts[order], np.concatenate([known.widths, added.widths])[order])
+        self.layout, reference = Layout(ascending), values if reference is None else reference
+        self.values = np.concatenate([self.values, values])[entries]
+        self.reference = np.concatenate([self.reference, reference])[entries]
+        self.linearized = np.concatenate([self.linearized, values])[entries]
 
     def remove(self, keys: IntArray) -> None:
         if len(keys) == 0:
@@ -326,7 +309,8 @@ class Variables:
         """Return a view of the window's poses (P, 3), oldest first."""
         known = self._first_pose
         if known[0] is not self.layout or known[1] != self.first_cycle:
-            begin = self.layout.begin(pose_key(self.first_cycle))
+            count = len(self.keys) - int(self.keys.searchsorted(pose_key(self.first_cycle)))
+            begin = self.layout.size - POSE * count
             known = self._first_pose = self.layout, self.first_cycle, begin
         return self.values[known[2] :].reshape(-1, POSE)
 

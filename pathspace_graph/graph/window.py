@@ -19,6 +19,7 @@ from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_f
 from .rows import KeptRows, OdometryChain, Rows, among, at_reference, jacobian_factors, stacked_factor
 from .variables import (
     CALIBRATION_LETTER,
+    NO_KEYS,
     POSE,
     POSE_LETTER,
     SENSOR_LETTER,
@@ -31,7 +32,6 @@ from .variables import (
     sizes,
 )
 
-NO_OWNERS: Final = np.zeros(0, np.intp)
 SENSOR_LEVER: Final = 10.0  # m by unit of the sensor's calibration, of detections 10 m away at 10 m/s
 
 
@@ -190,10 +190,10 @@ class WindowFactors(Generic[M_co]):
     def _relinearize_gauge(self, moved: IntArray) -> None:
         if self.map.structure is not self._structure:
             self.gauge, self.linear_gauge, self._structure = KeptRows(), KeptRows(), self.map.structure
-            self.linear_gauge.replace(NO_OWNERS, self.map.linear_gauge(False), self.variables)
+            self.linear_gauge.replace(NO_KEYS, self.map.linear_gauge(False), self.variables)
         if (self.exact and len(moved)) or not self.gauge.groups:
             self.gauge = KeptRows()
-            self.gauge.replace(NO_OWNERS, self.map.gauge(False), self.variables)
+            self.gauge.replace(NO_KEYS, self.map.gauge(False), self.variables)
             return
         stale = np.unique(self.gauge.holding(moved))
         if len(stale):
