@@ -48,14 +48,11 @@ def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: 
     if covariance is not None:
         by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
         joint = by_ribbon @ covariance @ by_ribbon.T
-        joint = 0.5 * (joint + joint.T)
+        joint = 0.5 * (joint + joint.T) + sigma_shape**2 * np.eye(len(joint))
     boundaries = {}
     for label, (spline, jacobian) in edges.items():
-        own = NO_COVARIANCE
-        if joint is not None:
-            block = slice(at, at := at + len(jacobian))
-            own = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
-            joint[block, block] = own
+        block = slice(at, at := at + len(jacobian))
+        own = NO_COVARIANCE if joint is None else joint[block, block].copy()
         boundaries[label] = SplineBoundary(spline, own, until.get(label, spline.domain[1]))
     return Map(ribbon.periodic, boundaries, joint)
 

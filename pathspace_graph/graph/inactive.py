@@ -57,24 +57,19 @@ class InactiveMap:
 
     @property
     def newest(self) -> IntArray:
-        """Return the keys (k,) of the variables that become active again together, which are all."""
+        """Return the keys (k,) of the variables that become active again together."""
         return self.keys
 
-    def active(self, layout: Layout) -> Layout:
-        """Return the layout of the active variables, given that of all variables."""
-        return layout if len(self.keys) == 0 else self._active_part(layout)[1]
-
-    def active_entries(self, layout: Layout) -> IntArray | slice:
-        """Return the columns that the active variables have in the layout of all variables."""
-        return slice(None) if len(self.keys) == 0 else self._active_part(layout)[2]
-
-    def _active_part(self, layout: Layout) -> tuple[Layout, Layout, IntArray]:
+    def active(self, layout: Layout) -> tuple[Layout, IntArray | slice]:
+        """Return the layout of the active variables, and their columns in the layout of all variables."""
+        if len(self.keys) == 0:
+            return layout, slice(None)
         if self._active is None or self._active[0] is not layout:
             active = np.ones(len(layout.keys), bool)
             active[layout.positions(self.keys)] = False
             part = Layout(layout.keys[active])
             self._active = layout, part, spread(layout.starts[active], part.widths)
-        return self._active
+        return self._active[1:]
 
     def push(
         self,
@@ -103,7 +98,7 @@ class InactiveMap:
         return remaining
 
     def refresh(self, variables: Variables) -> None:
-        """Update the inactive variables by back-substitution, given the active ones."""
+        """Update the inactive variables, given the active ones."""
         if len(self) == 0:
             return
         given, ends = gtsam.VectorValues(), sizes(self._given).cumsum()
@@ -212,7 +207,6 @@ class InactiveChain(InactiveMap):
         self._active = None
 
     def refresh(self, variables: Variables) -> None:
-        """Update the inactive variables, from the newest link to the oldest, given the active ones."""
         self.poses = {}
         for link in reversed(self.links):
             values = link.solve(variables, self._pose(link.factor.frame, variables))
@@ -227,12 +221,10 @@ class InactiveChain(InactiveMap):
 
     @property
     def newest(self) -> IntArray:
-        """Return the keys (k,) of the map points that left last."""
         keys = self.links[-1].leaving.keys
         return np.asarray(keys[~are_poses(keys)])
 
     def holds(self, keys: IntArray) -> bool:
-        """Return whether any link depends on any of some variables."""
         return any(link.holds(keys) for link in self.links)
 
     # --- the frame ---------------------------------------------------------------------------------------

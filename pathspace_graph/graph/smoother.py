@@ -65,12 +65,10 @@ class FixedLagSmoother(Generic[M_co]):
 
     @property
     def first_cycle(self) -> int:
-        """Return the perception cycle of the oldest pose in the window."""
         return self.variables.first_cycle
 
     @property
     def next_cycle(self) -> int:
-        """Return the number of the next perception cycle, counted from 0."""
         return self.first_cycle + len(self.times)
 
     @property
@@ -85,7 +83,7 @@ class FixedLagSmoother(Generic[M_co]):
     @property
     def layout(self) -> Layout:
         """Return the columns of the active variables, which a step solves for."""
-        return self.inactive.active(self.variables.layout)
+        return self.inactive.active(self.variables.layout)[0]
 
     @property
     def chain(self) -> InactiveChain | None:
@@ -129,7 +127,6 @@ class FixedLagSmoother(Generic[M_co]):
         self.prior.push_back(absolute_factor(pose_keys(np.array([cycle])), root, self.variables))
 
     def check_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
-        """Raise a SettingsError for the first of a user's factors that cannot be used; nothing changes."""
         check_factors(factors, self.variables, self.next_cycle)
 
     def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
@@ -173,7 +170,7 @@ class FixedLagSmoother(Generic[M_co]):
         """Take one Gauss-Newton step; `sigma_step` (m) damps it as a prior on the motion of map points."""
         negative_gradient = self.factorize(sigma_step)
         assert self.last_step is not None
-        entries = self.inactive.active_entries(self.variables.layout)
+        _, entries = self.inactive.active(self.variables.layout)
         self.variables.values[entries] += solve(self.last_step.factor, negative_gradient)
         self.map.correct()
 
@@ -184,10 +181,11 @@ class FixedLagSmoother(Generic[M_co]):
         """
         while not self.window.relinearize(self._cycles, self.inactive.keys) and len(self.inactive):
             self.activate(self.inactive.newest)  # rare: a detection has moved to where the map is inactive
-        user, layout = self.user_factors.linearized(self.variables), self.layout
+        user = self.user_factors.linearized(self.variables)
+        layout, entries = self.inactive.active(self.variables.layout)
         held = self.chain.hold(self.variables) if self.chain is not None else []
         graph = graph_of(self.prior, *user, *held) if user or held else self.prior
-        change = self.variables.change(self.inactive.active_entries(self.variables.layout))
+        change = self.variables.change(entries)
         hessian, negative_gradient = newton_system(graph, self.window.groups, layout, change)
         if sigma_step is not None:
             points = np.arange(layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start)
@@ -314,7 +312,6 @@ class FixedLagSmoother(Generic[M_co]):
         self.window.relinearize(self._cycles, self.inactive.keys)
 
     def refresh(self) -> None:
-        """Update the inactive variables."""
         self.inactive.refresh(self.variables)
 
     def activate(self, keys: IntArray) -> None:
@@ -427,7 +424,6 @@ class FixedLagSmoother(Generic[M_co]):
         self.window.clear()
 
     def remove_information(self, keys: IntArray) -> None:
-        """Remove all prior information about map points."""
         self.activate(keys)
         now = self.variables.change(self.variables.layout.entries(keys))
         self.prior = remove_information(self.prior, Layout(keys), now)

@@ -84,7 +84,6 @@ def indices(keys: IntArray) -> IntArray:
 
 
 def are_poses(keys: IntArray) -> BoolArray:
-    """Return which keys belong to poses."""
     return np.asarray(keys >= FIRST_POSE)
 
 
@@ -166,7 +165,6 @@ class Layout:
         return spread(self.starts[places], self.widths[places])
 
     def block(self, letter: str) -> slice:
-        """Return the columns of all keys of a letter."""
         return self._blocks[letter]
 
     @cached_property
@@ -214,7 +212,6 @@ class Variables:
 
     @property
     def keys(self) -> IntArray:
-        """Return all keys (K,), ascending."""
         return self.layout.keys
 
     def insert(self, keys: IntArray, values: Array, reference: Array | None = None) -> None:
