@@ -188,9 +188,9 @@ def smoothness_coefficients(abscissae: Array, period: float | None, spacing: flo
     return np.column_stack([scale / before, -scale / before - scale / after, scale / after])
 
 
-def smoothness_matrix(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
+def smoothness_matrix(abscissae: Array, period: float | None) -> Array:
     """Return the matrix D (m - 2, m), or (m, m) for a closed curve, of `smoothness_coefficients`."""
-    coefficients = smoothness_coefficients(abscissae, period, spacing)
+    coefficients = smoothness_coefficients(abscissae, period)
     return scatter(coefficients, np.arange(len(coefficients)), len(abscissae), periodic=True)
 
 
