@@ -1,4 +1,4 @@
-"""B-spline bases on plain arrays: the Cox-de Boor recurrence, and polynomials on each span, which are faster.
+"""B-spline bases on plain arrays: the Cox-de Boor recurrence, as polynomials on each span.
 
 A spline of degree p over n control points has n + p + 1 non-decreasing knots and the domain
 [knots[p], knots[n]]. On the span knots[i] <= u < knots[i + 1] only the control points i - p to i matter.
@@ -24,89 +24,15 @@ def domain(knots: Array, degree: int) -> tuple[float, float]:
     return float(knots[degree]), float(knots[len(knots) - degree - 1])
 
 
-def wrap(knots: Array, degree: int, u: Array) -> Array:
-    """Return u modulo the period, inside the domain of a periodic spline.
-
-    The right end of the domain is reached by round-off only.
-    """
-    low, high = domain(knots, degree)
-    period = high - low
-    wrapped = u - period * np.floor((u - low) / period)
-    return np.minimum(np.maximum(wrapped, low), high)
-
-
-def find_span(knots: Array, degree: int, u: Array) -> IntArray:
-    """Return the span i (m,), in [p, n - 1], of each u (m,), so that knots[i] <= u < knots[i + 1].
-
-    Values of u outside the domain are treated as if they were clipped to it. The right end of the domain
-    belongs to the last non-empty span. knots has shape (n + p + 1,).
-    """
-    end = len(knots) - degree - 1
-    last = int(np.searchsorted(knots[degree:end], knots[end], side="left")) - 1
-    inner = knots[degree + 1 : degree + 1 + max(last, 0)]
-    return np.searchsorted(inner, u, side="right") + degree
-
-
-def basis(knots: Array, degree: int, u: Array, derivatives: int = 0) -> tuple[Array, IntArray]:
-    """Return basis values and derivatives (derivatives + 1, m, p + 1) at u (m,), and the spans (m,) of u.
-
-        N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}
-
-    knots (n + p + 1,) must have a non-empty domain, and u is clipped to it. Column j belongs to the control
-    point span - p + j. A derivative at a knot is the one from the right, and at the right end of the domain
-    the one from the left. The span of a parameter is never empty, so no divisor is zero. See de Boor (1972).
-    """
-    low, high = domain(knots, degree)
-    u = np.minimum(np.maximum(u, low), high)
-    span = find_span(knots, degree, u)
-    window = knots[span + np.arange(1 - degree, degree + 1)[:, None]]
-    orders = min(derivatives, degree)
-    levels = _levels(window, degree, u)
-    values = np.zeros((derivatives + 1, degree + 1, len(u)))
-    values[0] = levels[degree]
-    for order in range(1, orders + 1):
-        level = levels[degree - order]
-        for q in range(degree - order + 1, degree + 1):
-            level = _differentiate(window, degree, q, level)
-        values[order] = level
-    return values.transpose(0, 2, 1), span
-
-
-def _levels(window: Array, degree: int, u: Array) -> list[Array]:
-    """Return the basis values (q + 1, m) of each degree q <= p, from the knots (2 p, m) around each u."""
-    levels = [np.ones((1, len(u)))]
-    for q in range(1, degree + 1):
-        lower, upper = window[degree - q : degree], window[degree : degree + q]
-        ratio = levels[-1] / (upper - lower)
-        level = np.empty((q + 1, len(u)))
-        np.multiply(upper - u, ratio, out=level[:-1])
-        level[-1] = 0.0
-        level[1:] += (u - lower) * ratio
-        levels.append(level)
-    return levels
-
-
-def _differentiate(window: Array, degree: int, q: int, level: Array) -> Array:
-    """Return q (N_i^{q-1} / (t_{i+q} - t_i) - N_{i+1}^{q-1} / (t_{i+q+1} - t_{i+1})) (q + 1, m).
-
-    level (q, m) holds the functions, or derivatives, of degree q - 1.
-    """
-    ratio = q * level / (window[degree : degree + q] - window[degree - q : degree])
-    raised = np.zeros((q + 1, ratio.shape[1]))
-    raised[1:] = ratio
-    raised[:-1] -= ratio
-    return raised
-
-
 def divisors(width: Array) -> Array:
     """Return each width, or infinity where it is zero, so that 0 / 0 is taken as 0."""
     return np.where(width > 0.0, width, np.inf)
 
 
 def scatter(values: Array, first: IntArray, size: int, periodic: bool = False) -> Array:
-    """Return dense rows (m, size) of local values (m, p + 1), whose first columns belong to `first` (m,).
+    """Return dense rows (m, size) of local values (m, p + 1), which begin in the columns `first` (m,).
 
-    Columns of a periodic spline are taken modulo `size`, and values that fall on the same column are added.
+    Columns of a periodic spline are taken modulo `size`, and values in the same column are added.
     """
     matrix = np.zeros((len(values), size))
     columns = first[:, None] + np.arange(values.shape[1])
@@ -114,12 +40,6 @@ def scatter(values: Array, first: IntArray, size: int, periodic: bool = False) -
         columns %= size
     np.add.at(matrix, (np.arange(len(values))[:, None], columns), values)
     return matrix
-
-
-def basis_matrix(knots: Array, degree: int, u: Array, n: int, derivative: int = 0) -> Array:
-    """Return B (m, n) with B[k, i] = d^r/du^r N_i^p(u_k), so that d^r S/du^r = B c for n control points."""
-    values, span = basis(knots, degree, u, derivative)
-    return scatter(values[derivative], span - degree, n)
 
 
 def uniform_knots(count: int, degree: int, interval: float = 1.0, start: float = 0.0) -> Array:
@@ -133,48 +53,35 @@ def clamped_knots(breaks: Array, degree: int) -> Array:
 
 
 def periodic_knots(breaks: Array, degree: int) -> Array:
-    """Return one period of m + 1 > p breaks with p more knots on either side.
-
-    They are the knots of m + p unwrapped control points.
-    """
+    """Return one period of m + 1 > p breaks with p more on either side: knots of m + p control points."""
     period = breaks[-1] - breaks[0]
     before = breaks[-1 - degree : -1] - period
     after = breaks[1 : degree + 1] + period
     return np.concatenate([before, breaks, after])
 
 
-_PERIODS_LAID_OUT: Final = (-1.0, 0.0, 1.0)
-"""A periodic curve lies on the axis of `Spans` once for each of these shifts, in periods."""
-_GAP_OF_CURVES: Final = 1.0
-"""Curves on the axis of `Spans` are at least this far apart, in units of the parameter."""
+_PERIODS_LAID_OUT: Final = (-1.0, 0.0, 1.0)  # shifts at which a periodic curve lies on the axis of `Spans`
+_GAP_OF_CURVES: Final = 1.0  # least distance of curves on the axis of `Spans`, in units of the parameter
 
 
 @dataclass(frozen=True, eq=False)
 class SpanPolynomials:
-    """Basis functions on each span as polynomials of s = (u - t_i) / (t_{i+1} - t_i).
+    """Basis functions as polynomials of s = (u - t_i) / (t_{i+1} - t_i) on each span i."""
 
-    It gives the same values as `basis`, but faster.
-    """
-
-    knots: Array
-    """The knots (n + p + 1,) do not decrease; they are unwrapped where the curve is periodic."""
+    knots: Array  # (n + p + 1,) not decreasing, and unwrapped where the curve is periodic
     degree: int
-    periodic: bool = False
-    """If true, parameters are taken modulo the length of the domain instead of being clipped to it."""
-    known: Array | None = field(default=None, repr=False)
-    """Coefficients of the first spans, which are taken over instead of being computed again."""
+    periodic: bool = False  # parameters are taken modulo the length of the domain instead of being clipped
+    known: Array | None = field(default=None, repr=False)  # coefficients of the first spans
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", np.ascontiguousarray(self.knots, dtype=np.float64))
 
     @cached_property
     def low(self) -> float:
-        """Left end of the domain."""
         return domain(self.knots, self.degree)[0]
 
     @cached_property
     def high(self) -> float:
-        """Right end of the domain."""
         return domain(self.knots, self.degree)[1]
 
     @cached_property
@@ -230,6 +137,11 @@ class SpanPolynomials:
         return self.high - self.low
 
     @property
+    def size(self) -> int:
+        """Return the number of distinct control points."""
+        return len(self.starts) if self.periodic else len(self.starts) + self.degree
+
+    @property
     def occupied(self) -> int:
         """Return the number of spans up to the last one that is not empty."""
         return len(self._breaks) + 1
@@ -237,14 +149,11 @@ class SpanPolynomials:
     def inside(self, u: Array) -> Array:
         """Return u wrapped into the domain of a periodic curve, or clipped to the domain of an open one."""
         if self.periodic:
-            return wrap(self.knots, self.degree, u)
+            u = u - self.length * np.floor((u - self.low) / self.length)
         return np.minimum(np.maximum(u, self.low), self.high)
 
     def locate(self, u: Array) -> tuple[IntArray, Array]:
-        """Return the span number span - p (m,), in [0, n - p), and s (m,), in [0, 1], of each u (m,).
-
-        u is wrapped or clipped first.
-        """
+        """Return the span number (m,), in [0, n - p), and s (m,), in [0, 1], of each u (m,), put `inside`."""
         inside = self.inside(u)
         number = self._breaks.searchsorted(inside, side="right")
         return number, (inside - self.starts.take(number)) * self.inverse_widths.take(number)
@@ -256,9 +165,10 @@ class SpanPolynomials:
         return int(self._breaks.searchsorted(min(max(u, self.low), self.high), side="right"))
 
     def evaluate(self, u: Array, derivatives: int = 0) -> tuple[Array, IntArray]:
-        """Return values (derivatives + 1, m, p + 1) and spans (m,) as `basis` does, by Horner's rule.
+        """Return basis values and derivatives (derivatives + 1, m, p + 1) at u (m,), and the spans (m,) of u.
 
-        u is wrapped or clipped first.
+        u is put `inside`. Column j belongs to the control point span - p + j. A derivative at a knot is the
+        one from the right, and at the right end of the domain the one from the left.
         """
         number, s = self.locate(u)
         values = horner(self._stack(derivatives).take(number, axis=1), s[:, None])
@@ -280,37 +190,25 @@ class SpanPolynomials:
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """Spans of several curves of one degree, laid out one curve after the other on an axis v.
+    """Spans of several curves of one degree on one axis v: rows on any of them are evaluated in one call.
 
-    Rows on any of the curves are then located and evaluated in one call. Parameter u of curve k lies at
-    `v = u + shift[k]`. A periodic curve is laid out for three periods, so that a stretch across the seam need
-    not be wrapped.
+    Parameter u of curve k lies at `v = u + shift[k]`. A periodic curve is laid out for three periods, so that
+    a stretch across the seam need not be wrapped.
     """
 
     degree: int
-    periodic: bool
-    """If true, all curves are closed; otherwise none is."""
+    periodic: bool  # all curves are closed, or none is
     low: Array
-    high: Array
-    """Limits (k,) of the curves' domains on the axis."""
-    shift: Array
-    """Each shift (k,) leads from a curve's own parameter to the axis; it is zero for the first curve."""
-    interval: Array
-    """Mean knot intervals (k,) of the curves."""
-    first: int
-    """The control points of the first curve begin at this place of the common array."""
-    columns: IntArray
-    """Each row (n, p + 1) holds the control points that matter on a span."""
-    starts: Array
-    """Left ends (l,) of the spans, in order: l is n, or 3 n for periodic curves."""
-    inverse_widths: Array
-    """Each entry (l,) is one over the width of a span."""
-    number: IntArray
-    """Each entry (l,) is the number of the span, in [0, n)."""
-    by_span: Array
-    """The array (n, 3 (p + 1), p + 1) holds the polynomials of the basis and of two derivatives."""
-    values: Array
-    """The array (p + 1, n, p + 1) holds the polynomials of the basis, power after power."""
+    high: Array  # limits (k,) of the curves' domains on the axis
+    shift: Array  # (k,) from a curve's own parameter to the axis; zero for the first curve
+    interval: Array  # (k,) mean knot intervals
+    first: int  # where the control points of the first curve begin in the common array
+    columns: IntArray  # (n, p + 1) control points that matter on each span
+    starts: Array  # (l,) left ends of the spans, in order: l is n, or 3 n for periodic curves
+    inverse_widths: Array  # (l,) one over the width of each span
+    number: IntArray  # (l,) number of each span, in [0, n)
+    by_span: Array  # (n, 3 (p + 1), p + 1) polynomials of the basis and of two derivatives
+    values: Array  # (p + 1, n, p + 1) polynomials of the basis, power after power
 
     def locate(self, v: Array) -> tuple[IntArray, Array]:
         """Return the span number in [0, n), and s in [0, 1], of each place v (m,) on the axis."""
@@ -344,9 +242,8 @@ def lay_out(
 ) -> Spans:
     """Return the spans of curves, all periodic or none, laid out on one axis.
 
-    The control points of each curve begin at its entry of `offsets` in a common array. Where `sizes` is
-    given, the array holds this many distinct control points of each periodic curve; otherwise it holds
-    unwrapped ones.
+    The control points of each curve begin at its entry of `offsets` in a common array, which holds unwrapped
+    ones, or as many distinct ones of each periodic curve as `sizes` tells.
     """
     periodic, counts = curves[0].periodic, [curve.occupied for curve in curves]
     periods = np.array(_PERIODS_LAID_OUT) if periodic else np.zeros(1)
@@ -380,10 +277,7 @@ def lay_out(
 
 
 def _shifts(curves: Sequence[SpanPolynomials], periods: Array) -> list[float]:
-    """Return the shift of each curve at which no two overlap; the first curve is not shifted.
-
-    Shifts are whole numbers, which add the least round-off.
-    """
+    """Return the shift of each curve at which no two overlap: whole numbers, which add little round-off."""
     shifts, end = [0.0], curves[0].high + curves[0].length * periods[-1]
     for curve in curves[1:]:
         shifts.append(float(np.ceil(end - (curve.low + curve.length * periods[0]) + _GAP_OF_CURVES)))
@@ -392,7 +286,10 @@ def _shifts(curves: Sequence[SpanPolynomials], periods: Array) -> list[float]:
 
 
 def _span_coefficients(knots: Array, degree: int) -> Array:
-    """Return the coefficients (p + 1 powers, n - p spans, p + 1) by Cox-de Boor on polynomials of s."""
+    """Return the coefficients (p + 1 powers, n - p spans, p + 1) by Cox-de Boor (de Boor 1972) in s:
+
+    N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}
+    """
     spans = np.arange(degree, len(knots) - degree - 1)
     start = knots[spans]
     width = knots[spans + 1] - start

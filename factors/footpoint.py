@@ -11,26 +11,19 @@ from .arrays import Array, BoolArray, IntArray
 from .bspline import SpanPolynomials, Spans, horner
 from .kernels import compiled
 
-_STEP_TOLERANCE: Final = 1e-9
-"""A row takes its last step where |step| <= tolerance * length of the domain; the error is its square."""
-_FLAT: Final = 1e-12
-"""The derivative f' counts as zero where |f'| <= tolerance * |S'|^2."""
-_EQUAL_SQUARE: Final = 1e-12
-"""Squared distances d, e (m^2) differ by more than round-off where e > d + tolerance * (1 + d)."""
-_END_TOLERANCE: Final = 1e-9
-"""A foot point is at an end that is no farther away than tolerance * length of the domain."""
-_NO_TANGENT: Final = 1e-12
-"""The tangent vanishes where |S'| <= tolerance * largest coordinate / length of the domain."""
-_TINY: Final = 1e-300
-"""Smallest divisor of a step; the numerator vanishes before it does."""
+_STEP_TOLERANCE: Final = (
+    1e-9  # a row's last step is |step| <= this * length of the domain; the error is its square
+)
+_FLAT: Final = 1e-12  # f' counts as zero where |f'| <= this * |S'|^2
+_EQUAL_SQUARE: Final = 1e-12  # squared distances d, e (m^2) differ where e > d + this * (1 + d)
+_END_TOLERANCE: Final = 1e-9  # a foot point this near (by the length of the domain) to an end is at the end
+_NO_TANGENT: Final = 1e-12  # S' vanishes where |S'| <= this * largest coordinate / length of the domain
+_TINY: Final = 1e-300  # smallest divisor of a step; the numerator vanishes before it does
 TOLERANCES: Final = (_STEP_TOLERANCE, _FLAT, _EQUAL_SQUARE, _END_TOLERANCE, _NO_TANGENT, _TINY)
 """These, as they are handed to the compiled versions."""
-_CHUNK: Final = 1 << 20
-"""At most this number of point-to-grid distances are held in memory at once."""
-SEARCH_ITERATIONS: Final = 50
-"""A search in a bracket takes at most this number of steps; it ends earlier once all rows have converged."""
-REFINE_ITERATIONS: Final = 2
-"""A refinement from a known parameter takes this number of Newton steps."""
+_CHUNK: Final = 1 << 20  # largest number of point-to-grid distances in memory at once
+SEARCH_ITERATIONS: Final = 50  # most steps of a search in a bracket, which ends once all rows have converged
+REFINE_ITERATIONS: Final = 2  # Newton steps of a refinement from a known parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,15 +32,12 @@ class Stretch:
 
     periodic: bool
     begin: Array
-    end: Array
-    """Limits (m,) of the domain of each row's curve."""
+    end: Array  # limits (m,) of the domain of each row's curve
     low: Array
     high: Array
     floor: Array
-    ceiling: Array
-    """Limits (m,) of the iteration, which are infinite where a stretch is a whole period."""
-    interval: Array
-    """Mean knot interval (m,) of each row's curve."""
+    ceiling: Array  # limits (m,) of the iteration, infinite where a stretch is a whole period
+    interval: Array  # (m,) mean knot interval of each row's curve
 
     @property
     def length(self) -> Array:
@@ -107,67 +97,34 @@ def stretch_of(spans: Spans, curve: IntArray, u_low: Array, u_high: Array) -> St
 class FootPoints:
     """Curve point that is nearest to each of m points, within each point's own stretch."""
 
-    u: Array
-    """The parameters (m,) are inside the domain; those of a periodic curve are wrapped."""
-    position: Array
-    """Curve points S(u) (m, 2), in m."""
-    tangent_unit: Array
-    """The unit tangents (m, 2) are in the direction of travel."""
-    normal_unit: Array
-    """The unit normals (m, 2) point to the left of the direction of travel."""
-    distance: Array
-    """The signed distances normal_unit . (point - S(u)) (m,), in m, are positive left of the curve."""
-    interior: BoolArray
-    """False (m,) at an end of an open curve, and at a limit beyond which the curve comes nearer."""
-    basis: Array
-    """Column j of these basis values (m, p + 1) at u belongs to control point `columns[:, j]`."""
-    span: IntArray
-    """Knot spans (m,) of u; the spans of several curves are numbered consecutively."""
-    columns: IntArray
-    """Indices (m, p + 1) of the control points that the basis values belong to."""
+    u: Array  # (m,) parameters inside the domain; those of a periodic curve are wrapped
+    position: Array  # (m, 2) curve points S(u), in m
+    tangent_unit: Array  # (m, 2) in the direction of travel
+    normal_unit: Array  # (m, 2) to the left of the direction of travel
+    distance: Array  # (m,) normal_unit . (point - S(u)), in m: positive left of the curve
+    interior: (
+        BoolArray  # (m,) false at an open curve's end, and at a limit beyond which the curve comes nearer
+    )
+    basis: Array  # (m, p + 1) basis values at u, of the control points `columns`
+    span: IntArray  # (m,) knot spans of u; the spans of several curves are numbered consecutively
+    columns: IntArray  # (m, p + 1) indices of the control points
 
     def where(self, rows: IntArray | BoolArray | slice) -> FootPoints:
         return FootPoints(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
-class _Curves:
-    """Curves as polynomials on each span; arrays have the component x, y first."""
-
-    spans: Spans
-    coefficients: Array
-    """Result (p + 1, 3, 2, n) of `Spans.curve_coefficients`."""
-
-    def position(self, v: Array) -> Array:
-        """Return S (2, m) at places v (m,) on the axis."""
-        number, s = self.spans.locate(v)
-        return horner(self.coefficients[:, 0].take(number, axis=-1), s)
-
-    def derivatives(self, number: IntArray, s: Array) -> Array:
-        """Return S, S', S'' (3, 2, m) at the local coordinates s (m,) on the spans `number` (m,)."""
-        return horner(self.coefficients.take(number, axis=-1), s)
-
-
-@dataclass(frozen=True, eq=False)
 class _Probe:
     """Curve and the distance to it at one parameter for each row."""
 
-    v: Array
-    """Places (m,) on the axis."""
-    number: IntArray
-    """Span numbers (m,) from `Spans.locate`."""
-    s: Array
-    """Local coordinates (m,) on the spans."""
-    offset: Array
-    """Offsets S(u) - p (2, m), in m."""
-    first: Array
-    """Derivatives S'(u) (2, m)."""
-    square: Array
-    """Squared distances |S(u) - p|^2 (m,), in m^2."""
-    slope: Array
-    """The slope f = (S - p) . S' (m,) is half the derivative of the squared distance."""
-    step: Array
-    """The downhill step (m,) is Newton's -f / |f'|, or Gauss-Newton's -f / |S'|^2 where f' is zero."""
+    v: Array  # (m,) places on the axis
+    number: IntArray  # (m,) span numbers
+    s: Array  # (m,) local coordinates on the spans
+    offset: Array  # (2, m) S(u) - p, in m
+    first: Array  # (2, m) derivatives S'(u)
+    square: Array  # (m,) |S(u) - p|^2, in m^2
+    slope: Array  # (m,) f = (S - p) . S', half the derivative of the squared distance
+    step: Array  # (m,) downhill: Newton's -f / |f'|, or Gauss-Newton's -f / |S'|^2 where f' is zero
 
 
 def foot_points(
@@ -182,14 +139,15 @@ def foot_points(
     """Return `u_i = argmin |S(u) - p_i|` over u in [u_low_i, u_high_i], and the curve there.
 
     The minimum is global as far as a coarse grid of step `coarse_step` in u resolves it. control_points
-    (n, 2) are unwrapped where the curve is periodic, points (m, 2) are in the same frame, in m, and the
-    limits (m,) are parameters. They are clipped to the domain of an open curve. On a periodic curve they may
-    run past the seam, and a stretch as long as the period has no limits. Finite input gives finite output,
-    also where the tangent vanishes, at centres of curvature and at kinks.
+    (n, 2) are unwrapped where the curve is periodic, points (m, 2) are in the same frame, in m. The limits
+    (m,) are clipped to the domain of an open curve. On a periodic curve they may run past the seam, and a
+    stretch as long as the period has no limits. Finite input gives finite output, also where the tangent
+    vanishes, at centres of curvature and at kinks.
     """
     curve = np.zeros(len(points), np.intp)
-    search = (coarse_step, iterations)
-    return joint_foot_points(tables.alone, control_points, points, curve, u_low, u_high, *search)
+    return joint_foot_points(
+        tables.alone, control_points, points, curve, u_low, u_high, coarse_step, iterations
+    )
 
 
 def joint_foot_points(
@@ -203,30 +161,8 @@ def joint_foot_points(
     iterations: int = SEARCH_ITERATIONS,
 ) -> FootPoints:
     """Return `foot_points` on several curves; `curve` (m,) is the number of each row's own."""
-    stretch = (curve, u_low, u_high)
-    return FootPoints(
-        *_searched(spans, control_points, points, *stretch, coarse_step, iterations, TOLERANCES)
-    )
-
-
-def refine_foot_points(
-    tables: SpanPolynomials,
-    control_points: Array,
-    points: Array,
-    u_start: Array,
-    u_low: Array,
-    u_high: Array,
-    iterations: int = REFINE_ITERATIONS,
-) -> FootPoints:
-    """Return the local minimum of |S(u) - p_i| downhill from u_start, by a few safeguarded Newton steps.
-
-    The arguments are those of `foot_points`. A start (m,) outside its stretch is moved into it first. A step
-    is never longer than one mean knot interval, and no row ends farther from the curve than it began.
-    """
-    curve = np.zeros(len(points), np.intp)
-    return refine_joint_foot_points(
-        tables.alone, control_points, points, curve, u_start, u_low, u_high, iterations
-    )
+    search = coarse_step, iterations, TOLERANCES
+    return FootPoints(*_searched(spans, control_points, points, curve, u_low, u_high, *search))
 
 
 def refine_joint_foot_points(
@@ -239,11 +175,13 @@ def refine_joint_foot_points(
     u_high: Array,
     iterations: int = REFINE_ITERATIONS,
 ) -> FootPoints:
-    """Return `refine_foot_points` on several curves; `curve` (m,) is the number of each row's own."""
-    steps = (iterations, SEARCH_ITERATIONS)
-    return FootPoints(
-        *_refined(spans, control_points, points, curve, u_start, u_low, u_high, *steps, TOLERANCES)
-    )
+    """Return the local minimum of |S(u) - p_i| downhill from u_start, by a few safeguarded Newton steps.
+
+    The arguments are those of `joint_foot_points`. A start (m,) outside its stretch is moved into it first. A
+    step is never longer than one mean knot interval, and no row ends farther from the curve than it began.
+    """
+    search = iterations, SEARCH_ITERATIONS, TOLERANCES
+    return FootPoints(*_refined(spans, control_points, points, curve, u_start, u_low, u_high, *search))
 
 
 @compiled
@@ -259,11 +197,10 @@ def _searched(
     tolerances: tuple[float, ...],
 ) -> tuple[Any, ...]:
     """Return the fields of `joint_foot_points`; the tolerances are those of this module."""
-    curves = _Curves(spans, spans.curve_coefficients(control_points))
-    points_t = np.ascontiguousarray(points.T)
-    stretch = stretch_of(spans, curve, u_low, u_high)
-    start = _nearest_on_grid(curves, points, curve, stretch, coarse_step)
-    probe = _descend(curves, points_t, start, stretch, np.full(len(points), coarse_step), iterations)
+    stretch, points_t = stretch_of(spans, curve, u_low, u_high), np.ascontiguousarray(points.T)
+    search = spans, spans.curve_coefficients(control_points), points_t
+    start = _nearest_on_grid(*search, curve, stretch, coarse_step)
+    probe = _descend(*search, start, stretch, np.full(len(points), coarse_step), iterations)
     return _finish(spans, control_points, points_t, curve, probe, stretch)
 
 
@@ -281,27 +218,28 @@ def _refined(
     tolerances: tuple[float, ...],
 ) -> tuple[Any, ...]:
     """Return the fields of `refine_joint_foot_points`; the last two arguments are those of this module."""
-    curves = _Curves(spans, spans.curve_coefficients(control_points))
-    points_t = np.ascontiguousarray(points.T)
-    stretch = stretch_of(spans, curve, u_low, u_high)
+    stretch, points_t = stretch_of(spans, curve, u_low, u_high), np.ascontiguousarray(points.T)
+    search = spans, spans.curve_coefficients(control_points), points_t
     start = stretch.moved_into(u_start + spans.shift.take(curve))
-    probe = _newton(curves, points_t, start, stretch, iterations, safeguarded)
+    probe = _newton(*search, start, stretch, iterations, safeguarded)
     return _finish(spans, control_points, points_t, curve, probe, stretch)
 
 
-def _nearest_on_grid(curves: _Curves, points: Array, curve: IntArray, stretch: Stretch, step: float) -> Array:
+def _nearest_on_grid(
+    spans: Spans, coefficients: Array, points_t: Array, curve: IntArray, stretch: Stretch, step: float
+) -> Array:
     """Return the nearest place (m,) to each point, of a grid in its stretch and the stretch's limits."""
-    if len(points) == 0:
+    if len(curve) == 0:
         return np.zeros(0)
     low, high = stretch.low, stretch.high
-    masks = [curve == k for k in range(len(curves.spans.low))]
+    masks = [curve == k for k in range(len(spans.low))]
     grid = np.concatenate([_grid(low[rows], high[rows], step) for rows in masks if rows.any()])
-    count = len(grid)
-    on_curve = curves.position(np.concatenate([grid, low, high]))
-    on_grid, ends = on_curve[:, :count], on_curve[:, count:].reshape(2, 2, -1)
-    offsets = ends - points.T[:, None]
+    number, s = spans.locate(np.concatenate([grid, low, high]))
+    on_curve = horner(coefficients[:, 0].take(number, axis=-1), s)
+    on_grid, ends = on_curve[:, : len(grid)], on_curve[:, len(grid) :].reshape(2, 2, -1)
+    offsets = ends - points_t[:, None]
     at_ends = offsets[0] ** 2 + offsets[1] ** 2
-    index, at_grid = _nearest_of(points, grid, on_grid, low, high)
+    index, at_grid = _nearest_of(points_t.T, grid, on_grid, low, high)
     choice = np.concatenate([at_grid[None], at_ends]).argmin(axis=0)
     return np.asarray(np.choose(choice, [grid[index], low, high]))
 
@@ -316,10 +254,7 @@ def _grid(low: Array, high: Array, step: float) -> Array:
 def _nearest_of(
     points: Array, grid: Array, on_grid: Array, low: Array, high: Array
 ) -> tuple[IntArray, Array]:
-    """Return the index (m,) of the nearest grid point in each stretch, and its squared distance (m,).
-
-    Rows are taken in chunks, so that the distances fit into memory.
-    """
+    """Return the index (m,) of the nearest grid point in each stretch, and its squared distance (m,)."""
     index, least = np.empty(len(points), np.intp), np.empty(len(points))
     rows = max(_CHUNK // len(grid), 1)
     for begin in range(0, len(points), rows):
@@ -333,39 +268,52 @@ def _nearest_of(
 
 
 def _newton(
-    curves: _Curves, points_t: Array, start: Array, stretch: Stretch, iterations: int, safeguarded: int
+    spans: Spans,
+    coefficients: Array,
+    points_t: Array,
+    start: Array,
+    stretch: Stretch,
+    iterations: int,
+    safeguarded: int,
 ) -> _Probe:
     """Take Newton steps; a row that one leads farther away is searched for to the end of its bracket."""
     reach = stretch.interval
-    last = _probe(curves, points_t, start)
+    last = _probe(spans, coefficients, points_t, start)
     for _ in range(iterations):
         step = np.minimum(np.maximum(last.step, -reach), reach)
         v = stretch.within(last.v + step)
-        probe = _probe(curves, points_t, v)
+        probe = _probe(spans, coefficients, points_t, v)
         farther = ~_no_farther(probe.square, last.square)
         if farther.any():
             own, start = stretch.where(farther), last.v[farther]
-            v[farther] = _descend(curves, points_t[:, farther], start, own, own.interval, safeguarded).v
-            probe = _probe(curves, points_t, v)
+            search = spans, coefficients, points_t[:, farther]
+            v[farther] = _descend(*search, start, own, own.interval, safeguarded).v
+            probe = _probe(spans, coefficients, points_t, v)
         last = probe
     return last
 
 
 def _descend(
-    curves: _Curves, points_t: Array, start: Array, stretch: Stretch, reach: Array, iterations: int
+    spans: Spans,
+    coefficients: Array,
+    points_t: Array,
+    start: Array,
+    stretch: Stretch,
+    reach: Array,
+    iterations: int,
 ) -> _Probe:
-    """Take Newton steps that stay inside a bracket, and otherwise goes to the middle of the bracket.
+    """Take Newton steps that stay inside a bracket, or go to the middle of the bracket.
 
     The bracket reaches from the nearest place so far to one where the distance surely rises again, so that no
     row ever gets farther away. At first it is `reach` (m,) long, downhill.
     """
     tolerance = _STEP_TOLERANCE * stretch.length
-    best = _probe(curves, points_t, start)
+    best = _probe(spans, coefficients, points_t, start)
     end, step = start - np.sign(best.slope) * reach, best.step
     for _ in range(iterations):
         inside = np.abs(step) < np.abs(end - best.v)
         candidate = stretch.within(np.where(inside, best.v + step, 0.5 * (best.v + end)))
-        probe = _probe(curves, points_t, candidate)
+        probe = _probe(spans, coefficients, points_t, candidate)
         if not (np.abs(candidate - best.v) > tolerance).any():
             return probe
         better = _no_farther(probe.square, best.square)
@@ -382,10 +330,10 @@ def _no_farther(square: Array, than: Array) -> BoolArray:
     return square <= than + _EQUAL_SQUARE * (1.0 + than)
 
 
-def _probe(curves: _Curves, points_t: Array, v: Array) -> _Probe:
+def _probe(spans: Spans, coefficients: Array, points_t: Array, v: Array) -> _Probe:
     """Return the curve at the places v (m,), and its distance from points (2, m)."""
-    number, s = curves.spans.locate(v)
-    orders = curves.derivatives(number, s)
+    number, s = spans.locate(v)
+    orders = horner(coefficients.take(number, axis=-1), s)
     offset, first = orders[0], orders[1]
     offset -= points_t
     products = orders * offset

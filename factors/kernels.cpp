@@ -1204,8 +1204,7 @@ Array whitener(const Array& covariance, double least) {
   return Array(Shape{3, 3}, values);
 }
 
-py::tuple odometry_residuals(const Array& starts, const Array& ends, const Array& deltas,
-                             double series_below) {
+py::tuple odometry_residuals(const Array& starts, const Array& ends, const Array& deltas) {
   const Index m = deltas.shape(0);
   expect(starts.size() == 3 * m && ends.size() == 3 * m && deltas.size() == 3 * m);
   const double pi = std::acos(-1.0);
@@ -1224,7 +1223,7 @@ py::tuple odometry_residuals(const Array& starts, const Array& ends, const Array
     if (wrapped < 0.0) wrapped += 2.0 * pi;
     const double phi = -(wrapped - pi), h = 0.5 * phi;
     double a = 1.0 - phi * phi / 12.0, slope = -phi / 6.0;
-    if (!(std::abs(phi) < series_below)) {
+    if (!(std::abs(phi) < 1e-3)) {
       const double cot = 1.0 / std::tan(h);
       a = h * cot;
       slope = 0.5 * cot - 0.5 * h * (1.0 + cot * cot);
@@ -1245,10 +1244,10 @@ py::tuple odometry_residuals(const Array& starts, const Array& ends, const Array
 }
 
 py::tuple whitened_odometry(const Array& starts, const Array& ends, const Array& deltas, const Array& whiteners,
-                            const Array& by_calibration, const Array& calibration, double series_below) {
+                            const Array& by_calibration, const Array& calibration) {
   const Index m = deltas.shape(0);
   expect(whiteners.size() == 9 * m && by_calibration.size() == 6 * m && calibration.size() == 2);
-  const py::tuple own = odometry_residuals(starts, ends, deltas, series_below);
+  const py::tuple own = odometry_residuals(starts, ends, deltas);
   const Array plain = own[0].cast<Array>(), by_start = own[1].cast<Array>(), by_end = own[2].cast<Array>();
   Array residual(Shape{m, 3}), jacobian(Shape{m, 3, 8});
   for (Index i = 0; i < m; ++i) {

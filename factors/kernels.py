@@ -11,8 +11,7 @@ from typing import Any, Final, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-NUMPY_ONLY: Final = "PATHSPACE_NUMPY"
-"""Environment variable that, when it is set, keeps the compiled versions out."""
+NUMPY_ONLY: Final = "PATHSPACE_NUMPY"  # environment variable that keeps the compiled versions out
 
 
 def _built() -> Any:
@@ -24,11 +23,8 @@ def _built() -> Any:
 
 _KERNELS: Final = _built()
 COMPILED: Final = _KERNELS is not None
-"""Whether the compiled versions run."""
-KERNELS: Final = "compiled" if COMPILED else "numpy"
-"""Word for it."""
-IN_NUMPY: Final[dict[str, Callable[..., Any]]] = {}
-"""The versions in numpy by name."""
+KERNELS: Final = "compiled" if COMPILED else "numpy"  # as `summary.json` says it
+IN_NUMPY: Final[dict[str, Callable[..., Any]]] = {}  # the versions in numpy by name
 
 
 def compiled(function: F) -> F:

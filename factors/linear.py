@@ -1,29 +1,22 @@
 """GTSAM's linear factors as arrays, and back again to the last bit."""
 
 from collections.abc import Sequence
-from typing import TypeVar
 
 import gtsam
 import numpy as np
 
 from .arrays import Array, IntArray
 
-F = TypeVar("F", bound=gtsam.JacobianFactor)
 
-
-def linear_factor(keys: Sequence[int], dims: Sequence[int], A: Array, b: Array) -> gtsam.GaussianConditional:
-    """Return the factor `1/2 |A x - b|^2` on any number of keys; A (m, sum of dims) and b (m,) are whitened.
+def linear_factor(keys: IntArray, widths: IntArray, A: Array, b: Array) -> gtsam.GaussianConditional:
+    """Return the factor `1/2 |A x - b|^2` on any number of keys (k,), with whitened A (m, n) and b (m,).
 
     The binding's constructors take at most three keys. A Gaussian conditional has no such limit, and it is a
-    Jacobian factor. The binding does not check shapes: ValueError where they do not fit.
+    Jacobian factor.
     """
-    if len(keys) != len(dims) or len(set(keys)) != len(keys):
-        raise ValueError(f"expected one size for each of {len(keys)} different keys, found {len(dims)}")
-    if A.shape != (len(b), sum(dims)):
-        raise ValueError(f"expected a matrix of shape {(len(b), sum(dims))}, found {A.shape}")
-    blocks = np.empty((len(b), A.shape[1] + 1), order="F")
-    blocks[:, :-1], blocks[:, -1] = A, b
-    return gtsam.GaussianConditional(list(keys), 1, gtsam.VerticalBlockMatrix([*dims, 1], blocks, False))
+    if len(A) != len(b):
+        raise ValueError(f"expected a matrix of {len(b)} rows, found {A.shape}")
+    return conditional_of(keys, widths, 1, np.concatenate([A, b[:, None]], axis=1))
 
 
 def keys_of_factor(factor: gtsam.GaussianFactor) -> IntArray:
@@ -54,9 +47,9 @@ def conditional_of(
 ) -> gtsam.GaussianConditional:
     """Return the conditional of the first `frontals` keys, with the rows `[A b]` (m, n + 1).
 
-    ValueError is raised where the numbers do not fit each other, which GTSAM does not check.
+    ValueError where the numbers do not fit, which GTSAM does not check.
     """
-    _check_keys(keys)
+    _check_keys(keys, widths)
     if not 1 <= frontals <= len(keys):
         raise ValueError(f"expected 1 to {len(keys)} frontal keys, found {frontals}")
     _check_matrix(matrix, int(widths.sum()) + 1)
@@ -72,10 +65,10 @@ def hessian_matrix(factor: gtsam.HessianFactor) -> Array:
 def hessian_factor_of(keys: IntArray, widths: IntArray, matrix: Array) -> gtsam.HessianFactor:
     """Return the factor with `[[H, g], [g', f]]` (n + 1, n + 1) on keys (k,) of widths (k,).
 
-    The binding has constructors for at most three keys. So this is the sum of a factor for each block of H,
-    in which each number is added to zeros alone. ValueError is raised where the numbers do not fit.
+    It is the sum of a factor for each block of H, in which each number is added to zeros alone, since the
+    binding's constructors take at most three keys. ValueError where the numbers do not fit.
     """
-    _check_keys(keys)
+    _check_keys(keys, widths)
     size = int(widths.sum()) + 1
     _check_matrix(matrix, size)
     if len(matrix) != size:
@@ -93,9 +86,9 @@ def hessian_factor_of(keys: IntArray, widths: IntArray, matrix: Array) -> gtsam.
     return gtsam.HessianFactor(graph)
 
 
-def _check_keys(keys: IntArray) -> None:
-    if keys.ndim != 1 or len(keys) == 0 or len(np.unique(keys)) != len(keys):
-        raise ValueError(f"expected one or more different keys, found {keys.size} of shape {keys.shape}")
+def _check_keys(keys: IntArray, widths: IntArray) -> None:
+    if not 0 < len(keys) == len(widths) == len(set(keys.tolist())):
+        raise ValueError(f"expected one or more different keys, a width for each, found {keys}, {widths}")
 
 
 def _check_matrix(matrix: Array, columns: int) -> None:

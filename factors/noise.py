@@ -43,15 +43,11 @@ def huber_loss(whitened: Array, threshold: float) -> Array:
 
 def huber_roots(whitened: Array, threshold: float) -> Array:
     """Return `sign(z) sqrt(2 rho(z))`, whose half square is the loss rho of `huber_loss`."""
-    size = np.abs(whitened)
-    inner = np.minimum(size, threshold)
-    return np.sign(whitened) * np.sqrt(inner * (2.0 * size - inner))
+    return np.sign(whitened) * np.sqrt(2.0 * huber_loss(whitened, threshold))
 
 
-SURE: Final = 4.0
-"""An error of the sensor is beyond doubt at this number of sigmas."""
-STAYS: Final = 1.5
-"""Stated noise is contradicted where errors that stay make the mean of a cone so many times as uncertain."""
+SURE: Final = 4.0  # sigmas at which an error of the sensor is beyond doubt
+STAYS: Final = 1.5  # growth of the sigma of a cone's mean from which errors that stay count
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +60,9 @@ class RayNoise:
 
     LENGTHS: ClassVar = {"sigma": (1, 0)}
 
-    sigma: Array
-    """(2,) Standard deviation at range 0 (m), and its growth with the range (m/m)."""
-    share: float = 0.0
-    """Share of the variance that stays with a cone for a while."""
-    time: float = 1.0
-    """Correlation time of that share, s."""
+    sigma: Array  # (2,) standard deviation at range 0 (m), and its growth with the range (m/m)
+    share: float = 0.0  # of the variance that stays with a cone for a while
+    time: float = 1.0  # correlation time of that share, s
 
     def sigmas(self, ranges: Array) -> Array:
         """Return the standard deviation (m,) of single detections at ranges (m,), in m."""
@@ -106,28 +99,19 @@ class MeasuredNoise:
         "sensor_sigma": (0, 1, 0, 0, 1),
     }
 
-    odometry: Array
-    """(3,) White noise of a twist from sample to sample: m/s, m/s, rad/s, one sigma."""
-    drift: Array
-    """(3,) Slow part of the odometry's error as a random walk of the pose: m, m and rad by root of s."""
-    interval: float
-    """Time between two twists, s."""
-    along: RayNoise | None = None
-    """Noise along the ray; None where too few cones were seen often enough."""
-    across: RayNoise | None = None
-    """Noise across the ray, as `along`."""
-    count: int = 1
-    """Number of detections of one cone, median."""
-    period: float = 0.1
-    """Time between two perception cycles, s."""
-    per_cycle: float = 1.0
-    """Number of cones seen in a cycle, mean."""
+    odometry: Array  # (3,) white noise of a twist from sample to sample: m/s, m/s, rad/s, one sigma
+    drift: Array  # (3,) slow part of its error as a random walk of the pose: m, m and rad by root of s
+    interval: float  # time between two twists, s
+    along: RayNoise | None = None  # along the ray; None where too few cones were seen often enough
+    across: RayNoise | None = None  # across the ray, as `along`
+    count: int = 1  # median number of detections of one cone
+    period: float = 0.1  # time between two perception cycles, s
+    per_cycle: float = 1.0  # mean number of cones seen in a cycle
     sensor: Array = field(default_factory=lambda: np.zeros(SENSOR_SIZE))
     """(5,) Constant errors of the sensor (`factors.sensor:SENSOR`), while the odometry's scale is held."""
     sensor_sigma: Array = field(default_factory=lambda: np.full(SENSOR_SIZE, np.inf))
     """(5,) Their standard deviations; infinite where nothing was measured."""
-    seconds: float = 0.0
-    """Time of driving that was measured on, s."""
+    seconds: float = 0.0  # time of driving that was measured on, s
 
     @property
     def twist_sigma(self) -> Array:
@@ -146,50 +130,49 @@ class MeasuredNoise:
         """
         if self.along is None or self.across is None:
             return None
-        ranges = np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)
+        ranges, ray = np.hypot(points[:, 0], points[:, 1]), ray_axes(points)[:, 0]
         factors = self._inflations if inflated else np.ones(2)
         along = factors[0] * self.along.sigmas(ranges) ** 2
         across = factors[1] * self.across.sigmas(ranges) ** 2
-        ray = points / ranges[:, None]
         outer = ray[:, :, None] * ray[:, None, :]
         return np.asarray(across[:, None, None] * np.eye(2) + (along - across)[:, None, None] * outer)
 
     def inflated(self, points: Array, covariances: Array) -> Array:
         """Return covariances (m, 2, 2) of single detections so wide that errors that stay may be forgotten.
 
-        That is `G C G` with the roots of the inflations along and across the ray in G, where one of them is
-        more than `STAYS`.
+        That is `G C G`, G with the roots of the inflations along and across the ray, if one exceeds `STAYS`.
         """
         if self.along is None or self.across is None:
             return covariances
         roots = np.sqrt(self._inflations)
         if (roots < STAYS).all():
             return covariances
-        ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
-        axes = np.stack([ray, left_of(ray)], axis=1)
+        axes = ray_axes(points)
         wider = np.einsum("mki,k,mkj->mij", axes, roots, axes)
         return np.asarray(wider @ covariances @ wider)
 
     @cached_property
     def shown(self) -> Array:
-        """Return those errors (5,) of the sensor that are more than `SURE` sigmas; the others are zero."""
+        """Errors (5,) of the sensor of more than `SURE` sigmas; the others are zero."""
         return np.where(np.abs(self.sensor) > SURE * self.sensor_sigma, self.sensor, 0.0)
 
     def corrected(self, points: Array, twist: Array, *, shown: bool = False) -> Array:
-        """Return detections at points (m, 2), vehicle frame, without the constant errors of the sensor.
-
-        Without those errors alone that are `shown`, if asked for.
-        """
+        """Return detections at points (m, 2), vehicle frame, without all constant errors or those `shown`."""
         errors = self.shown if shown else self.sensor
         if not errors.any():
             return points
         return shifted(points, np.broadcast_to(twist, (len(points), 3)), errors)
 
 
+def ray_axes(points: Array) -> Array:
+    """Return the unit vectors (m, 2, 2) along and across the rays to points (m, 2), vehicle frame."""
+    ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
+    return np.stack([ray, left_of(ray)], axis=1)
+
+
 def ray_sigmas(points: Array, covariances: Array) -> Array:
     """Return the standard deviations (m, 2) along and across the rays to points (m, 2), vehicle frame."""
-    ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
-    axes = np.stack([ray, left_of(ray)], axis=1)
+    axes = ray_axes(points)
     return np.asarray(np.sqrt(np.einsum("mki,mij,mkj->mk", axes, covariances, axes)))
 
 
@@ -199,11 +182,7 @@ class KnownNoise:
 
     LENGTHS: ClassVar = {"odometry": (1, 1, 0), "measured": 0}
 
-    odometry: Array
-    """(3,) Standard deviation of a twist (m/s, m/s, rad/s): stated, or assumed where it is not."""
+    odometry: Array  # (3,) standard deviation of a twist (m/s, m/s, rad/s): stated or assumed
     odometry_stated: bool = True
-    """Whether somebody has stated it."""
-    detections_stated: bool = True
-    """Whether the covariances of the detections were stated."""
-    measured: MeasuredNoise | None = None
-    """What was measured on this drive as a whole, or on an earlier one."""
+    detections_stated: bool = True  # whether the covariances of the detections were stated
+    measured: MeasuredNoise | None = None  # on this drive as a whole, or on an earlier one

@@ -7,32 +7,21 @@ from scipy.linalg import lapack
 
 from .arrays import Array
 from .kernels import compiled
-from .se2 import se2_exp, wrap_angle
+from .se2 import compose, se2_exp, wrap_angle
 
-MIN_SIGMA = 1e-6
-"""Smallest sigma of integrated odometry (m, rad), which keeps the factor of an empty interval finite."""
-
-CALIBRATION_SIZE = 2
-"""The calibration has two entries: the scale error of the speeds (-) and the bias of the yaw rate (rad/s)."""
-
-_SERIES_BELOW = 1e-3
-"""Below this angle (rad) a series replaces `(phi/2) cot(phi/2)`; its next terms are below 1e-15 there."""
+MIN_SIGMA = 1e-6  # of integrated odometry (m, rad), which keeps the factor of an empty interval finite
+CALIBRATION_SIZE = 2  # entries of the calibration: scale error of the speeds (-), yaw-rate bias (rad/s)
 
 
 @dataclass(frozen=True)
 class IntegratedOdometry:
     """Relative pose over an interval, as a factor between its two poses needs it."""
 
-    delta: Array
-    """End pose (x, y, theta) in the frame of the start, in m, m and rad."""
-    covariance: Array
-    """Covariance (3, 3) of the end pose, in the frame of the end (GTSAM's tangent of Pose2)."""
-    calibration_jacobian: Array
-    """Derivative (3, 2) of the end pose, in its own frame, by (scale error, yaw-rate bias)."""
-    whitener: Array
-    """Matrix W (3, 3) with `W' W = covariance^-1`, which whitens a residual."""
-    twist: Array = field(default_factory=lambda: np.zeros(3))
-    """Twist (3,) at the end, in m/s, m/s and rad/s."""
+    delta: Array  # (3,) end pose in the frame of the start (m, m, rad)
+    covariance: Array  # (3, 3) of the end pose, in its own frame (GTSAM's tangent of Pose2)
+    calibration_jacobian: Array  # (3, 2) derivative of the end pose, in its own frame
+    whitener: Array  # (3, 3) W with `W' W = covariance^-1`
+    twist: Array = field(default_factory=lambda: np.zeros(3))  # (3,) at the end (m/s, m/s, rad/s)
 
 
 def integrate_poses(durations: Array, twists: Array) -> Array:
@@ -52,12 +41,11 @@ def integrate_poses(durations: Array, twists: Array) -> Array:
 def integrate_twists(durations: Array, twists: Array, sigma: Array) -> IntegratedOdometry:
     """Return `prod_k exp(dt_k xi_k)` with its first-order covariance and its calibration derivative.
 
-    durations (k,) are in s. twists (k, 3) are body twists (vx m/s, vy m/s, wz rad/s), each held over its
-    duration, and sigma, (3,) or (k, 3), is the standard deviation of each sample. An error e of sample k, in
-    its own frame, reaches the end as `Ad(T_end^-1 T_k) e` with T_k the middle of its step. Samples are
-    independent, so their covariances add. The odometry measures `(1 + scale) v` and `w + bias`, so the
-    calibrated end pose is the end pose minus `calibration_jacobian @ (scale, bias)`. Without samples, or in
-    no time, the result is the identity with zero covariance.
+    Body twists (k, 3) (m/s, m/s, rad/s) are held over durations (k,) in s; sigma, (3,) or (k, 3), is the
+    standard deviation of each independent sample. An error e of sample k, in its own frame, reaches the end
+    as `Ad(T_end^-1 T_k) e` with T_k the middle of its step. The odometry measures `(1 + scale) v` and
+    `w + bias`, so the calibrated end pose is the end pose minus `calibration_jacobian @ (scale, bias)`.
+    Without samples the result is the identity with zero covariance.
     """
     if len(durations) == 0:
         return integrated_odometry(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
@@ -72,7 +60,8 @@ def _integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, 
     """Return end pose (3,), covariance (3, 3) and calibration derivative (3, 2) of `integrate_twists`."""
     poses = integrate_poses(durations, twists)
     end = poses[-1]
-    adjoints = _adjoints_to_end(_midpoints(poses, durations, twists), end)
+    # in the middle of each step the adjoint equals the exponential's right Jacobian to second order
+    adjoints = _adjoints_to_end(compose(poses, se2_exp(-0.5 * twists * durations[:, None])), end)
     scaled = (adjoints * (durations[:, None] * sigmas)[:, None, :]).transpose(1, 0, 2).reshape(3, -1)
     by_speed, by_rate = adjoints[:, :, :2] @ twists[:, :2, None], adjoints[:, :, 2:]
     by_calibration = np.concatenate([by_speed, by_rate], axis=2).transpose(1, 2, 0) @ durations
@@ -93,17 +82,6 @@ def _whitener(covariance: Array, least: float) -> Array:
     return np.ascontiguousarray(whitener)
 
 
-def _midpoints(poses: Array, durations: Array, twists: Array) -> Array:
-    """Return the poses (k, 3) in the middle of each step.
-
-    The adjoint there equals the right Jacobian of the exponential to second order.
-    """
-    back = se2_exp(-0.5 * twists * durations[:, None])
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x, y = poses[:, 0] + c * back[:, 0] - s * back[:, 1], poses[:, 1] + s * back[:, 0] + c * back[:, 1]
-    return np.array([x, y, poses[:, 2] + back[:, 2]]).T
-
-
 def _adjoints_to_end(poses: Array, end: Array) -> Array:
     """Return the adjoint maps (k, 3, 3) that carry a tangent at each pose to one at the end pose."""
     theta = poses[:, 2] - end[2]
@@ -117,6 +95,7 @@ def _adjoints_to_end(poses: Array, end: Array) -> Array:
     return out
 
 
+@compiled
 def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> tuple[Array, Array, Array]:
     """Return `r = Log(delta^-1 start^-1 end)` (m, 3), and its Jacobians (m, 3, 3) by start and end.
 
@@ -124,14 +103,6 @@ def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> t
     (m, 3) are in the map frame, deltas (m, 3) in the frame of the start. The Jacobians are by (x, y, theta)
     in the map frame.
     """
-    return _odometry_residuals(poses_start, poses_end, deltas, _SERIES_BELOW)
-
-
-@compiled
-def _odometry_residuals(
-    poses_start: Array, poses_end: Array, deltas: Array, series_below: float
-) -> tuple[Array, Array, Array]:
-    """Return `odometry_residuals`, with a series where |phi| is below a limit (rad)."""
     angle = poses_start[:, 2] + deltas[:, 2]
     c, s = np.cos(angle), np.sin(angle)
     offset = poses_end[:, :2] - poses_start[:, :2]
@@ -139,7 +110,7 @@ def _odometry_residuals(
     cd, sd = np.cos(deltas[:, 2]), np.sin(deltas[:, 2])
     dx, dy = along - (cd * deltas[:, 0] + sd * deltas[:, 1]), across - (cd * deltas[:, 1] - sd * deltas[:, 0])
     phi = wrap_angle(poses_end[:, 2] - angle)
-    a, slope = _inverse_left_terms(phi, series_below)
+    a, slope = _inverse_left_terms(phi)
     h = 0.5 * phi
     residuals = np.array([a * dx + h * dy, a * dy - h * dx, phi]).T
     by_phi_x, by_phi_y = slope * dx + 0.5 * dy, slope * dy - 0.5 * dx
@@ -153,6 +124,7 @@ def _odometry_residuals(
     return residuals, by_start, by_end
 
 
+@compiled
 def whitened_odometry(
     poses_start: Array,
     poses_end: Array,
@@ -163,33 +135,18 @@ def whitened_odometry(
 ) -> tuple[Array, Array]:
     """Return `W (r + G b)` (m, 3) with r of `odometry_residuals`, and its derivatives (m, 3, 8).
 
-    W (m, 3, 3) are whiteners, and G (m, 3, 2) the derivatives by the calibration b (2,). The results are
-    derivatives by [b | start | end].
+    W (m, 3, 3) are whiteners, and G (m, 3, 2) derivatives by the calibration b (2,). The result's
+    derivatives are by [b | start | end].
     """
-    measured = deltas, whiteners, by_calibration, calibration
-    return _whitened_odometry(poses_start, poses_end, *measured, _SERIES_BELOW)
-
-
-@compiled
-def _whitened_odometry(
-    poses_start: Array,
-    poses_end: Array,
-    deltas: Array,
-    whiteners: Array,
-    by_calibration: Array,
-    calibration: Array,
-    series_below: float,
-) -> tuple[Array, Array]:
-    """Return `whitened_odometry`, with a series where |phi| is below a limit (rad)."""
-    residual, *by_poses = _odometry_residuals(poses_start, poses_end, deltas, series_below)
+    residual, *by_poses = odometry_residuals(poses_start, poses_end, deltas)
     residual = residual + by_calibration @ calibration
     jacobian = whiteners @ np.concatenate([by_calibration, *by_poses], axis=2)
     return (whiteners @ residual[:, :, None])[:, :, 0], jacobian
 
 
-def _inverse_left_terms(phi: Array, series_below: float) -> tuple[Array, Array]:
+def _inverse_left_terms(phi: Array) -> tuple[Array, Array]:
     """Return `a = (phi/2) cot(phi/2)` of SE(2)'s inverse left Jacobian, and da/dphi."""
-    small = np.abs(phi) < series_below
+    small = np.abs(phi) < 1e-3  # the next terms of the series are below 1e-15 there
     half = np.where(small, 0.5, 0.5 * phi)
     cot = 1.0 / np.tan(half)
     a = np.where(small, 1.0 - phi**2 / 12.0, half * cot)

@@ -7,10 +7,10 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from .arrays import Array
-from .bspline import SpanPolynomials
+from .bspline import SpanPolynomials, scatter
 from .footpoint import FootPoints
 from .kernels import compiled
-from .se2 import to_vehicle
+from .se2 import in_vehicle, to_vehicle
 from .sensor import sensor_rows
 
 
@@ -18,14 +18,10 @@ from .sensor import sensor_rows
 class ProjectionRows:
     """A row for each detection: residual, standard deviation and Jacobian blocks, not whitened."""
 
-    residual: Array
-    """Signed distance (m,) of the detection from the curve, in m, positive left of travel."""
-    sigma: Array
-    """Standard deviation (m,) of the detection across the curve, in m."""
-    by_pose: Array
-    """Derivatives (m, 3) by the pose (x, y, theta) in the map frame."""
-    by_control: Array
-    """Derivatives (m, degree + 1, 2) by the control points of the foot point's span."""
+    residual: Array  # (m,) signed distance of the detection from the curve, in m, positive left of travel
+    sigma: Array  # (m,) standard deviation of the detection across the curve, in m
+    by_pose: Array  # (m, 3) derivatives by the pose (x, y, theta) in the map frame
+    by_control: Array  # (m, degree + 1, 2) derivatives by the control points of the foot point's span
 
 
 def chi2_quantile(probability: float, degrees: int) -> float:
@@ -39,12 +35,11 @@ def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: 
     normals n (m, 2) are in the map frame, covariances K (m, 2, 2) in the vehicle frame of each row's pose
     (m, 3).
     """
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    nx, ny = c * normals[:, 0] + s * normals[:, 1], -s * normals[:, 0] + c * normals[:, 1]
+    nx, ny = in_vehicle(normals, poses).T
     variance = (
         nx * nx * covariances[:, 0, 0] + 2.0 * nx * ny * covariances[:, 0, 1] + ny * ny * covariances[:, 1, 1]
     )
-    return np.sqrt(variance + sigma_model**2)
+    return np.asarray(np.sqrt(variance + sigma_model**2))
 
 
 def project(
@@ -58,8 +53,7 @@ def project(
 
         dr/dt = n,   dr/dtheta = n . (J R z),   dr/dc_j = -beta_j(u) n
 
-    are exact at any distance from the curve. They are not exact at an end of the curve or of a stretch: such
-    rows are to be left out (`foot.interior`).
+    are exact at any distance from the curve. Elsewhere they are not: leave out what is not `foot.interior`.
     """
     n = foot.normal_unit
     arm = points_map - poses[:, :2]
@@ -103,30 +97,24 @@ def detection_rows(
 
 # --- a ribbon: a centre line with a width ----------------------------------------------------------------
 
-RIBBON: Final = 3
-"""Number of entries of a ribbon's control point: x, y (m, map frame) and half the width h (m)."""
-_LEAST_SPREAD = 0.05
-"""1 - k d, which vanishes at the centre of curvature, counts as at least this."""
+RIBBON: Final = 3  # entries of a ribbon's control point: x, y (m, map frame) and half the width h (m)
+_LEAST_SPREAD = 0.05  # 1 - k d, which vanishes at the centre of curvature, counts as at least this
 
 
 @dataclass(frozen=True)
 class RibbonRows:
     """A row for each detection: residual, gradient and Jacobian blocks, not whitened."""
 
-    residual: Array
-    """How far (m,) the detection lies outside of the edge of its side, in m."""
-    by_point: Array
-    """Derivatives (m, 2) by the detection in the map frame."""
-    by_control: Array
-    """Derivatives (m, degree + 1, 3) by the control points (x, y, h) of the span."""
+    residual: Array  # (m,) distance of the detection beyond the edge of its side, in m
+    by_point: Array  # (m, 2) derivatives by the detection in the map frame
+    by_control: Array  # (m, degree + 1, 3) derivatives by the control points (x, y, h) of the span
 
 
 def beyond_edge(tables: SpanPolynomials, control_points: Array, sides: Array, foot: FootPoints) -> RibbonRows:
     """Return `r = s n . (p - C(u)) - h(u)`, with u the foot point of p on the centre line C.
 
-    The side s (m,) is 1 for the left edge and -1 for the right one. control_points (n, 3) are those of the
-    ribbon, with those that a closed one repeats. The distance d = n . (p - C) does not depend on u, but h
-    does. With the unit tangent t, the speed |C'| and the curvature k of the centre line,
+    The side s (m,) is 1 for the left edge and -1 for the right one; control_points (n, 3) are unwrapped. With
+    d = n . (p - C), the unit tangent t, the speed |C'| and the curvature k of the centre line,
 
         du/dp = t / (|C'| (1 - k d)),   du/dc_j = (d beta'_j n / |C'| - beta_j t) / (|C'| (1 - k d)),
         dr/dp = s n - h' du/dp,   dr/dc_j = -s beta_j n - h' du/dc_j,   dr/dh_j = -beta_j
@@ -154,18 +142,15 @@ def beyond_edge(tables: SpanPolynomials, control_points: Array, sides: Array, fo
 class LandmarkResiduals:
     """Two rows for each detection, in the vehicle frame, not whitened."""
 
-    residual: Array
-    """Each row (m, 2) is the expected minus the measured position of the landmark, in m."""
-    by_pose: Array
-    """Derivatives (m, 2, 3) by the pose (x, y, theta) in the map frame."""
-    by_landmark: Array
-    """Derivatives (m, 2, 2) by the landmark in the map frame, the transposed rotations."""
+    residual: Array  # (m, 2) expected minus measured position of the landmark, in m
+    by_pose: Array  # (m, 2, 3) derivatives by the pose (x, y, theta) in the map frame
+    by_landmark: Array  # (m, 2, 2) derivatives by the landmark in the map frame
 
 
 def landmark_residuals(poses: Array, landmarks: Array, points_vehicle: Array) -> LandmarkResiduals:
-    """Return `r = R^T (l - t) - z`, with poses (m, 3) and landmarks l (m, 2) in the map frame.
+    """Return `r = R^T (l - t) - z` of poses (m, 3), landmarks l (m, 2), map frame, and detections z (m, 2).
 
-    The detections z are points_vehicle (m, 2) in the vehicle frame, in m. The derivatives are
+    The detections are in the vehicle frame, all in m. The derivatives are
 
         dr/dt = -R^T,   dr/dtheta = (a_y, -a_x) with a = R^T (l - t),   dr/dl = R^T
     """
@@ -178,10 +163,9 @@ def landmark_residuals(poses: Array, landmarks: Array, points_vehicle: Array) ->
 
 
 def pair_residuals(first: Array, second: Array, nominal: Array) -> tuple[Array, Array]:
-    """Return `r_j = |b_j - a_j| - nominal_j` (k,) of pairs of points a, b (k, 2), and unit directions (k, 2).
+    """Return `r_j = |b_j - a_j| - nominal_j` (k,) of points a, b (k, 2), and directions (k, 2), in m.
 
-    The residual is that of GTSAM's RangeFactor2, with dr/db_j = -dr/da_j the direction, which is zero for
-    coinciding points. All are in m.
+    dr/db_j = -dr/da_j is the direction, which is zero for coinciding points.
     """
     offset = second - first
     length = np.hypot(offset[:, 0], offset[:, 1])
@@ -191,10 +175,9 @@ def pair_residuals(first: Array, second: Array, nominal: Array) -> tuple[Array, 
 def smoothness_coefficients(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
     """Return second divided differences over abscissae (m,), times the squared spacing: (m - 2, 3).
 
-    Row j holds the coefficients of the points j, j + 1 and j + 2. They are the second difference where points
-    are evenly spaced, and give zero for points on a straight line whatever their spacing. A curve that is
-    closed after `period` has m rows, whose points are counted around. The spacing is the mean gap of these
-    abscissae where `spacing` is not given.
+    Row j holds the coefficients of the points j, j + 1 and j + 2, which give zero for points on a straight
+    line whatever their spacing. A curve that is closed after `period` has m rows. The default spacing is the
+    mean gap of the abscissae.
     """
     m = len(abscissae)
     extended = abscissae if period is None else np.concatenate([abscissae, abscissae[:2] + period])
@@ -205,17 +188,10 @@ def smoothness_coefficients(abscissae: Array, period: float | None, spacing: flo
     return np.column_stack([scale / before, -scale / before - scale / after, scale / after])
 
 
-def smoothness_matrix(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
-    """Return the matrix D (m - 2, m), or (m, m) for a closed curve, of `smoothness_coefficients`.
-
-    `D c` is in m. The prior `D c ~ N(0, sigma^2)` is linear, so it is a Jacobian factor.
-    """
-    coefficients, m = smoothness_coefficients(abscissae, period, spacing), len(abscissae)
-    matrix = np.zeros((len(coefficients), m))
-    rows = np.arange(len(coefficients))
-    for k in range(3):
-        matrix[rows, (rows + k) % m] += coefficients[:, k]
-    return matrix
+def smoothness_matrix(abscissae: Array, period: float | None) -> Array:
+    """Return the matrix D (m - 2, m), or (m, m) for a closed curve, of `smoothness_coefficients`."""
+    coefficients = smoothness_coefficients(abscissae, period)
+    return scatter(coefficients, np.arange(len(coefficients)), len(abscissae), periodic=True)
 
 
 def greville(knots: Array, degree: int) -> Array:

@@ -59,10 +59,7 @@ def inverse(pose: Array) -> Array:
 
 
 def relative(pose: Array, other: Array) -> Array:
-    """Return `pose^-1 * other` on SE(2): another pose (3,) in the frame of a pose (3,).
-
-    Headings are subtracted and not wrapped.
-    """
+    """Return `pose^-1 * other` (3,) on SE(2); its heading is not wrapped."""
     return np.append(rotation(pose[2]).T @ (other[:2] - pose[:2]), other[2] - pose[2])
 
 
@@ -73,23 +70,22 @@ def move_points(motion: Array, points: Array) -> Array:
 
 @compiled
 def to_map(points_vehicle: Array, poses: Array) -> Array:
-    """Return `p = R z + t` (m, 2) in the map frame.
-
-    points_vehicle (m, 2) are in the vehicle frame of each row's own pose (m, 3).
-    """
+    """Return `p = R z + t` (m, 2), map frame: points z (m, 2) in the vehicle frames of poses (m, 3)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = points_vehicle[:, 0], points_vehicle[:, 1]
     return np.array([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]]).T
 
 
-def to_vehicle(points_map: Array, poses: Array) -> Array:
-    """Return `z = R^T (p - t)` (m, 2) in the vehicle frame of each row's own pose (m, 3).
-
-    points_map (m, 2) are in the map frame.
-    """
+def in_vehicle(directions: Array, poses: Array) -> Array:
+    """Return vectors (m, 2), map frame, in the vehicle frames of poses (m, 3)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    dx, dy = points_map[:, 0] - poses[:, 0], points_map[:, 1] - poses[:, 1]
-    return np.array([c * dx + s * dy, -s * dx + c * dy]).T
+    x, y = directions[:, 0], directions[:, 1]
+    return np.array([c * x + s * y, -s * x + c * y]).T
+
+
+def to_vehicle(points_map: Array, poses: Array) -> Array:
+    """Return `z = R^T (p - t)` (m, 2): points p (m, 2), map frame, in the vehicle frames of poses (m, 3)."""
+    return in_vehicle(points_map - poses[:, :2], poses)
 
 
 def se2_exp(tangents: Array) -> Array:

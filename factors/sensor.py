@@ -9,27 +9,21 @@ import numpy as np
 
 from .arrays import Array
 from .kernels import compiled
-from .se2 import left_of
+from .se2 import in_vehicle, left_of
 
 SENSOR = ("yaw", "lateral", "latency", "range_scale", "range_bias")
-"""Entries of the sensor's calibration b: its yaw (rad) and its lateral offset (m), which are
-positive to the left, the age of detections at their stamps (s), and the scale error (-) and the bias (m) of
-ranges."""
-
+"""Entries of the calibration b: yaw (rad) and lateral offset (m), positive to the left, age of detections at
+their stamps (s), scale error (-) and bias (m) of ranges."""
 SENSOR_SIZE = len(SENSOR)
-"""Number of these entries."""
-
-RANGE = slice(3, 5)
-"""These of them are errors of the ranges."""
+RANGE = slice(3, 5)  # errors of the ranges
 
 
 @compiled
 def by_sensor(points_vehicle: Array, twists: Array) -> Array:
-    """Return the derivatives C (m, 2, 5) of detections by the calibration b of the sensor, at b = 0.
+    """Return the derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b.
 
-    A detection z, as the sensor believes to see it, is corrected to `z + C b`. points_vehicle z (m, 2) are in
-    m, twists (vx, vy, wz) (m, 3) in m/s, m/s and rad/s are those at their stamps. With J the quarter turn and
-    the vehicle's motion `v + wz J z` relative to a point that stands still, the columns are
+    z are points_vehicle (m, 2) as measured, in m, and twists (m, 3) are those at their stamps (m/s, m/s,
+    rad/s). With J the quarter turn and `v + wz J z` the motion relative to a point at rest, the columns are
 
         J z (yaw),   (0, 1) (lateral),   -(v + wz J z) (latency),   -z (range scale),   -z / |z| (range bias)
 
@@ -47,13 +41,8 @@ def by_sensor(points_vehicle: Array, twists: Array) -> Array:
 
 
 def corrected(measured: Array, twists: Array, sensor: Array) -> Array:
-    """Return the detections `z + C b` (m, 2), or z as measured where the calibration b (5,) is empty.
-
-    They were measured at (m, 2), vehicle frame, while the vehicle moved with twists (m, 3).
-    """
-    if len(sensor) == 0:
-        return measured
-    return shifted(measured, twists, sensor)
+    """Return the detections `z + C b` (m, 2), or z as measured where the calibration b (5,) is empty."""
+    return shifted(measured, twists, sensor) if len(sensor) else measured
 
 
 @compiled
@@ -62,19 +51,12 @@ def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
     return np.asarray(measured + by_sensor(measured, twists) @ sensor)
 
 
-def in_vehicle(directions: Array, poses: Array) -> Array:
-    """Return vectors (m, 2), map frame, in the vehicle frames of poses (m, 3)."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    forward = c * directions[:, 0] + s * directions[:, 1]
-    return np.stack([forward, c * directions[:, 1] - s * directions[:, 0]], axis=1)
-
-
 def by_range(points_vehicle: Array) -> Array:
     """Return the derivatives (m, 2, 2, 2) of `M^-1` by the range scale and by the range bias.
 
-    M is the derivative of a corrected detection by the measured one, z (m, 2). The noise is that of measured
-    detections, so a residual r of a corrected one counts as `M^-1 r`. Otherwise least squares would shrink
-    the world, since a smaller world has smaller residuals. With I the identity they are
+    M is the derivative of a corrected detection by the measured one, z (m, 2). Noise is stated for measured
+    detections, so a residual r of a corrected one counts as `M^-1 r`; otherwise least squares would shrink
+    the world. The derivatives are
 
         I (range scale),   (I - z z' / |z|^2) / |z| (range bias)
     """
@@ -88,18 +70,16 @@ def by_range(points_vehicle: Array) -> Array:
 
 @dataclass(frozen=True)
 class SensorRows:
-    """How residuals of corrected detections depend on the calibration of the sensor."""
+    """Dependence of residuals of corrected detections on the sensor's calibration."""
 
-    factor: Array
-    """Residuals and all their derivatives are multiplied by this (m,), as if of measured detections."""
-    by_sensor: Array
-    """Derivatives (m, 5) of the multiplied residuals, or (m, 0) where nothing is estimated."""
+    factor: Array  # (m,) by which residuals and all their derivatives become those of measured detections
+    by_sensor: Array  # (m, 5) derivatives of the multiplied residuals, or (m, 0) if nothing is estimated
 
 
 def range_rates(directions: Array, poses: Array, measured: Array) -> Array:
     """Return the derivatives (m, 2) of `SensorRows.factor` by the range scale and the range bias.
 
-    They are `d' R (d M^-1) R' d` along unit vectors d (m, 2), map frame (see `by_range`). The detections were
+    They are `d' R (d M^-1) R' d` along unit vectors d (m, 2), map frame (see `by_range`), for detections
     measured at (m, 2), vehicle frame, from poses (m, 3) with rotations R.
     """
     along = in_vehicle(directions, poses)
@@ -118,8 +98,8 @@ def sensor_rows(
     """Return factors `f = 1 + rates b` and derivatives `f d' R C + r rates` of residuals `r = d . (p - q)`.
 
     d (m, 2) are unit vectors in the map frame and p corrected detections, measured at (m, 2), vehicle frame,
-    from poses (m, 3) while the vehicle moved with twists (m, 3). C is `by_sensor`, b the sensor's calibration
-    (5,), which is empty where it is not estimated, and `rates` (m, 2) are by default those of `range_rates`.
+    from poses (m, 3) with twists (m, 3). C is `by_sensor`, b the sensor's calibration (5,) or empty, and
+    `rates` (m, 2) are by default those of `range_rates`.
     """
     if len(sensor) == 0:
         return SensorRows(np.ones(len(residual)), np.zeros((len(residual), 0)))
@@ -134,9 +114,9 @@ def sensor_rows(
 def restored(residual: Array, measured: Array, twists: Array, sensor: Array) -> tuple[Array, Array]:
     """Return `M^-1` (m, 2, 2) and the derivatives of `M^-1 r` (m, 2, 5) by the sensor's calibration.
 
-    r (m, 2) are the expected minus the corrected detections, vehicle frame, which were measured at (m, 2)
-    while the vehicle moved with twists (m, 3). The derivatives are `-M^-1 C`, and `d M^-1 r` for the errors
-    of the ranges. For a calibration that is empty, M is the identity, and the derivatives are (m, 2, 0).
+    r (m, 2) are the expected minus the corrected detections, vehicle frame, measured at (m, 2) with twists
+    (m, 3). The derivatives are `-M^-1 C`, and `d M^-1 r` for the errors of the ranges. For an empty
+    calibration, M is the identity, and the derivatives are (m, 2, 0).
     """
     if len(sensor) == 0:
         return np.tile(np.eye(2), (len(measured), 1, 1)), np.zeros((len(measured), 2, 0))

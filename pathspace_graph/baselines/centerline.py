@@ -15,11 +15,11 @@ from pathspace_graph.batch.start import CurveMapper
 from pathspace_graph.batch.system import CurveGauge
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.gtsam_factors import pose_array, ribbon_factor
+from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.graph.gaussian import sparse_marginal
-from pathspace_graph.graph.variables import POSE, pose_key
+from pathspace_graph.graph.variables import POSE, pose_key, pose_keys
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, LapBatches, RunNoise, VehicleState
@@ -33,10 +33,10 @@ from pathspace_graph.spline.centre_line import SIDE, CentreCurve, Ribbon, find_l
 NAME: Final = "centerline"
 ONLINE_NAME: Final = "centerline-fixed-lag"  # names of the estimators on the command line
 ROOM: Final = 4.0  # distance along the line within which a foot point is searched for (m)
-RIBBON_LETTER: Final = "a"  # letter of the keys of a ribbon's control points, which hold `Point3` (x, y, h)
+RIBBON_LETTER: Final = "a"  # of the keys of a ribbon's control points, which hold `Point3` (x, y, h)
 ROUNDS: Final = 2  # optimizations; before each, the control points are held beside the poses anew
 MAX_ITERATIONS: Final = 15  # most iterations of one of them
-TOLERANCE: Final = 1e-5  # share by which an iteration lowers the error at least, or it is the last one
+TOLERANCE: Final = 1e-5  # largest relative gain of its last iteration
 
 
 def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
@@ -48,14 +48,11 @@ def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: 
     if covariance is not None:
         by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
         joint = by_ribbon @ covariance @ by_ribbon.T
-        joint = 0.5 * (joint + joint.T)
+        joint = 0.5 * (joint + joint.T) + sigma_shape**2 * np.eye(len(joint))
     boundaries = {}
     for label, (spline, jacobian) in edges.items():
-        own = NO_COVARIANCE
-        if joint is not None:
-            block = slice(at, at := at + len(jacobian))
-            own = joint[block, block] + sigma_shape**2 * np.eye(len(jacobian))
-            joint[block, block] = own
+        block = slice(at, at := at + len(jacobian))
+        own = NO_COVARIANCE if joint is None else joint[block, block].copy()
         boundaries[label] = SplineBoundary(spline, own, until.get(label, spline.domain[1]))
     return Map(ribbon.periodic, boundaries, joint)
 
@@ -63,8 +60,7 @@ def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: 
 def ribbon_of(track: Map, settings: MapperSettings) -> tuple[Ribbon, Array | None, dict[int, float]]:
     """Return the ribbon between the boundaries of a map, or raise a SettingsError.
 
-    With it come its covariance (3m, 3m), if that of the map is known, and the parameter up to which each open
-    edge is confirmed.
+    With it come its covariance (3m, 3m), if known, and the parameter up to which each open edge is confirmed.
     """
     curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
     P = track.covariance_of(*curves.values())
@@ -79,11 +75,9 @@ def ribbon_of(track: Map, settings: MapperSettings) -> tuple[Ribbon, Array | Non
 
 @at_scale
 class CenterlineMapper:
-    """Maps a track online as a ribbon.
+    """Maps a track online as a ribbon, from the joint Gaussian of the boundaries of `FixedLagMapper`.
 
-    The fixed-lag smoother holds what all detections say as a joint Gaussian of both boundaries, from which
-    the ribbon is estimated whenever the map is asked for. Where there is no line between the boundaries, the
-    map is theirs. What isn't described is that of `FixedLagMapper`.
+    Where there is no line between the boundaries, the map is theirs.
     """
 
     def __init__(
@@ -91,7 +85,6 @@ class CenterlineMapper:
     ) -> None:
         self.settings = settings or MapperSettings()
         self.boundaries = FixedLagMapper(replace(self.settings, scale=1.0), odometry_sigma)
-        """Mapper of both boundaries and of the poses."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         return self.boundaries.update(odometry, detections)
@@ -127,34 +120,30 @@ def ribbon_keys(ribbon: Ribbon) -> list[int]:
     return [int(gtsam.symbol(RIBBON_LETTER, j)) for j in range(ribbon.size)]
 
 
-def edge_factors(
-    start: BatchResult, line: CentreCurve, settings: MapperSettings
-) -> Iterator[gtsam.CustomFactor]:
-    """Yield a factor for each cycle with detections that the batch of both boundaries uses."""
-    table, parts = start.system.detections, []
+def edge_factors(start: BatchResult, line: CentreCurve, settings: MapperSettings) -> list[gtsam.CustomFactor]:
+    """Return a factor for each cycle with detections that the batch of both boundaries uses."""
+    table, variables, parts = start.system.detections, start.optimum.state.variables, []
     for side, (label, projected) in enumerate(start.optimum.projected.items()):
         used = start.system.scale(projected) > 0.0
         u = line.ribbon_parameters(side, projected.foot.u[used])
         parts.append((projected.rows[used], np.full(len(u), SIDE[label]), u))
     rows, sides, u = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.argsort(rows)
-    for own in np.split(order, np.flatnonzero(np.diff(table.cycle[rows[order]])) + 1):
-        if len(own):
-            row = rows[own]
-            yield ribbon_factor(
-                pose_key(table.cycle[row[0]]),
-                ribbon_keys(line.ribbon),
-                line.ribbon.tables,
-                points_vehicle=table.measured[row],
-                covariances=table.covariance[row],
-                sides=sides[own],
-                low=u[own] - ROOM,
-                high=u[own] + ROOM,
-                sigma_model=settings.batch.sigma_model,
-                huber=settings.gate.huber,
-                sensor_key=start.optimum.state.variables.sensor_key,
-                twists=table.twist[row],
-            )
+    rows, u = rows[order], u[order]
+    return spline_projection_factors(
+        pose_keys(table.cycle[rows]),
+        ribbon_keys(line.ribbon),
+        line.ribbon.tables,
+        points_vehicle=table.measured[rows],
+        covariances=table.covariance[rows],
+        low=u - ROOM,
+        high=u + ROOM,
+        sigma_model=settings.batch.sigma_model,
+        huber=settings.gate.huber,
+        sensor_key=variables.sensor_key,
+        twists=table.twist[rows],
+        sides=sides[order],
+    )
 
 
 def shape_factors(ribbon: Ribbon, poses: Array, settings: MapperSettings) -> Iterator[gtsam.CustomFactor]:
@@ -190,10 +179,7 @@ Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 def _of_ribbon(terms: Terms, weights: Array) -> Terms:
-    """Return terms of control points of a ribbon (k, 3), with a row for each of the weights (r, k) of widths.
-
-    The other rows are those of the centre line, which `terms` are.
-    """
+    """Return the terms of a centre line and weights (r, k) of widths as those of a ribbon's points (k, 3)."""
 
     def of_ribbon(points: Array, pose: Array) -> tuple[Array, Array, Array]:
         residual, by_points, by_pose = terms(points[:, :2], pose)

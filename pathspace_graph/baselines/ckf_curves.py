@@ -24,6 +24,12 @@ from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 SIGMA_START: Final = 0.3  # of a new curve's control points (m), beyond that of its detections
 
 
+def in_map(detections: Detections, pose: Array) -> tuple[Array, Array]:
+    """Return points (m, 2) and covariances (m, 2, 2) of detections from a pose (3,), map frame."""
+    turned = rotated(detections.covariances, np.full(len(detections.labels), pose[2]))
+    return to_map(detections.points_vehicle, pose[None]), turned
+
+
 class CurveState:
     """State `x = [pose | calibration | left control points | right control points]`, and the knots."""
 
@@ -35,7 +41,6 @@ class CurveState:
 
     @property
     def pose(self) -> Array:
-        """Return the pose (3,), x (m), y (m), theta (rad, not wrapped), in the map frame: a view."""
         return self.belief.pose
 
     def offset(self, label: int) -> int:
@@ -43,7 +48,7 @@ class CurveState:
         return sum(curve.size for other, curve in self.curves.items() if other < label)
 
     def control_points(self, label: int) -> Array:
-        """Return the distinct control points (m, 2) of a curve in m, map frame: a view."""
+        """Return a view of the distinct control points (m, 2) of a curve in m, map frame."""
         start = self.offset(label)
         return self.belief.points[start : start + self.curves[label].size]
 
@@ -62,9 +67,8 @@ class CurveState:
     def foot_points(self, label: int, points: Array, low: Array, high: Array) -> FootPoints:
         """Return the foot points of points (m, 2) in the stretches [low, high] (m,) of a curve."""
         curve, s = self.spline(label), self.settings.spline
-        return foot_points(
-            curve.tables, curve.control_points, points, low, high, s.search_step, s.search_iterations
-        )
+        search = s.search_step, s.search_iterations
+        return foot_points(curve.tables, curve.control_points, points, low, high, *search)
 
     def locate_vehicle(self) -> None:
         """Update the vehicle's parameter on each curve: near the last one, or anywhere if it has left."""
@@ -148,24 +152,21 @@ AT_END: Final = 1e-6  # a foot point within this distance (m) of the end's param
 
 
 class Expansion:
-    """What was detected beyond the curves, which expands them.
+    """Expands curves by detections of confirmed tracks that come next along the path.
 
-    A detection expands a curve only if it belongs to a confirmed track that comes next along the path. An end
-    that the vehicle has passed is extended beside the path.
+    An end that the vehicle has passed is extended beside the path.
     """
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
         self.tentative = {label: TentativeTracks(settings.growth) for label in BOUNDARIES}
-        """Tracks of all recent detections, by label."""
         self.observed: dict[int, list[Array]] = {label: [] for label in BOUNDARIES}
         """All distinct cones that were confirmed, as points (2,) in m, map frame, by label."""
         self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # lengths (m) since the last cone
 
     def observe(self, state: CurveState, detections: Detections) -> None:
         """Add all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
-        points = to_map(detections.points_vehicle, state.pose[None])
-        covariances = rotated(detections.covariances, np.full(len(points), state.pose[2]))
+        points, covariances = in_map(detections, state.pose)
         add_by_label(self.tentative, detections.labels, points, covariances, detections.t)
         for label, tentative in self.tentative.items():
             known, radius = self.observed[label], self.settings.growth.merge_radius
@@ -176,7 +177,7 @@ class Expansion:
     def expand(
         self, state: CurveState, detections: Detections, path_ahead: PathAhead, free: BoolArray
     ) -> set[int]:
-        """Begin or extends each curve by detections that update none (`free` (m,))."""
+        """Begin or extend each curve by detections that update none (`free` (m,)); return which grew."""
         extended: set[int] = set()
         for label in BOUNDARIES:
             rows = np.flatnonzero(free & (detections.labels == label))
@@ -228,10 +229,10 @@ class Expansion:
         """Extend a curve to the last candidate of the proximity chain; return whether there is any."""
         if len(found.points) == 0:
             return False
-        order = proximity_chain(found.points, _end_position(state, label))
+        last = _end_position(state, label)
+        order = proximity_chain(found.points, last)
         points, rows = found.points[order], found.indices[order]
         covariances = self._covariances(detections, rows)
-        last = _end_position(state, label)
         for i in range(len(rows)):
             final = i == len(rows) - 1
             too_far = not final and np.hypot(*(points[i + 1] - last)) > STRETCH
@@ -264,7 +265,7 @@ class Expansion:
 def beyond_end(
     points: Array, u: Array, high: float, control_points: Array, settings: CkfSettings
 ) -> BoolArray:
-    """Return which points (m, 2) with foot points at u (m,) meet the paper's three conditions (m,).
+    """Return which points (m, 2) with foot points at u (m,) meet the paper's three conditions.
 
     The foot point is the end `high`; the point is farther from `C_n` than the growth threshold, and farther
     from `C_{n-1}` than the separation.

@@ -12,8 +12,8 @@ from scipy.linalg import block_diag
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import scatter
 from pathspace_graph.factors.residuals import project
-from pathspace_graph.factors.se2 import rotation, to_map, to_vehicle
-from pathspace_graph.factors.sensor import SENSOR_SIZE, in_vehicle
+from pathspace_graph.factors.se2 import in_vehicle, rotation, to_map, to_vehicle
+from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
@@ -52,8 +52,8 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     """Return the detections within the gate of a curve: `d^2 < chi^2 (n' K n + sigma^2 + g' Sigma g)`.
 
     d is the signed distance across the curve, n its normal, K the covariance of the detection, sigma^2 the
-    variances of the settings, g the derivative of d by pose and control points, and Sigma their joint
-    covariance. The foot point is in the stretch that the vehicle sees, and is not at an end of it.
+    variances of the settings, g the derivative of d by pose, calibration and control points, and Sigma their
+    covariance. The foot point is inside the stretch that the vehicle sees.
     """
     gate, curve = state.settings.gate, state.curves[label]
     rows = np.flatnonzero((detections.labels == label) | (detections.labels == UNKNOWN))
@@ -143,7 +143,7 @@ class CurveBlock:
 
 
 def update(state: CurveState, detections: Detections, found: dict[int, OnCurve]) -> None:
-    """Fit S_z of each curve, and makes one Kalman update of pose and map with all of them."""
+    """Fit S_z of each curve, and make one Kalman update of pose and map with all of them."""
     blocks = [_fit(state, label, detections, on) for label, on in found.items() if len(on.rows)]
     if not blocks:
         return
@@ -170,11 +170,8 @@ def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> 
     """
     control = np.flatnonzero(on.basis.sum(axis=0) > LEAST_BASIS)
     known = to_vehicle_rows(state.pose[None], state.control_points(label)[control].reshape(1, -1))
-    ckf, points, t = (
-        state.settings.ckf,
-        detections.points_vehicle[on.rows],
-        on.tangents @ rotation(state.pose[2]),
-    )
+    ckf, points = state.settings.ckf, detections.points_vehicle[on.rows]
+    t = on.tangents @ rotation(state.pose[2])
     along = ckf.sigma_along**2 * t[:, :, None] * t[:, None, :]
     covariances = detections.covariances[on.rows] + ckf.sigma_model**2 * np.eye(POINT) + along
     fitted = fit_detections(on.basis[:, control], points, covariances, known.reshape(-1, POINT), ckf)

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise
-from pathspace_graph.factors.se2 import left_of, rotated, to_map
+from pathspace_graph.factors.se2 import left_of, to_map
 from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.graph.variables import POINT, POSE, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
@@ -30,7 +30,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 
-from .ckf_curves import CurveState, Expansion
+from .ckf_curves import CurveState, Expansion, in_map
 from .ckf_update import OnCurve, classify, update
 from .landmark_association import ROUGH, Gates, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
@@ -55,7 +55,6 @@ class _Filter:
         self.settings = settings or MapperSettings()
         self.front_end = FrontEnd(self.settings, known_noise(odometry_sigma))
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
-        """State `x = [pose | calibration | control points or landmarks]`."""
         self._begin()
 
     @abstractmethod
@@ -63,7 +62,6 @@ class _Filter:
         """Make what only this filter has."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Process one perception cycle: the twists since the last one, and the detections of now."""
         watch = Stopwatch()
         cycle = self.front_end.admit(odometry, detections)
         reading = self.front_end.update(cycle.odometry, cycle.detections)
@@ -173,9 +171,9 @@ def associate_early_segment(
 def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
     """Make one Kalman update: the end of each curve lies on its beginning, at the correspondences.
 
-    `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where the motion moves S(u), near the end, on S(w), with
-    the normal n. Along the tangent all k correspondences are one result of the registration, so each has
-    sqrt(k) times its sigma. False, and nothing is done, if an end has not reached its beginning yet.
+    `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where the motion moves S(u) on S(w), with the normal n.
+    Along the tangent all k correspondences are one result of the registration, so each has sqrt(k) times its
+    sigma. False, and nothing is done, if an end has not reached its beginning yet.
     """
     overlaps = {label: _overlap(state, label, motion) for label in state.curves}
     if not all(len(u) for u, _ in overlaps.values()):
@@ -231,17 +229,16 @@ def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
 class LandmarkCkf(_Filter):
     """Maps cones as points: predict, associate, update, create.
 
-    The paper describes its baseline as "a similarly structured state and overall implementation style", with
-    the Mahalanobis distance as the cost of the assignment (section Results). What it leaves open makes the
-    baseline no weaker than it has to be: the gates are those of the landmark graph, a detection is associated
-    only with a landmark of its own label, a track becomes a landmark after `ckf.sightings` detections, and
-    the odometry is calibrated. Landmarks are never merged, and the loop never closes, so ghosts stay.
+    The paper's baseline has "a similarly structured state and overall implementation style", with the
+    Mahalanobis distance as the cost of the assignment (section Results). What it leaves open makes it no
+    weaker than need be: the gates are those of the landmark graph, labels must agree, a track becomes a
+    landmark after `ckf.sightings` detections, and the odometry is calibrated. Landmarks are never merged, and
+    the loop never closes, so ghosts stay.
     """
 
     def _begin(self) -> None:
         self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
-        """Tracks by label that are not landmarks yet."""
 
     def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
         watch.lap("predict")
@@ -280,8 +277,7 @@ class LandmarkCkf(_Filter):
 
     def _create(self, detections: Detections, new: BoolArray) -> None:
         """Add a landmark for each track that has enough detections beyond the gate of every landmark."""
-        points = to_map(detections.points_vehicle, self.belief.pose[None])
-        covariances = rotated(detections.covariances, np.full(len(points), self.belief.pose[2]))
+        points, covariances = in_map(detections, self.belief.pose)
         chosen = [np.zeros(0, np.intp)]
         for label, tentative in self.tentative.items():
             rows = np.flatnonzero(new & (detections.labels == label))

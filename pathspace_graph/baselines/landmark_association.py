@@ -24,24 +24,22 @@ HELD_MARGIN: Final = 1e-9  # of a held pair below the match gate, where round-of
 
 
 class Gates(NamedTuple):
-    """Two gates on squared Mahalanobis distances with two degrees of freedom."""
+    """Gates on squared Mahalanobis distances, chi-square quantiles with two degrees of freedom."""
 
-    match: float  # a detection may be associated with a landmark below this distance
-    create: float  # it may create a landmark if it is above this distance from every compatible landmark
+    match: float  # below it, a detection may be associated with a landmark
+    create: float  # above it for every compatible landmark, a detection may create one
 
     @staticmethod
     @cache
     def of(settings: LandmarkSettings) -> "Gates":
-        """Return the chi-square quantiles of the two probabilities in the settings."""
         return Gates(chi2_quantile(settings.match, POINT), chi2_quantile(settings.create, POINT))
 
 
 def associate(cost: Array, gates: Gates) -> tuple[IntArray, BoolArray]:
     """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
-    cost (m, n) holds squared Mahalanobis distances of detections to landmarks, infinite for other labels.
-    Return the column (m,) of each detection's landmark, or UNASSOCIATED, and which detections (m,) lie beyond
-    the create gate of every compatible landmark.
+    cost (m, n) are squared Mahalanobis distances of detections to landmarks, infinite for other labels.
+    Return the column (m,) of each landmark, or UNASSOCIATED, and which detections (m,) may create one.
     """
     landmark = np.full(len(cost), UNASSOCIATED, np.intp)
     rows, columns = scipy.optimize.linear_sum_assignment(np.minimum(cost, gates.match))
@@ -58,9 +56,9 @@ def squared_mahalanobis(innovations: Array, covariances: Array) -> Array:
 
 
 def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_covariances: Array) -> Array:
-    """Return the squared Mahalanobis distances (m, n) with `S_ij = H_j Sigma H_j' + K_i`, vehicle frame.
+    """Return the squared Mahalanobis distances (m, n) of detections (m, 2) and predicted ones (n, 2).
 
-    Of detections (m, 2) with covariances K (m, 2, 2), and landmarks (n, 2) with `H Sigma H'` (n, 2, 2).
+    Their covariances are (m, 2, 2) and (n, 2, 2).
     """
     innovations = predicted[None] - points[:, None]
     return squared_mahalanobis(innovations, predicted_covariances[None] + covariances[:, None])
@@ -106,8 +104,8 @@ def associate_newest(
 def predict(smoother: LandmarkSmoother, landmarks: IntArray, cycle: int | None = None) -> tuple[Array, Array]:
     """Return where landmarks (k,), by position, should be detected from the newest or a given cycle's pose.
 
-    The places (k, 2) are in m, vehicle frame. Their covariances `H_j Sigma H_j'` (k, 2, 2) have the joint
-    covariance Sigma of pose and landmark in the last step, zero before the first step.
+    The places (k, 2) are in m, vehicle frame, with covariances `H_j Sigma H_j'` (k, 2, 2), Sigma that of pose
+    and landmark in the last step, zero before the first one.
     """
     state, k = smoother.map.state, len(landmarks)
     cycles = np.full(k, smoother.next_cycle - 1 if cycle is None else cycle)
@@ -162,10 +160,7 @@ def pairs_within(landmarks: Array, labels: IntArray, radius: float) -> tuple[Int
 
 
 def difference_covariances(joint: Array, i: IntArray, j: IntArray) -> Array:
-    """Return the covariances (..., 2, 2) of what points i and j (...,) with a joint one (2n, 2n) are apart.
-
-    Two estimates of one cone may differ by `SIGMA_MERGE` more.
-    """
+    """Return the covariances (..., 2, 2) of the differences of points i and j (...,), plus `SIGMA_MERGE`."""
     blocks = joint.reshape(len(joint) // POINT, POINT, -1, POINT)
     spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
     return np.asarray(spread + SIGMA_MERGE**2 * np.eye(POINT))
@@ -174,10 +169,7 @@ def difference_covariances(joint: Array, i: IntArray, j: IntArray) -> Array:
 def compatible_pairs(
     newer: IntArray, older: IntArray, offset: Array, covariances: Array, settings: LandmarkSettings
 ) -> IntArray:
-    """Return the indices of the pairs (k,) that are one cone, by the gate on their Mahalanobis distance.
-
-    The nearest pair is taken first, and each landmark is in one pair at most.
-    """
+    """Return the indices of the pairs (k,) in the match gate, nearest first, one for each landmark."""
     distance = squared_mahalanobis(offset, covariances)
     taken: set[int] = set()
     chosen = []

@@ -23,7 +23,7 @@ from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import POINT, POSE, indices
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import BatchRun, RunNoise
-from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
+from pathspace_graph.labels import BOUNDARIES, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
@@ -37,10 +37,10 @@ from .landmark_fixed_lag import LandmarkFixedLag
 from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
 
 NAME: Final = "landmark-batch"  # the estimator's name on the command line
-MAX_ROUNDS: Final = 10  # all detections are associated anew at most this number of times
-SETTLED: Final = 1e-3  # largest share of the detections that changed their landmark in the last round
+MAX_ROUNDS: Final = 10  # most rounds of associating all detections anew
+SETTLED: Final = 1e-3  # largest share of detections that change their landmark in the last round
 MAX_STEPS: Final = 80  # most steps of a round's optimization
-TOLERANCE: Final = 1e-6  # it ends where |cost_before - cost_after| is at most this share of the cost
+TOLERANCE: Final = 1e-6  # largest relative gain of the last step
 
 
 @log_at_scale
@@ -92,19 +92,16 @@ class LandmarkBatch:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkSystem:
-    """Minimizes `1/2 |odometry|^2 + sum rho(associated detections) + 1/2 |calibration, first pose|^2`.
+    """Minimizes `1/2 |odometry|^2 + sum rho(associated detections) + 1/2 |calibration, first pose|^2`."""
 
-    The associations are constant, and a detection without a landmark costs nothing.
-    """
-
-    detections: LandmarkDetections  # detections of the whole log
-    chain: LogOdometry  # odometry of the whole log
+    detections: LandmarkDetections
+    chain: LogOdometry
     settings: MapperSettings
-    noise: RunNoise  # noise that is used
+    noise: RunNoise
 
     @classmethod
     def of_log(cls, log: Log, settings: MapperSettings, noise: KnownNoise) -> "LandmarkSystem":
-        """Return the problem of a log without any association; `noise` is what is known before."""
+        """Return the problem of a log without any association; `noise` is what is known before it."""
         judged = judge_log(log, noise, settings)
         detections = LandmarkDetections.of(judged.cycles, twists=judged.chain.twists)
         return cls(detections, judged.chain, judged.settings, judged.noise)
@@ -226,9 +223,8 @@ class Reassociation:
         for label in BOUNDARIES:
             rows = free[detections.label[free] == label]
             points, cycles = self._confirmed(rows), detections.cycle[rows]
-            chosen, landmark = association.associate_created(
-                self.points_map[rows], cycles, points, self.settings.growth
-            )
+            new = self.points_map[rows], cycles, points, self.settings.growth
+            chosen, landmark = association.associate_created(*new)
             numbers = self.state.add(points, np.full(len(points), label, np.intp))
             detections.take(rows[chosen], numbers[landmark])
 
@@ -257,10 +253,7 @@ def relabel(
 
 
 def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray, jacobian: Array) -> Array:
-    """Return `J Sigma J'` (m, 2, 2) of landmarks with keys (m,), as detected from the poses of cycles (m,).
-
-    J (m, 2, 5) is the derivative by [pose | landmark].
-    """
+    """Return `J Sigma J'` (m, 2, 2), J (m, 2, 5) by [pose | landmark], of cycles (m,) and keys (m,)."""
     landmark = problem.map.columns(keys)[:, None] + np.arange(POINT)
     pose = POSE * cycles[:, None] + np.arange(POSE)
     cross = problem.cross_covariance[pose[:, :, None], landmark[:, None, :]]
@@ -283,8 +276,8 @@ def solve_landmarks(
 ) -> tuple[LandmarkSystem, LandmarkState]:
     """Minimize all squared Mahalanobis distances over poses, calibration and landmarks; no loss is robust.
 
-    associations (R,) holds the number of the landmark of each detection in file order; negative ones are left
-    out, and so are orange cones.
+    associations (R,) are the numbers of the detections' landmarks in file order; negative ones are left out,
+    and so are orange cones.
     """
     associations = associations[~np.concatenate([is_orange(cycle) for cycle in log.cycles])]
     settings = settings or MapperSettings()
@@ -303,12 +296,10 @@ def start_oracle(system: LandmarkSystem, associations: IntArray) -> LandmarkStat
     calibration = np.array(system.settings.calibrations)
     poses = system.chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
     points = to_map(detections.point[rows[first]], poses[detections.cycle[rows[first]]])
-    labels = detections.label[rows]
-    votes = np.stack(
-        [np.bincount(landmark[labels == label], minlength=len(numbers)) for label in (LEFT, RIGHT, UNKNOWN)]
-    )
+    votes = np.zeros((len(numbers), 3), np.intp)  # left, right, unknown
+    np.add.at(votes, (landmark, detections.label[rows]), 1)
     state = LandmarkState()
-    state.add(points, votes.argmax(axis=0).astype(np.intp), numbers.astype(np.intp))
-    state.votes = votes[: len(BOUNDARIES)].T
+    state.add(points, votes.argmax(axis=1), numbers.astype(np.intp))
+    state.votes = votes[:, : len(BOUNDARIES)]
     insert_drive(state.variables, calibration, poses)
     return state

@@ -1,8 +1,7 @@
 """The Hungarian landmark graph online: cones are points in the same fixed-lag smoother as the curves.
 
-The loop closes where enough of the landmarks seen now are those of the beginning. The landmarks seen now and
-those not seen for long have one joint covariance. So a set of pairs can be tested as a whole, since each
-accepted pair moves all others (joint compatibility, Neira and Tardos 2001).
+The loop closes where enough of the landmarks seen now are those of the beginning. Their joint covariance
+tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
 from dataclasses import replace
@@ -55,7 +54,6 @@ class LandmarkFixedLag:
         self.smoother.window.exact = True
         self.path = DrivenPath()
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
-        """Tracks by label that are not landmarks yet."""
         self.believed = self.settings  # settings with the priors of the calibrations as they are now
         self.closed = False
         self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
@@ -226,10 +224,7 @@ class JointCompatibility:
         return mean - (gain @ innovation).reshape(-1, POINT), covariance - gain @ cross.T
 
     def grow(self, i: int, j: int, gate: float) -> tuple[list[tuple[int, int]], float]:
-        """Return pairs, and the squared distance of all together: a hypothesis.
-
-        It begins with one pair, and adds the best pair while that is in the gate.
-        """
+        """Return pairs, begun with one and grown by the best in the gate, and their squared distance."""
         mean, covariance, total = self.mean, self.covariance, 0.0
         distances = self.distances(mean, covariance)
         free = np.ones(distances.shape, bool)
@@ -249,8 +244,8 @@ def detect_loop(
 ) -> tuple[IntArray, IntArray] | None:
     """Return pairs (k,) of recent and old landmarks, within `reach` (m), that are one cone each.
 
-    They are those of the best hypothesis, and None if it is not clear or too small. It explains detections
-    better than new landmarks do, by a gate for each pair less the distance of all.
+    They are those of the best hypothesis, or None if it is not clear or too small. Its score is a gate for
+    each pair less the distance of all.
     """
     state, settings = smoother.map.state, smoother.map.settings
     old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]

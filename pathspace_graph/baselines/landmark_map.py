@@ -137,7 +137,6 @@ class LandmarkMap:
 
     @property
     def structure(self) -> object:
-        """Object that is another one whenever other landmarks are held together."""
         return self.loop_pairs
 
     def gauge(self, whole: bool) -> list[Rows]:
@@ -153,11 +152,9 @@ class LandmarkMap:
         residual = (pairs[:, 0] - pairs[:, 1]).ravel() / SIGMA_MERGE
         return [Rows(keys, np.tile(axes, (len(pairs), 1)), residual, keys[:, 0])]
 
-    def activate(self, keys: IntArray) -> None:
-        """Do nothing, since every landmark is always active."""
+    def activate(self, keys: IntArray) -> None: ...  # every landmark is always active
 
-    def activate_all(self) -> None:
-        """Do nothing, since every landmark is always active."""
+    def activate_all(self) -> None: ...
 
     def drop_cycle(self, cycle: int) -> None:
         self.detections.keep_from(cycle + 1)
@@ -183,8 +180,8 @@ def landmark_rows(
 ) -> Rows:
     """Return the rows `w W (R^T (l - t) - z)` of associated detections (m,), with `W' W = K^-1`.
 
-    w is the root of each row's Huber weight. The detections z are corrected by the sensor's calibration, and
-    the residuals are those of measured ones (`factors.sensor:restored`).
+    w is the root of each row's Huber weight. The detections z are corrected by the sensor's calibration, the
+    residuals those of measured ones (`factors.sensor:restored`).
     """
     cycles, numbers, sensor = detections.cycle[chosen], detections.landmark[chosen], state.variables.sensor
     poses, points = state.variables.poses_at(cycles), state.landmarks[state.positions(numbers)]
@@ -201,12 +198,10 @@ def landmark_rows(
 
 def two_rows(cycles: IntArray, numbers: IntArray, jacobian: Array, residual: Array) -> Rows:
     """Return Jacobians (m, 2, n) and residuals (m, 2) as rows on [pose | landmark], owned by the cycles."""
-    keys = [pose_keys(cycles), landmark_keys(numbers)]
-    if jacobian.shape[2] > POSE + POINT:
-        keys.insert(1, np.full(len(cycles), SENSOR_KEY))
+    sensor = [np.full(len(cycles), SENSOR_KEY)] if jacobian.shape[2] > POSE + POINT else []
+    keys = np.stack([pose_keys(cycles), *sensor, landmark_keys(numbers)], axis=1)
     flat = jacobian.reshape(-1, jacobian.shape[2])
-    both = np.repeat(np.stack(keys, axis=1), POINT, axis=0)
-    return Rows(both, flat, residual.ravel(), np.repeat(cycles, POINT))
+    return Rows(np.repeat(keys, POINT, axis=0), flat, residual.ravel(), np.repeat(cycles, POINT))
 
 
 def landmark_counts(labels: IntArray) -> tuple[int, int]:

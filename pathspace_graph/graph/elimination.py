@@ -9,7 +9,6 @@ calibration.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, cast
 
@@ -24,25 +23,19 @@ from .gaussian import cholesky, factors_of, graph_of, keys_of, normal_equations,
 from .rows import Rows, jacobian_factors
 from .variables import POSE, Layout, Variables, are_poses, sizes
 
-POSES_IN_FACTOR: Final = 8
-"""The rows of this number of poses make one factor. Each factor costs its creation from Python, and each pose
-makes it wider. Between 5 and 10 the time hardly changes."""
+POSES_IN_FACTOR: Final = 8  # few factors are cheap to create, narrow ones to eliminate; 5 to 10 take alike
 
 
 def owners(cycles: IntArray, side: IntArray | int = 0) -> IntArray:
     """Return the number of the factor that the rows of poses belong to, by perception cycles of any shape.
 
-    Rows on the left (0) and the right (1) boundary have no key of the map in common, so each side has its own
-    factor: two narrow factors are faster to eliminate than a wide one that is half empty.
+    Each side, left (0) and right (1), has its own, since they have no key of the map in common.
     """
     return np.asarray(2 * (cycles // POSES_IN_FACTOR) + side)
 
 
 def linear_graph(groups: Sequence[Rows], variables: Variables) -> gtsam.GaussianFactorGraph:
-    """Return the rows as a graph whose unknowns are the changes from the variables' values.
-
-    The graph is for one linearization: unlike the window's factors, these are not kept.
-    """
+    """Return the rows as a graph whose unknowns are the changes from the variables' values."""
     return graph_of(*jacobian_factors(groups, variables.layout).values())
 
 
@@ -68,8 +61,7 @@ class Elimination:
         require_keys(graph, layout)
         poses = are_poses(layout.keys)
         self.poses = Layout(layout.keys[poses])
-        self.map = Layout(layout.keys[~poses])
-        """Columns of the other variables, which come first in a solution."""
+        self.map = Layout(layout.keys[~poses])  # they come first in a solution
         self._net, remaining = _eliminated(graph, self.map, len(self.poses.keys))
         self.information, self.vector = np.zeros((0, 0)), np.zeros(0)
         """The marginal of the map is `1/2 y' L y - g' y`, with information L (n, n) and vector g (n,)."""
@@ -123,32 +115,35 @@ class Elimination:
     def _pose_covariances(self) -> tuple[Array, Array]:
         """Return marginals and cross covariances, computed from the root clique to the leaves.
 
-        A clique's poses x are `T y + R^-1 w` with w white, where y is in the map or in the clique above. So
-        `cov(x, z) = T cov(y, z)` for all z above, and `cov(x) = T cov(y) T' + R^-1 R^-T` (Kaess and Dellaert
-        2009).
+        A clique's poses x are `T y + R^-1 w` with w white, so `cov(x, z) = T cov(y, z)` for all z above, and
+        `cov(x) = T cov(y) T' + R^-1 R^-T` (Kaess and Dellaert 2009).
         """
         marginals = np.empty((self.poses.size // POSE, POSE, POSE))
         cross = np.empty((self.poses.size, self.map.size))
         joints: list[tuple[IntArray, Array]] = []
         clique_of, place = np.empty((2, self.poses.size), np.intp)
-        for clique in self._cliques():
-            x, y, m = clique.poses, clique.poses_above, clique.map_above
+        for x, y, m, root, by_poses, by_map in self._cliques():
             above = np.zeros((len(y), len(y)))
             if len(y):
                 columns, joint = joints[clique_of[y].max()]  # the deepest that holds one of y holds all
                 place[columns] = np.arange(len(columns))
                 above = joint[np.ix_(place[y], place[y])]
-            cross[x] = clique.by_map @ self.map_covariance[m] + clique.by_poses @ cross[y]
-            with_above = clique.by_map @ cross[np.ix_(y, m)].T + clique.by_poses @ above
-            own = cross[np.ix_(x, m)] @ clique.by_map.T + with_above @ clique.by_poses.T
-            own += clique.root @ clique.root.T
+            cross[x] = by_map @ self.map_covariance[m] + by_poses @ cross[y]
+            with_above = by_map @ cross[np.ix_(y, m)].T + by_poses @ above
+            own = cross[np.ix_(x, m)] @ by_map.T + with_above @ by_poses.T
+            own += root @ root.T
             clique_of[x] = len(joints)
             joints.append((np.append(x, y), np.block([[own, with_above], [with_above.T, above]])))
             for k in range(0, len(x), POSE):
                 marginals[x[k] // POSE] = own[k : k + POSE, k : k + POSE]
         return marginals, cross
 
-    def _cliques(self) -> Iterator[_Clique]:
+    def _cliques(self) -> Iterator[tuple[IntArray, IntArray, IntArray, Array, Array, Array]]:
+        """Yield the conditionals `x = T y + R^-1 w` of poses x (f,), given their separator y, root first.
+
+        The tuples hold the entries of x, of the poses (p,) and of the map's variables (m,) in y, R^-1 (f, f),
+        and the columns of T for the poses (f, p) and for the map (f, m).
+        """
         for k in reversed(range(self._net.size())):
             conditional = self._net.at(k)
             keys = np.array(conditional.keys(), np.intp)
@@ -157,7 +152,7 @@ class Elimination:
             root, _ = lapack.dtrtri(R)
             above, on_poses = keys[count:], are_poses(keys[count:])
             by_above, entries = -(root @ S), np.repeat(on_poses, sizes(above))
-            yield _Clique(
+            yield (
                 self.poses.entries(keys[:count]),
                 self.poses.entries(above[on_poses]),
                 self.map.entries(above[~on_poses]),
@@ -167,31 +162,9 @@ class Elimination:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class _Clique:
-    """Conditional `x = T y + R^-1 w` of some poses x, given the variables y of their separator."""
-
-    poses: IntArray
-    """Entries (f,) of x among the poses."""
-    poses_above: IntArray
-    """Entries (p,) of the poses of y among the poses."""
-    map_above: IntArray
-    """Entries (m,) of the map variables of y among the map's."""
-    root: Array
-    """Inverse R^-1 (f, f)."""
-    by_poses: Array
-    """Columns (f, p) of T for the poses of y."""
-    by_map: Array
-    """Columns (f, m) of T for the map variables of y."""
-
-
 def eliminated_system(graph: gtsam.GaussianFactorGraph, kept: Layout) -> tuple[Array, Array]:
-    """Return H (n, n) and g (n,) of `1/2 d' H d - g' d` on a layout, with all other variables eliminated.
-
-    Raises as `Elimination` does.
-    """
-    others = len(keys_of(graph)) - len(kept.keys)
-    _, remaining = _eliminated(graph, kept, others)
+    """Return H (n, n) and g (n,) on a layout, all others eliminated. Raises as `Elimination` does."""
+    _, remaining = _eliminated(graph, kept, len(keys_of(graph)) - len(kept.keys))
     return normal_equations(remaining, kept)
 
 
@@ -214,7 +187,7 @@ def _eliminated(
 
 
 class Damping:
-    """Levenberg-Marquardt's weight: it falls by a tenth after each step that is taken, and grows else."""
+    """Levenberg-Marquardt's weight: divided by 10 after an accepted step, times 5 after a rejected one."""
 
     def __init__(self, first: float = 1e-2, least: float = 1e-6, most: float = 1e6) -> None:
         self._first, self._least, self._most = first, least, most
@@ -222,17 +195,13 @@ class Damping:
 
     @property
     def exhausted(self) -> bool:
-        """Return whether the weight is larger than any that is worth trying."""
         return self.weight > self._most
 
     def lower(self) -> None:
-        """Follow a step that made the cost smaller."""
         self.weight = max(0.1 * self.weight, self._least)
 
     def grow(self) -> None:
-        """Follow a step that made the cost larger."""
         self.weight *= 5.0
 
     def reset(self) -> None:
-        """Begin again at the first weight."""
         self.weight = self._first

@@ -21,11 +21,8 @@ from .variables import POINT, Layout, Variables, names, sizes, spread
 GraphPart = (
     gtsam.GaussianFactor | gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet | gtsam.GaussianBayesTree
 )
-"""A graph can be extended by each of these types."""
-NEGLIGIBLE: Final = 1e-6
-"""Negligible information (1/m^2), which keeps a pivot from being zero."""
-RANK_TOLERANCE: Final = 1e-12
-"""Information below this share of the diagonal's counts as zero."""
+NEGLIGIBLE: Final = 1e-6  # information (1/m^2) that keeps a pivot from being zero
+RANK_TOLERANCE: Final = 1e-12  # information below this share of the diagonal's counts as zero
 
 
 def graph_of(*factors: GraphPart) -> gtsam.GaussianFactorGraph:
@@ -50,10 +47,7 @@ def keys_of(graph: gtsam.GaussianFactorGraph) -> IntArray:
 
 
 def require_keys(graph: gtsam.GaussianFactorGraph, layout: Layout) -> None:
-    """Raise SingularSystemError where no factor holds a key of the layout, and ValueError for a foreign key.
-
-    GTSAM gives a smaller system in the first case, without an error.
-    """
+    """Raise SingularSystemError where no factor holds a key of the layout, ValueError for a foreign key."""
     held = keys_of(graph)
     if np.array_equal(held, layout.keys):
         return
@@ -64,10 +58,7 @@ def require_keys(graph: gtsam.GaussianFactorGraph, layout: Layout) -> None:
 
 
 def normal_equations(graph: gtsam.GaussianFactorGraph, layout: Layout) -> tuple[Array, Array]:
-    """Return H (n, n) and g (n,) of `1/2 d' H d - g' d`, on the columns of a layout.
-
-    H is stored by columns. Raises as `require_keys` does.
-    """
+    """Return H (n, n), stored by columns, and g (n,) of `1/2 d' H d - g' d`. Raises as `require_keys`."""
     require_keys(graph, layout)
     hessian, vector = graph.hessian(layout.ordering)
     return hessian, vector
@@ -76,7 +67,7 @@ def normal_equations(graph: gtsam.GaussianFactorGraph, layout: Layout) -> tuple[
 def cholesky(hessian: Array) -> Array:
     """Return the lower factor of `L L' = H`, whose upper triangle is not cleared.
 
-    It overwrites an H that is stored by columns. SingularSystemError where H is not positive definite.
+    An H stored by columns is overwritten. SingularSystemError where H is not positive definite.
     """
     factor, info = lapack.dpotrf(hessian, lower=1, clean=0, overwrite_a=1)
     if info != 0:
@@ -98,11 +89,10 @@ def half_solve(factor: Array, columns: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class FactoredSystem:
-    """Cholesky factor of normal equations."""
+    """Lower Cholesky factor (n, n) of normal equations; its upper triangle is not cleared."""
 
     layout: Layout
     factor: Array
-    """Lower Cholesky factor (n, n); its upper triangle is not cleared."""
 
     def covariance(self, keys: IntArray) -> Array:
         """Return the joint covariance (q, q) of keys (k,), in their order, all others marginalized out."""
@@ -120,12 +110,10 @@ def factorize(graph: gtsam.GaussianFactorGraph, layout: Layout) -> FactoredSyste
 
 @dataclass(frozen=True, eq=False)
 class HeldMap:
-    """What was known of a closed map when its gauge was held: the most that is claimed of it."""
+    """Joint covariance (2k, 2k) of a closed map's points (k,) when its gauge was held: the most claimed."""
 
     keys: IntArray
-    """(k,) Keys of all its points."""
     covariance: Array
-    """(2k, 2k) Their joint covariance then (m^2)."""
 
     def claimed(self, joint: Array) -> Array:
         """Return the covariance (q, q) of variables, given the joint one (2k + q, 2k + q) with the map's.
@@ -146,7 +134,7 @@ class HeldMap:
 
 def jacobian_factor(keys: IntArray, A: Array, b: Array) -> gtsam.GaussianConditional:
     """Return the factor `1/2 |A d - b|^2` on any number of keys (k,), with whitened A (m, n), b (m,)."""
-    return linear_factor(keys.tolist(), sizes(keys).tolist(), A, b)
+    return linear_factor(keys, sizes(keys), A, b)
 
 
 def absolute_factor(
@@ -161,24 +149,17 @@ def absolute_factor(
 def calibration_factors(variables: Variables, mean: Array, sigma: Array) -> list[gtsam.GaussianConditional]:
     """Return the factors `(b - mean) / sigma` of the calibrations of the odometry and of the sensor."""
     factors = []
-    for key in variables.calibration_keys:
-        keys = np.array([key])
+    for keys in variables.calibration_keys[:, None]:
         entries = variables.layout.entries(keys)
-        root = np.diag(1.0 / sigma[entries])
-        factors.append(absolute_factor(keys, root, variables, mean[entries]))
+        factors.append(absolute_factor(keys, np.diag(1.0 / sigma[entries]), variables, mean[entries]))
     return factors
-
-
-def as_hessian_factor(graph: gtsam.GaussianFactorGraph) -> gtsam.HessianFactor:
-    """Return one factor on all keys of a graph, which is the sum of its factors."""
-    return gtsam.HessianFactor(graph)
 
 
 def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
     """Return A (r, n) and b (r,) with `A'A = L` and `A'b = g`, where L (n, n) has rank r.
 
-    A is a Cholesky factor with pivoting, of L scaled to a diagonal of ones. A direction whose information is
-    below `RANK_TOLERANCE` of that has no row.
+    A is a pivoted Cholesky factor of L scaled to a diagonal of ones. A direction with less information than
+    `RANK_TOLERANCE` has no row.
     """
     scale = np.sqrt(np.maximum(np.diagonal(information), 0.0))
     scale = np.where(scale > 0.0, scale, 1.0)
@@ -191,10 +172,7 @@ def square_root_form(information: Array, vector: Array) -> tuple[Array, Array]:
 
 
 def as_rows(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianConditional:
-    """Return one factor of rows on all keys of a graph.
-
-    Where round-off has left a direction with negative information, the rows have none about it.
-    """
+    """Return one factor of rows on all keys of a graph, without what round-off has made negative."""
     keys = Layout(keys_of(graph))
     return jacobian_factor(keys.keys, *square_root_form(*normal_equations(graph, keys)))
 
@@ -205,23 +183,20 @@ def as_rows(graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianConditional:
 def eliminate(
     graph: gtsam.GaussianFactorGraph, keys: IntArray
 ) -> tuple[gtsam.GaussianConditional, gtsam.GaussianFactorGraph]:
-    """Return the conditional of all keys (k,) together, and the graph of the others.
+    """Return the conditional `p(keys | others)` of all keys (k,) together, and the graph `p(others)`.
 
-    It splits `p(x) = p(keys | others) p(others)`. Factors that hold none of the keys stay as they are.
+    Factors that hold none of the keys stay as they are.
     """
     eliminated, factors = frozenset(keys.tolist()), factors_of(graph)
     holding = [factor for factor in factors if not eliminated.isdisjoint(factor.keys())]
     others = [factor for factor in factors if eliminated.isdisjoint(factor.keys())]
-    dense = graph_of(as_hessian_factor(graph_of(*holding)))  # one factor gives one clique
+    dense = graph_of(gtsam.HessianFactor(graph_of(*holding)))  # one factor gives one clique
     tree, remaining = dense.eliminatePartialMultifrontal(gtsam.Ordering(keys.tolist()))
     return tree.roots()[0].conditional(), graph_of(*others, remaining)
 
 
 def marginalize(graph: gtsam.GaussianFactorGraph, keys: IntArray) -> gtsam.GaussianFactorGraph:
-    """Return the graph with variables (k,) marginalized out, several of them in a good order.
-
-    Factors that hold none of them stay as they are. Keys that no factor holds are ignored.
-    """
+    """Return the graph with variables (k,) marginalized out; keys that no factor holds are ignored."""
     if len(keys) == 1:
         return graph.eliminatePartialSequential(gtsam.Ordering(keys.tolist()))[1]
     held = keys_of(graph)
@@ -242,8 +217,7 @@ def remove_information(
 ) -> gtsam.GaussianFactorGraph:
     """Return the graph without a layout's variables; the information about all others is kept.
 
-    The graph need not determine these variables: `NEGLIGIBLE` information about `values` (n,) of their
-    unknowns makes them regular.
+    `NEGLIGIBLE` information about `values` (n,) of their unknowns makes undetermined ones regular.
     """
     root = np.sqrt(NEGLIGIBLE) * np.eye(layout.size)
     weak = jacobian_factor(layout.keys, root, root @ values)
@@ -268,8 +242,8 @@ def merge_variables(
 ) -> gtsam.GaussianFactorGraph:
     """Return the graph where each key of `removed` (k,) is replaced by that of `kept` (k,).
 
-    The unknowns satisfy `d_removed = d_kept + offset` (n,). This is exact: with `d_old = E d_new + e`, the
-    information becomes `E' L E` and the vector `E' (g - L e)`.
+    The unknowns satisfy `d_removed = d_kept + offset` (n,). With `d_old = E d_new + e`, the information
+    becomes `E' L E` and the vector `E' (g - L e)`.
     """
     old = Layout(keys_of(graph))
     becomes, places = old.keys.copy(), old.positions(removed)
@@ -280,7 +254,7 @@ def merge_variables(
     e[old.entries(removed[places >= 0])] = offset[np.repeat(places >= 0, sizes(removed))]
     information, vector = normal_equations(graph, old)
     root, right = square_root_form(E.T @ information @ E, E.T @ (vector - information @ e))
-    return graph_of(as_hessian_factor(graph_of(jacobian_factor(new.keys, root, right))))
+    return graph_of(gtsam.HessianFactor(graph_of(jacobian_factor(new.keys, root, right))))
 
 
 def substitute_points(
@@ -289,8 +263,8 @@ def substitute_points(
     """Return the graph, as one factor, where points `new` (k,) replace points `old` (n,).
 
     The unknowns satisfy `d_old = (E x I) d_new + offset + N(0, sigma^2)`, with E the matrix `change` (n, k)
-    and `offset` (2 n,). The information about the old points is carried over, reduced by a shift of sigma
-    (m): LAPACK eliminates them from the sum of both.
+    and `offset` (2 n,). So the information about the old points is reduced by a shift of sigma (m): LAPACK
+    eliminates them from the sum of both.
     """
     held, E, weight = Layout(keys_of(graph)), np.kron(change, np.eye(POINT)), sigma**-2
     information, vector = normal_equations(graph, held)
@@ -308,4 +282,4 @@ def substitute_points(
     half = half_solve(root, np.asfortranarray(np.column_stack([H[:count, count:], g[:count]])))
     carried, pull = half[:, :-1], half[:, -1]
     rows = square_root_form(H[count:, count:] - carried.T @ carried, g[count:] - pull @ carried)
-    return graph_of(as_hessian_factor(graph_of(jacobian_factor(keys[len(old) :], *rows))))
+    return graph_of(gtsam.HessianFactor(graph_of(jacobian_factor(keys[len(old) :], *rows))))

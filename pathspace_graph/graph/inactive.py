@@ -1,20 +1,19 @@
 """The inactive map: variables on which the window has no factor, given the active ones.
 
-The joint is split as `p(active, inactive) = p(active) p(inactive | active)`. Measurements in the window
-change the first factor only, and the inactive variables follow from their conditional when they are needed.
-That is exact, and a cycle costs no more on a longer track. It is one path of a Bayes tree (Kaess et al.
-2012), or a compressed filter (Guivant and Nebot 2001).
+The joint is `p(active) p(inactive | active)`. Measurements in the window change the first factor only, and
+inactive variables follow from the second when they are needed. That is exact, and a cycle costs no more on a
+longer track. It is one path of a Bayes tree (Kaess et al. 2012), or a compressed filter (Guivant and Nebot
+2001).
 
-A conditional depends on the pose that was the oldest of the window when its variables were deactivated: it
-separates them from the rest of the drive. This pose, the anchor, stays active as a keyframe until the next
-variables are deactivated, together with it.
+A conditional depends on its anchor, the pose that was the oldest of the window when its variables were
+deactivated and that separates them from the rest of the drive. The anchor stays active as a keyframe until
+the next variables are deactivated, together with it.
 
-While the loop is open, nothing ties the map to the place where the drive began but the drive itself. A bias
-of the yaw rate bends the whole of it: after a thousand metres, a thousandth of a radian per second is tens of
-metres. So the active part of the map is held at an anchor pose near the vehicle, and the stretches behind
-hang on it, one on the next, like a chain. Each is given by its conditional in the frame of its own anchor.
-However far the chain swings, no stretch is bent by more than the measurements say. The oldest link holds the
-origin of the map frame. To bring it back to (0, 0, 0), the whole map is moved rigidly.
+While the loop is open, only the drive itself ties the map to its beginning, and a bias of the yaw rate bends
+all of it: after a thousand metres, a thousandth of a radian per second is tens of metres. So the active part
+is held at an anchor near the vehicle, and the stretches behind hang on it like a chain, each given by its
+conditional in the frame of its own anchor: however far the chain swings, it bends none of them. The oldest
+link holds the origin of the map frame. To bring it back to (0, 0, 0), the whole map is moved rigidly.
 """
 
 from collections.abc import Sequence
@@ -28,7 +27,6 @@ from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, inverse
 
 from .gaussian import (
-    as_hessian_factor,
     eliminate,
     graph_of,
     jacobian_factor,
@@ -38,51 +36,40 @@ from .gaussian import (
     square_root_form,
 )
 from .relative import RelativeFactor, by_frame_of, from_frame, relative_factor, rotations, to_frame
-from .variables import ORIGIN_KEY, POSE, Layout, Variables, are_poses, pose_key, sizes, spread
-
-_NO_KEYS: IntArray = np.zeros(0, np.intp)
+from .variables import NO_KEYS, ORIGIN_KEY, POSE, Layout, Variables, are_poses, pose_key, sizes, spread
 
 
 class InactiveMap:
     """Bayes net: each conditional depends on variables deactivated later, or on active ones."""
 
     def __init__(self) -> None:
-        self.net = gtsam.GaussianBayesNet()
-        """Conditionals, in the order of their deactivation."""
-        self.keys: IntArray = _NO_KEYS
-        """Keys (k,) of the inactive variables, ascending."""
-        self.anchors: IntArray = _NO_KEYS
-        """The last conditional depends on these poses (a,), which must stay active."""
-        self._old_anchors: IntArray = _NO_KEYS  # they were eliminated with the next conditional
-        self._given: IntArray = _NO_KEYS  # active variables that the conditionals depend on
+        self.net = gtsam.GaussianBayesNet()  # conditionals, in the order of their deactivation
+        self.keys: IntArray = NO_KEYS  # (k,) of the inactive variables, ascending
+        self.anchors: IntArray = NO_KEYS  # (a,) poses that the last conditional depends on
+        self._old_anchors: IntArray = NO_KEYS  # they were eliminated with the next conditional
+        self._given: IntArray = NO_KEYS  # active variables that the conditionals depend on
         self._shared: list[gtsam.GaussianFactor] = []
-        self._active: tuple[Layout, Layout, IntArray] | None = (
-            None  # of all, of the active ones, their columns
-        )
+        self._active: tuple[Layout, Layout, IntArray] | None = None
+        """Layout of all variables, that of the active ones, and their columns in the former."""
 
     def __len__(self) -> int:
         return int(self.net.size())
 
     @property
     def newest(self) -> IntArray:
-        """Return the keys (k,) of the variables that become active again together, which are all."""
+        """Return the keys (k,) of the variables that become active again together."""
         return self.keys
 
-    def active(self, layout: Layout) -> Layout:
-        """Return the layout of the active variables, given that of all variables."""
-        return layout if len(self.keys) == 0 else self._active_part(layout)[1]
-
-    def active_entries(self, layout: Layout) -> IntArray | slice:
-        """Return the columns that the active variables have in the layout of all variables."""
-        return slice(None) if len(self.keys) == 0 else self._active_part(layout)[2]
-
-    def _active_part(self, layout: Layout) -> tuple[Layout, Layout, IntArray]:
+    def active(self, layout: Layout) -> tuple[Layout, IntArray | slice]:
+        """Return the layout of the active variables, and their columns in the layout of all variables."""
+        if len(self.keys) == 0:
+            return layout, slice(None)
         if self._active is None or self._active[0] is not layout:
             active = np.ones(len(layout.keys), bool)
             active[layout.positions(self.keys)] = False
             part = Layout(layout.keys[active])
             self._active = layout, part, spread(layout.starts[active], part.widths)
-        return self._active
+        return self._active[1:]
 
     def push(
         self,
@@ -91,10 +78,9 @@ class InactiveMap:
         keyframes: IntArray,
         shared: Sequence[gtsam.GaussianFactor],
     ) -> gtsam.GaussianFactorGraph:
-        """Move variables (k,) and the keyframes from a prior to the net, and return the remaining prior.
+        """Move variables (k,), keyframes and `shared` factors from a prior to the net; return what remains.
 
-        The factors `shared` are moved with them. They are weak priors on these variables and the user's
-        factors, which their owners add again once all variables are active.
+        The owners of the shared factors add them again once all variables are active.
         """
         graph = graph_of(prior, *shared)
         frontals = np.intersect1d(np.append(keys, keyframes), keys_of(graph))
@@ -112,12 +98,11 @@ class InactiveMap:
         return remaining
 
     def refresh(self, variables: Variables) -> None:
-        """Update the inactive variables by back-substitution, given the active ones."""
+        """Update the inactive variables, given the active ones."""
         if len(self) == 0:
             return
-        given, places = gtsam.VectorValues(), variables.layout.positions(self._given)
-        starts, widths = variables.layout.starts[places], variables.layout.widths[places]
-        change = np.split(variables.change(spread(starts, widths)), np.cumsum(widths)[:-1])
+        given, ends = gtsam.VectorValues(), sizes(self._given).cumsum()
+        change = np.split(variables.change(variables.layout.entries(self._given)), ends[:-1])
         for key, values in zip(self._given.tolist(), change, strict=True):
             given.insert(key, values)
         solution = self.net.optimize(given)
@@ -125,45 +110,34 @@ class InactiveMap:
         variables.values[entries] = variables.reference[entries] + solution.vector(self.keys.tolist())
 
     def joint_prior(self, prior: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
-        """Return the prior of active and inactive variables, without the `shared` factors of `push`.
-
-        A conditional is a factor, so the joint is the product of the prior and the net. Anchors that are no
-        longer variables are eliminated.
-        """
+        """Return the prior of active and inactive variables, without the `shared` factors of `push`."""
         if len(self) == 0:
             return prior
         negative = [factor.negate() for factor in self._shared]
-        joint = graph_of(as_hessian_factor(graph_of(prior, self.net, *negative)))
+        joint = graph_of(gtsam.HessianFactor(graph_of(prior, self.net, *negative)))
         return eliminate(joint, self._old_anchors)[1] if len(self._old_anchors) else joint
 
 
-SIGMA_ANCHOR: Final = 1e-3
-"""An open map is held at its anchor with this standard deviation (m, rad). All else is relative, so that any
-value gives the same step."""
+SIGMA_ANCHOR: Final = 1e-3  # of the pose that holds an open map (m, rad); any value gives the same step
 
 
 class Follower(Protocol):
-    """What else is in the map frame, and must go where the open map goes."""
+    """What else is in the map frame, and moves with the open map."""
 
     def move(self, motion: Array) -> None:
-        """Move everything by a rigid motion (3,) of the map frame: a turn (rad) and then a shift (m, m)."""
+        """Move by a rigid motion (3,) of the map frame: a turn (rad) and then a shift (m, m)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A link is the conditional of some variables, given others, in the frame of an anchor pose."""
+    """Conditional of some variables, given others, in the frame of an anchor: its mean is `y = G z + e`."""
 
     factor: RelativeFactor
-    shared: tuple[RelativeFactor, ...]
-    """These weak priors are part of the conditional, and their owners add them again to an active map."""
-    leaving: Layout
-    """These variables are given by the link: map points, older anchors, and the origin in the last link."""
-    others: Layout
-    """The link depends on these variables and on its anchor."""
-    gain: Array
-    """In the frame of the anchor the mean is `y = G z + e`, with G (n, m) for the others z."""
-    offset: Array
-    """Constant part e (n,)."""
+    shared: tuple[RelativeFactor, ...]  # weak priors in it, which their owners add again to an active map
+    leaving: Layout  # variables y: map points, older anchors, and the origin in the last link
+    others: Layout  # variables z
+    gain: Array  # (n, m) G
+    offset: Array  # (n,) e
 
     def solve(self, variables: Variables, frame: Array) -> Array:
         """Return the mean (n,) of the leaving variables in the map frame, with the anchor at a pose (3,)."""
@@ -180,9 +154,7 @@ class InactiveChain(InactiveMap):
     def __init__(self) -> None:
         super().__init__()
         self.links: list[Link] = []
-        """Links, in the order in which they left."""
-        self.poses: dict[int, Array] = {}
-        """Poses (3,) of the origin and of anchors that are no variables, as of `refresh`."""
+        self.poses: dict[int, Array] = {}  # (3,) of the origin and of past anchors by key, as of `refresh`
 
     def __len__(self) -> int:
         return len(self.links)
@@ -199,28 +171,27 @@ class InactiveChain(InactiveMap):
         shared: Sequence[gtsam.GaussianFactor],
         variables: Variables,
     ) -> gtsam.GaussianFactorGraph:
-        """Move map points (k,) and all keyframes from a prior to a new link, and return the prior left.
+        """Move map points (k,), keyframes and `shared` factors from a prior to a new link; return the rest.
 
-        The anchor is the oldest pose of the window. The factors `shared` are moved with them.
+        The anchor is the oldest pose of the window.
         """
         known = variables
         if not self.links:
             prior, known = on_origin(prior, variables), self._with_poses(variables)
-        keyframes = variables.keyframes
-        graph, leaving = graph_of(prior, *shared), np.concatenate([keys, keyframes])
-        frontals = np.intersect1d(np.append(leaving, ORIGIN_KEY), keys_of(graph))
+        graph, leaving = graph_of(prior, *shared), np.concatenate([keys, variables.keyframes, [ORIGIN_KEY]])
+        frontals = np.intersect1d(leaving, keys_of(graph))
         conditional, remaining = eliminate(graph, frontals)
-        anchor = pose_key(variables.first_cycle)
-        self.links.append(new_link(conditional, frontals, shared, anchor, known))
+        self.links.append(new_link(conditional, frontals, shared, pose_key(variables.first_cycle), known))
         self._changed()
         return remaining
 
     def detach(self, variables: Variables) -> gtsam.GaussianFactorGraph:
-        """Remove the newest link and returns it as a graph, linearized at the refreshed variables.
+        """Remove the newest link and return it as a graph, linearized at the refreshed variables.
 
         Its anchors become variables again. The `shared` factors of `attach` are taken out.
         """
-        graph, link = graph_of(*self._factors(self.links[-1], self._with_poses(variables))), self.links.pop()
+        known, link = self._with_poses(variables), self.links.pop()
+        graph = graph_of(link.factor.factor(known), *(one.factor(known).negate() for one in link.shared))
         for key in link.leaving.keys[are_poses(link.leaving.keys)].tolist():
             if key != ORIGIN_KEY:
                 variables.insert(np.array([key]), self.poses[key])
@@ -230,13 +201,12 @@ class InactiveChain(InactiveMap):
 
     def _changed(self) -> None:
         leaving = [link.leaving.keys for link in self.links]
-        keys = np.concatenate([np.zeros(0, np.intp), *leaving])
+        keys = np.concatenate([NO_KEYS, *leaving])
         self.keys = np.sort(keys[~are_poses(keys)])
         self.anchors = np.array([link.factor.frame for link in self.links[-1:]], np.intp)
         self._active = None
 
     def refresh(self, variables: Variables) -> None:
-        """Update the inactive variables, from the newest link to the oldest, given the active ones."""
         self.poses = {}
         for link in reversed(self.links):
             values = link.solve(variables, self._pose(link.factor.frame, variables))
@@ -251,12 +221,10 @@ class InactiveChain(InactiveMap):
 
     @property
     def newest(self) -> IntArray:
-        """Return the keys (k,) of the map points that left last."""
         keys = self.links[-1].leaving.keys
         return np.asarray(keys[~are_poses(keys)])
 
     def holds(self, keys: IntArray) -> bool:
-        """Return whether any link is a function of any of some variables."""
         return any(link.holds(keys) for link in self.links)
 
     # --- the frame ---------------------------------------------------------------------------------------
@@ -271,9 +239,9 @@ class InactiveChain(InactiveMap):
     def carry(
         self, prior: gtsam.GaussianFactorGraph, variables: Variables, followers: Sequence[Follower]
     ) -> gtsam.GaussianFactorGraph:
-        """Update the inactive variables, and moves everything so that the origin is at (0, 0, 0) again.
+        """Update the inactive variables, and move everything so that the origin is at (0, 0, 0) again.
 
-        It returns the prior of the active variables, linearized there.
+        Return the prior of the active variables, linearized there.
         """
         anchor = int(self.anchors[0])
         near = relative_factor(prior, anchor, *pose_and_reference(anchor, variables), variables)
@@ -288,22 +256,16 @@ class InactiveChain(InactiveMap):
     # --- as one Gaussian ---------------------------------------------------------------------------------
 
     def joint(self, prior: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.GaussianFactorGraph:
-        """Return the prior of all variables and anchors in the map frame.
-
-        It is linearized at the refreshed values. The `shared` factors of `attach` are part of it.
-        """
+        """Return the prior of all variables and anchors, with `shared` factors, at the refreshed values."""
         known = self._with_poses(variables)
         return graph_of(prior, *(link.factor.factor(known) for link in self.links))
 
     def marginal(self, prior: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.GaussianFactorGraph:
-        """Return the prior of the active variables in the map frame, linearized at the refreshed values."""
+        """Return the prior of the active variables, linearized at the refreshed values."""
         graph = self.joint(prior, variables)
         anchors = np.array([key for key in self.poses if key != ORIGIN_KEY], np.intp)
         inactive = np.append(self.keys, anchors)
         return sparse_marginal(graph, np.setdiff1d(keys_of(graph), inactive))
-
-    def _factors(self, link: Link, known: Variables) -> list[gtsam.GaussianFactor]:
-        return [link.factor.factor(known), *(one.factor(known).negate() for one in link.shared)]
 
     def _with_poses(self, variables: Variables) -> Variables:
         known = variables.copy()
@@ -316,10 +278,7 @@ class InactiveChain(InactiveMap):
 
 
 def on_origin(graph: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.GaussianFactorGraph:
-    """Return a graph of absolute information as one of relative information, on the origin as a pose.
-
-    What is known in the map frame is known relative to its origin.
-    """
+    """Return a graph of absolute information as one relative to the origin of the map frame, as a pose."""
     keys = Layout(keys_of(graph))
     root, right = square_root_form(*normal_equations(graph, keys))
     by_origin = by_frame_of(variables.of(keys.keys), np.zeros(POSE), keys)
@@ -335,10 +294,7 @@ def new_link(
     frame: int,
     variables: Variables,
 ) -> Link:
-    """Return a conditional of variables (k,), given others, as a link in the frame of a pose.
-
-    In the frame of a fixed pose all other variables are linear functions of the unknowns.
-    """
+    """Return a conditional of variables (k,), given others, as a link in the frame of a pose."""
     order, (A, b) = np.array(list(conditional.keys()), np.intp), conditional.jacobian()
     (pose, reference), columns = pose_and_reference(frame, variables), np.repeat(order, sizes(order))
     right = np.array(b).ravel() - A[:, columns == frame] @ (pose - reference)

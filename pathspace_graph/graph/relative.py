@@ -1,10 +1,9 @@
 """Relative factors: Gaussian information on coordinates in the frame of a pose, and submaps made of them.
 
 All measurements of a drive are relative: detections relate poses to map points, and odometry relates poses to
-poses. So what is left of them after an elimination is a function of coordinates in the frame of any one of
-these poses. It stays valid when the whole neighbourhood of the pose turns, and it adds no information about
-that turn. A factor that is linear in map coordinates does neither: it is linearized at the heading that the
-vehicle had drifted to.
+poses. So what an elimination leaves of them is a function of coordinates in the frame of any one of these
+poses. It stays valid when the pose's whole neighbourhood turns, and says nothing of that turn. A factor that
+is linear in map coordinates does neither: it is linearized at the heading that the vehicle had drifted to.
 """
 
 from __future__ import annotations
@@ -34,28 +33,20 @@ from .variables import ORIGIN_KEY, POSE, Layout, Variables, pose_key, rotation_b
 
 @dataclass(frozen=True, eq=False)
 class RelativeFactor:
-    """A relative factor is `1/2 |A e - b|^2` with `e = y(x) - y0`, where y are in the frame of a pose.
+    """Factor `1/2 |A e - b|^2` with `e = y(x) - y0`, where y are in the frame of a pose.
 
     In the frame of the pose `(p, theta)` a map point c is `R(theta)' (c - p)`, and another pose `(t, h)` is
     `(R(theta)' (t - p), h - theta)`. The calibration does not depend on a frame.
     """
 
-    frame: int
-    """Key of the pose in whose frame the factor is."""
-    keys: Layout
-    """The variables y are the calibration, map points and poses, by their keys."""
-    root: Array
-    """A (r, q), a square root of the information."""
-    right: Array
-    """Right-hand side b (r,)."""
-    local: Array
-    """Linearization point y0 (q,)."""
+    frame: int  # key of the pose
+    keys: Layout  # of the variables y: calibration, map points and poses
+    root: Array  # (r, q) A, a square root of the information
+    right: Array  # (r,) b
+    local: Array  # (q,) linearization point y0
 
     def factor(self, variables: Variables) -> gtsam.GaussianFactor:
-        """Return the factor on its keys and the frame's, linearized at the variables' values.
-
-        The origin of the map frame does not move, so the factor does not hold it.
-        """
+        """Return the factor on its keys and the frame's, but the origin's, linearized at the values."""
         keys = np.append(self.keys.keys, self.frame)
         entries = variables.layout.entries(keys)
         now, columns = (variables.values[entries], variables.change(entries)), self.keys
@@ -83,8 +74,8 @@ def relative_factor(
 ) -> RelativeFactor:
     """Return a graph of relative measurements as a factor in the frame of a pose.
 
-    The pose of the frame is at `pose` (3,), and its unknown is measured from `reference` (3,). In the frame
-    of a fixed pose the variables are linear functions of the unknowns, so the change of frame is exact.
+    That is at `pose` (3,), its unknown measured from `reference` (3,). In the frame of a fixed pose variables
+    are linear functions of the unknowns, so the change of frame is exact.
     """
     held = keys_of(graph)
     keys = Layout(held[held != frame])
@@ -175,13 +166,11 @@ class Submaps:
     """Submaps of the drive up to loop closure; the last of them is unfinished."""
 
     def __init__(self, first: gtsam.GaussianFactorGraph, interval: float) -> None:
-        self.first = first
-        """Absolute prior of the calibration and the first pose."""
+        self.first = first  # absolute prior of the calibration and the first pose
         self.interval = interval
-        self.finished: list[RelativeFactor] = []
-        """Finished submaps, in the order of the drive."""
+        self.finished: list[RelativeFactor] = []  # submaps, in the order of the drive
         self.keyframes: dict[int, tuple[Array, Array]] = {}
-        """Each keyframe, by key, has its pose (3,) when it was marginalized, and its reference (3,)."""
+        """Pose (3,), when it was marginalized, and reference (3,) of each keyframe by key."""
         self._hung: dict[int, tuple[int, Array]] = {}  # a keyframe's anchor, and its pose in that frame
         self._graph: gtsam.GaussianFactorGraph | None = None
         self._keyframe = 0
@@ -190,7 +179,7 @@ class Submaps:
     def add_pose(self, pose: int, factors: gtsam.GaussianFactorGraph, variables: Variables) -> None:
         """Add the window's oldest pose, by its key, and its factors, without the prior, to the submap.
 
-        The pose is marginalized out unless it is the keyframe. The next pose is the end of the submap.
+        The pose is marginalized out unless it is the keyframe.
         """
         if self._driven >= self.interval:
             self.finish(variables)
@@ -206,7 +195,8 @@ class Submaps:
     def finish(self, variables: Variables) -> None:
         """Finish the current submap at the oldest pose of the window."""
         if self._graph is not None:
-            self.finished.append(self._finished_submap(variables))
+            pose, reference = self.keyframes[self._keyframe]
+            self.finished.append(relative_factor(self._graph, self._keyframe, pose, reference, variables))
             self._graph = None
 
     def hang(self, anchor: int, pose: Array) -> None:
@@ -243,9 +233,3 @@ class Submaps:
             key: (pose, self.keyframes[key][1]) for key, pose in zip(keys.tolist(), poses, strict=True)
         }
         return dict(zip((keys - pose_key(0)).tolist(), poses, strict=True))
-
-    def _finished_submap(self, variables: Variables) -> RelativeFactor:
-        """Return the marginal of the current submap, given that its keyframe is where it was."""
-        assert self._graph is not None
-        pose, reference = self.keyframes[self._keyframe]
-        return relative_factor(self._graph, self._keyframe, pose, reference, variables)

@@ -1,8 +1,7 @@
 """Whitened linear rows on keys, the odometry's among them, and the GTSAM factors that are made of them.
 
-The residual functions give whitened rows of a whole window at once. They are kept as rows, and summed into
-the Hessian of a step. A GTSAM factor is made of them where they are marginalized or a user asks. The
-binding's constructors take at most three keys, so it is made by way of a Gaussian conditional, which is one.
+The residual functions give rows of a whole window at once, which are kept and summed into the Hessian of a
+step. A GTSAM factor is made of them where they are marginalized or a user asks.
 """
 
 from __future__ import annotations
@@ -47,25 +46,19 @@ Placed = tuple[IntArray, IntArray, IntArray, Array, Array]
 class Rows:
     """Whitened linear rows `J_i . dx + r_i`, with dx the change from the linearization point.
 
-    All rows of a group have the same number of keys, with the same letters in the same order. No row has a
-    key twice.
+    All rows of a group have keys with the same letters in the same order. No row has a key twice.
     """
 
-    keys: IntArray
-    """Keys (m, k) of each row's variables."""
-    jacobian: Array
-    """Whitened derivatives (m, n) by the entries of the variables, one key after the other."""
-    residual: Array
-    """Whitened residuals (m,) at the linearization point."""
-    owner: IntArray
-    """Each row (m,) belongs to the factor with this number; numbers are close together, as cycles are."""
+    keys: IntArray  # (m, k) of each row's variables
+    jacobian: Array  # (m, n) whitened derivatives by the entries of the variables, key after key
+    residual: Array  # (m,) whitened residuals at the linearization point
+    owner: IntArray  # (m,) number of the factor that a row belongs to, such as a cycle
 
     def __len__(self) -> int:
         return len(self.residual)
 
     @property
     def parts(self) -> Parts:
-        """Return keys, derivatives, residuals and owners."""
         return self.keys, self.jacobian, self.residual, self.owner
 
     def where(self, chosen: BoolArray | IntArray | slice) -> Rows:
@@ -74,25 +67,16 @@ class Rows:
     @property
     def placed(self) -> Placed:
         """Return the keys of rows, the key and the entry of each derivative, derivatives and residuals."""
-        return self.keys, *self.pattern, self.jacobian, self.residual
-
-    @property
-    def pattern(self) -> tuple[IntArray, IntArray]:
-        """Return which of a row's keys each derivative (n,) is by, and which entry of its variable."""
-        return _pattern(self.widths)
+        return self.keys, *_pattern(self.widths), self.jacobian, self.residual
 
     @cached_property
     def widths(self) -> tuple[int, ...]:
         """Return the widths (k,) of each row's variables."""
         return _widths(tuple((self.keys[0] >> INDEX_BITS).tolist()))
 
-    def places(self, layout: Layout) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
-        """Return what tells the column of each derivative: the arguments of `_columns_of`."""
-        return layout.keys, layout.starts, self.keys, *self.pattern
-
     def columns(self, layout: Layout) -> IntArray:
         """Return the column (m, n) of each derivative, which is UNKNOWN where a key is not in the layout."""
-        return _columns_of(*self.places(layout))
+        return _columns_of(layout.keys, layout.starts, *self.placed[:3])
 
 
 @cache
@@ -123,6 +107,7 @@ def _known_columns(
 
 @cache
 def _pattern(widths: tuple[int, ...]) -> tuple[IntArray, IntArray]:
+    """Return which of a row's keys each derivative (n,) is by, and which entry of its variable."""
     return np.repeat(np.arange(len(widths)), widths), np.concatenate([np.arange(width) for width in widths])
 
 
@@ -132,7 +117,7 @@ def at_reference(groups: Sequence[Rows], variables: Variables) -> list[Rows]:
     moved = []
     for rows in groups:
         if len(rows):
-            residual = _moved_residual(*rows.places(layout), rows.jacobian, rows.residual, change)
+            residual = _moved_residual(layout.keys, layout.starts, *rows.placed, change)
             moved.append(Rows(rows.keys, rows.jacobian, residual, rows.owner))
     return moved
 
@@ -206,8 +191,7 @@ class KeptRows:
     """Rows `J d + r` with d = value - reference, which are kept until those of their owner are replaced."""
 
     def __init__(self) -> None:
-        self.groups: list[Rows] = []
-        """Rows on variables of the same widths are one group, which is not empty."""
+        self.groups: list[Rows] = []  # one for each widths of variables, never empty
 
     @property
     def owners(self) -> IntArray:
@@ -293,12 +277,7 @@ def _replaced(
 
 def stacked_rows(groups: Sequence[Rows]) -> Rows:
     """Return the rows of groups on variables of the same widths as one group."""
-    return Rows(
-        keys=np.concatenate([rows.keys for rows in groups]),
-        jacobian=np.concatenate([rows.jacobian for rows in groups]),
-        residual=np.concatenate([rows.residual for rows in groups]),
-        owner=np.concatenate([rows.owner for rows in groups]),
-    )
+    return Rows(*map(np.concatenate, zip(*(rows.parts for rows in groups), strict=True)))
 
 
 def newton_system(
@@ -306,9 +285,8 @@ def newton_system(
 ) -> tuple[Array, Array]:
     """Return the lower triangle of H (n, n), stored by columns, and the negative gradient (n,) at `change`.
 
-    H is the sum of the graph's and of `J'J` of rows `J d + r`, whose negative gradient is `-J'(J d + r)`.
-    Both are on the variables of a layout. SingularSystemError where nothing holds one of them, and ValueError
-    where something holds another one.
+    They are sums over the graph and over rows `J d + r`, on the variables of a layout. SingularSystemError
+    where nothing holds one of them, and ValueError where something holds another one.
     """
     factors = [(keys_of_factor(factor), factor.augmentedInformation()) for factor in factors_of(graph)]
     hessian, gradient = _summed(
@@ -349,9 +327,8 @@ def _summed(
     return hessian, gradient
 
 
-_FIRST_KEYS: Final = np.array([CALIBRATION_KEY, pose_key(0), pose_key(1)])
-_ON_POSE: Final = np.array([0, 1, 1])
-"""The keys of a row of odometry at the first cycle, and which of them count the cycles."""
+_FIRST_KEYS: Final = np.array([CALIBRATION_KEY, pose_key(0), pose_key(1)])  # of a row of odometry at cycle 0
+_ON_POSE: Final = np.array([0, 1, 1])  # which of them count the cycles
 
 
 class OdometryChain:
@@ -359,12 +336,12 @@ class OdometryChain:
 
     def __init__(self, intervals: Sequence[IntegratedOdometry] = ()) -> None:
         self.deltas: Array = np.array([one.delta for one in intervals]).reshape(-1, POSE)
-        """Relative poses (m, 3), in m, m and rad."""
+        """(m, 3) Relative poses, in m, m and rad."""
         self.whiteners: Array = np.array([one.whitener for one in intervals]).reshape(-1, POSE, POSE)
-        """Each W (m, 3, 3) has `W' W` equal to the inverse covariance, in the frame of the end pose."""
+        """(m, 3, 3) W with `W' W` the inverse covariance, in the frame of the end pose."""
         by_calibration = np.array([one.calibration_jacobian for one in intervals])
         self.by_calibration: Array = by_calibration.reshape(-1, POSE, CALIBRATION_SIZE)
-        """Derivatives G (m, 3, 2) of the end pose, in its own frame, by the calibration."""
+        """(m, 3, 2) Derivatives G of the end pose, in its own frame, by the calibration."""
 
     def __len__(self) -> int:
         return len(self.deltas)
@@ -396,8 +373,7 @@ class OdometryChain:
     def rows(self, variables: Variables, cycles: IntArray) -> list[Rows]:
         """Return the rows from the poses of some cycles (m,) to the next poses; each cycle owns its rows.
 
-        The first interval begins at the window's oldest pose. The newest pose has no rows, since no interval
-        begins there.
+        The first interval begins at the window's oldest pose, and none begins at the newest one.
         """
         slots = cycles - variables.first_cycle
         slots = slots[slots < len(self)]
@@ -446,9 +422,8 @@ def predicted_covariance(
     """Return the predicted covariances `J Sigma J'` (m / k, k, k) of every k = `together` rows.
 
     The pose is the first key of a row, and Sigma is the covariance of the last step. The pose of the cycle
-    `newest` was not in that step, so it is replaced by its prediction from the pose before: the odometry's
-    last interval leads from the first of `poses` (2, 3) to it. A map point that was not in the step
-    contributes nothing.
+    `newest` was not in that step, so it is replaced by its prediction from the pose before, from the first to
+    the second of `poses` (2, 3). A map point that was not in the step contributes nothing.
     """
     gradient, row = np.zeros((step.layout.size, len(rows)), order="F"), np.arange(len(rows))
     columns = rows.columns(step.layout)

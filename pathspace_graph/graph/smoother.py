@@ -1,9 +1,9 @@
-"""The fixed-lag smoother: a window of GTSAM factors on the map and the last few seconds of poses.
+"""The fixed-lag smoother: a window of factors on the map and the last few seconds of poses.
 
-In each cycle the stale rows of the window are linearized again. They are added to the Hessian that GTSAM
-gives of the prior, and one dense Cholesky factor gives the step and the joint covariance. Then the oldest
-pose is eliminated, and the graph that remains is the prior. GTSAM's own fixed-lag smoothers freeze the
-linearization point of every variable that a marginal touches, which here is the whole map.
+In each cycle the stale rows of the window are linearized again and added to the Hessian of the prior, and one
+dense Cholesky factor gives the step and the joint covariance. Then the oldest pose is eliminated, and the
+graph that remains is the prior. GTSAM's own fixed-lag smoothers freeze the linearization point of every
+variable that a marginal touches, which here is the whole map.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,6 @@ from .gaussian import (
     FactoredSystem,
     HeldMap,
     absolute_factor,
-    as_hessian_factor,
     as_rows,
     calibration_factors,
     cholesky,
@@ -39,11 +38,8 @@ from .rows import Rows, calibrated_delta, newton_system, predicted_covariance
 from .variables import CALIBRATION_KEY, POINT, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys
 from .window import M_co, SmootherSettings, UserFactors, WindowFactors, check_factors
 
-STIFFNESS: Final = 1e4
-"""A gauge that is held has this number of times its information."""
-TIME_TOLERANCE: Final = 1e-9
-"""A pose leaves once it is older than the lag by more than this time (s), since stamps have round-off."""
-NO_KEYS: Final = np.zeros(0, np.intp)
+STIFFNESS: Final = 1e4  # information about a gauge that is held, by that from measurements
+TIME_TOLERANCE: Final = 1e-9  # by which a pose must be older than the lag (s), since stamps have round-off
 
 
 class FixedLagSmoother(Generic[M_co]):
@@ -51,27 +47,17 @@ class FixedLagSmoother(Generic[M_co]):
 
     def __init__(self, settings: SmootherSettings, map_rows: M_co) -> None:
         self.settings, self.map, self.variables = settings, map_rows, map_rows.variables
-        self.times: list[float] = []
-        """Stamps (s) of the poses in the window."""
+        self.times: list[float] = []  # stamps (s) of the poses in the window
         self.window = WindowFactors(map_rows, settings.tolerances)
         self.user_factors = UserFactors()
-        self.inactive = InactiveChain() if settings.relative else InactiveMap()
-        """Variables that a cycle does not solve for."""
-        self.followers: list[Follower] = []
-        """What is moved together with the open map."""
+        self.inactive: InactiveMap = InactiveChain()  # variables that a cycle does not solve for
+        self.followers: list[Follower] = []  # what moves with the open map
         self.submaps: Submaps | None = None
         """The prior in submaps, while the loop is open and the user gave no factors on poses."""
-        self.last_step: FactoredSystem | None = None
-        """Damped system of the last Gauss-Newton step; None before the first one."""
-        self.held: HeldMap | None = None
-        """What was known of a closed map when its gauge was held; None before."""
-        self.epoch = 0
-        """Number of changes of the prior other than the marginalization of a pose."""
+        self.last_step: FactoredSystem | None = None  # damped system of the last Gauss-Newton step
+        self.held: HeldMap | None = None  # what was known of a closed map when its gauge was held
         sigmas = np.array(settings.sigmas_calibrations)
-        self.calibration_prior: tuple[Array, Array] = (
-            np.resize(settings.calibrations or 0.0, len(sigmas)),
-            sigmas,
-        )
+        self.calibration_prior = np.resize(settings.calibrations or 0.0, len(sigmas)), sigmas
         """Means and standard deviations of the priors of the calibrations, (2,) or (7,)."""
         self.variables.insert_calibrations(self.calibration_prior[0])
         self.prior = graph_of(*calibration_factors(self.variables, *self.calibration_prior))
@@ -79,17 +65,15 @@ class FixedLagSmoother(Generic[M_co]):
 
     @property
     def first_cycle(self) -> int:
-        """Return the perception cycle of the oldest pose in the window."""
         return self.variables.first_cycle
 
     @property
     def next_cycle(self) -> int:
-        """Return the number of the next perception cycle, counted from 0."""
         return self.first_cycle + len(self.times)
 
     @property
     def keyframe_cycles(self) -> list[int]:
-        """Return the cycles of the poses in whose frames the drive is kept until the loop closes."""
+        """Return the cycles of the poses in whose frames the submaps are."""
         return [key - pose_key(0) for key in self.submaps.keyframes] if self.submaps is not None else []
 
     @property
@@ -99,7 +83,7 @@ class FixedLagSmoother(Generic[M_co]):
     @property
     def layout(self) -> Layout:
         """Return the columns of the active variables, which a step solves for."""
-        return self.inactive.active(self.variables.layout)
+        return self.inactive.active(self.variables.layout)[0]
 
     @property
     def chain(self) -> InactiveChain | None:
@@ -143,13 +127,12 @@ class FixedLagSmoother(Generic[M_co]):
         self.prior.push_back(absolute_factor(pose_keys(np.array([cycle])), root, self.variables))
 
     def check_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
-        """Raise a SettingsError for the first of a user's factors that cannot be used; nothing changes."""
         check_factors(factors, self.variables, self.next_cycle)
 
     def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
         """Add the user's factors on any variables, and on the pose of the next cycle, after their check.
 
-        Factors on poses may be absolute, which a submap cannot be. So submaps are dropped then, and the prior
+        Factors on poses may be absolute, which a submap cannot be: submaps are dropped then, and the prior
         keeps its linearization point when the loop closes. Inactive variables of a factor become active.
         """
         if not factors:
@@ -162,7 +145,7 @@ class FixedLagSmoother(Generic[M_co]):
     def believe_calibrations(self, mean: Array, sigma: Array) -> None:
         """Give the priors of the calibrations other means and standard deviations, (2,) or (7,).
 
-        Calibrations are never eliminated, so their priors are terms of the sum, and are exchanged exactly.
+        Calibrations are never eliminated, so their priors can be exchanged exactly.
         """
         before = self.calibration_prior
         if (mean == before[0]).all() and (sigma == before[1]).all():
@@ -177,7 +160,7 @@ class FixedLagSmoother(Generic[M_co]):
         self._add_to_prior(absolute_factor(keys, row, self.variables, np.array([0.0, value])))
 
     def _add_to_prior(self, *factors: gtsam.GaussianFactor) -> None:
-        self.prior, self.epoch = graph_of(self.prior, *factors), self.epoch + 1
+        self.prior = graph_of(self.prior, *factors)
         if self.submaps is not None:
             self.submaps.first = graph_of(self.submaps.first, *factors)
 
@@ -187,25 +170,25 @@ class FixedLagSmoother(Generic[M_co]):
         """Take one Gauss-Newton step; `sigma_step` (m) damps it as a prior on the motion of map points."""
         negative_gradient = self.factorize(sigma_step)
         assert self.last_step is not None
-        entries = self.inactive.active_entries(self.variables.layout)
+        _, entries = self.inactive.active(self.variables.layout)
         self.variables.values[entries] += solve(self.last_step.factor, negative_gradient)
         self.map.correct()
 
     def factorize(self, sigma_step: float | None = None) -> Array:
         """Factor the system of a step into `last_step`, and return the negative gradient (n,).
 
-        No variable moves. SingularSystemError where the system is not positive definite.
+        SingularSystemError where the system is not positive definite.
         """
         while not self.window.relinearize(self._cycles, self.inactive.keys) and len(self.inactive):
             self.activate(self.inactive.newest)  # rare: a detection has moved to where the map is inactive
-        user, layout = self.user_factors.linearized(self.variables), self.layout
+        user = self.user_factors.linearized(self.variables)
+        layout, entries = self.inactive.active(self.variables.layout)
         held = self.chain.hold(self.variables) if self.chain is not None else []
         graph = graph_of(self.prior, *user, *held) if user or held else self.prior
-        change = self.variables.change(self.inactive.active_entries(self.variables.layout))
+        change = self.variables.change(entries)
         hessian, negative_gradient = newton_system(graph, self.window.groups, layout, change)
         if sigma_step is not None:
-            first, last = layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start
-            points = np.arange(first, last)
+            points = np.arange(layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start)
             hessian[points, points] += sigma_step**-2
         self.last_step = FactoredSystem(layout, cholesky(hessian))
         return negative_gradient
@@ -213,8 +196,7 @@ class FixedLagSmoother(Generic[M_co]):
     def linear_graph(self, whole: bool = False) -> gtsam.GaussianFactorGraph:
         """Return the window and its prior, linearized at the variables' values, and change nothing.
 
-        The unknowns are `value - reference`, with poses (x, y, theta) in the map frame. If `whole`, the graph
-        is also on the inactive variables, which must be up to date.
+        The unknowns are `value - reference`. If `whole`, inactive variables, up to date, are among them.
         """
         if not whole:
             prior = self.absolute_prior()
@@ -239,10 +221,9 @@ class FixedLagSmoother(Generic[M_co]):
         return self.last_step.covariance(keys)
 
     def covariance(self, keys: IntArray) -> Array:
-        """Return the joint covariance (q, q) of variables (k,) at the estimate, without damping.
+        """Return the joint covariance (q, q) of variables (k,), in their order, at the estimate, undamped.
 
-        It is in the order of the keys, with poses as (x, y, theta) in the map frame (m, m, rad). Once a map
-        is held, no more is claimed of it than was known then.
+        Once a map is held, no more is claimed of it than was known then.
         """
         if self.held is None:
             return self._covariance(keys)
@@ -280,10 +261,7 @@ class FixedLagSmoother(Generic[M_co]):
             self._marginalize_oldest()
 
     def _marginalize_oldest(self) -> None:
-        """Add the factors of the oldest pose to the prior, and marginalize the pose.
-
-        The pose stays as a keyframe where inactive variables depend on it.
-        """
+        """Marginalize the oldest pose, or keep it as a keyframe if inactive variables depend on it."""
         cycle, key = self.first_cycle, pose_key(self.first_cycle)
         user = self.user_factors.remove(np.array([key]), self.variables)
         factors = graph_of(self.window.measured.pop(cycle, self.variables.layout), *user)
@@ -334,7 +312,6 @@ class FixedLagSmoother(Generic[M_co]):
         self.window.relinearize(self._cycles, self.inactive.keys)
 
     def refresh(self) -> None:
-        """Update the inactive variables."""
         self.inactive.refresh(self.variables)
 
     def activate(self, keys: IntArray) -> None:
@@ -353,10 +330,7 @@ class FixedLagSmoother(Generic[M_co]):
             self.map.activate(back)
 
     def reactivate(self, with_prior: bool = True) -> None:
-        """Make all variables active, and return the information about them to the prior.
-
-        Without `with_prior` there is no prior afterwards, because the submaps or a marginal will replace it.
-        """
+        """Make all variables active, with their prior, or with none that submaps or a marginal replace."""
         chain = self.chain
         if chain is None and len(self.inactive) == 0:
             return
@@ -396,7 +370,6 @@ class FixedLagSmoother(Generic[M_co]):
         """Optimize an open map with the window's oldest pose measured in the frame of a keyframe.
 
         The measurement is one of the submaps from now on. Return the poses (3,) of the keyframes by cycle.
-        The map is in the map frame afterwards, as after closing.
         """
         assert self.submaps is not None
         submaps = self.submaps
@@ -407,14 +380,13 @@ class FixedLagSmoother(Generic[M_co]):
         return keyframes
 
     def solve_loop(self, iterations: int, sigma_step: float | None) -> dict[int, Array]:
-        """Optimize the whole loop on the graph of its submaps, each relinearized in its own frame.
+        """Optimize the whole loop on its submaps, each relinearized in its own frame.
 
-        The keyframes are variables during the optimization, and are marginalized afterwards; their poses (3,)
-        are returned by cycle. Without submaps (a user's factors are absolute) the prior keeps its
-        linearization point, and there are no keyframes.
+        Return the poses (3,) of the keyframes by cycle. Without submaps, since a user's factors are absolute,
+        the prior keeps its linearization point, and there are no keyframes.
         """
         self.reactivate(with_prior=self.submaps is None)
-        submaps, self.submaps, self.epoch = self.submaps, None, self.epoch + 1
+        submaps, self.submaps = self.submaps, None
         if submaps is not None:
             submaps.finish(self.variables)
             submaps.insert_keyframes(self.variables)
@@ -431,7 +403,6 @@ class FixedLagSmoother(Generic[M_co]):
 
         E is `change` (n, k). The prior of the old points is carried over, reduced by a shift of sigma (m).
         """
-        self.epoch += 1
         user = self.user_factors.remove(old, self.variables)
         reference = self.variables.reference[self.variables.layout.entries(old)]
         offset = np.kron(change, np.eye(POINT)) @ points.ravel() - reference
@@ -443,10 +414,8 @@ class FixedLagSmoother(Generic[M_co]):
     def merge(self, removed: IntArray, kept: IntArray) -> None:
         """Merge map points `removed` (k,) into points `kept` (k,), which keep their values.
 
-        The prior is transformed exactly. Submaps are not, so the loop must be closed. The map's rows must be
-        on the kept keys from now on.
+        Submaps do not follow, so the loop must be closed. The map's rows must be on the kept keys afterwards.
         """
-        self.epoch += 1
         user, layout = self.user_factors.remove(removed, self.variables), self.variables.layout
         reference = self.variables.reference
         offset = reference[layout.entries(kept)] - reference[layout.entries(removed)]
@@ -455,35 +424,32 @@ class FixedLagSmoother(Generic[M_co]):
         self.window.clear()
 
     def remove_information(self, keys: IntArray) -> None:
-        """Remove all prior information about map points."""
         self.activate(keys)
-        self.epoch += 1
         now = self.variables.change(self.variables.layout.entries(keys))
         self.prior = remove_information(self.prior, Layout(keys), now)
         if self.submaps is not None:
             self.submaps.remove_information(keys, self.variables)
 
     def hold_gauge(self, keys: IntArray, across: Array) -> None:
-        """Hold where a closed map as a whole is, by its points (k,) in ascending order.
+        """Hold where a closed map as a whole is, and go on to estimate its shape.
 
-        The rows C `across` (3, 2k) give the rigid motion (x, y, theta) by `C dx`, for moves dx of the points.
-        It is held at the present estimate, where the shape of the map goes on to be estimated.
+        The rows C `across` (3, 2k) give the rigid motion (x, y, theta) by `C dx`, for moves dx of the points
+        (k,), ascending.
         """
         self.reactivate()
         known = self.covariance(keys)
         information = STIFFNESS * np.linalg.inv(across @ known @ across.T)
         root = np.linalg.cholesky(information).T @ across
         self.prior = graph_of(self.prior, absolute_factor(keys, root, self.variables))
-        self.held, self.epoch = HeldMap(keys, known), self.epoch + 1
+        self.held = HeldMap(keys, known)
 
     def forget_poses(self, first_cycle: int) -> None:
         """Remove the poses before `first_cycle`, and all prior information about where the poses are.
 
-        The window keeps its later poses with their odometry, and the prior keeps what is known of the map and
-        the calibration. A prior must be set for one of the poses, by `add_pose_prior`.
+        The later poses keep their odometry, and one of them must be given a prior by `add_pose_prior`.
         """
         self.reactivate()
-        self.epoch, self.submaps = self.epoch + 1, None
+        self.submaps = None
         leaving = pose_keys(np.arange(self.first_cycle, first_cycle))
         user = self.user_factors.remove(leaving, self.variables)
         self.prior = marginalize(graph_of(self.prior, *user), pose_keys(self._cycles))
@@ -492,25 +458,25 @@ class FixedLagSmoother(Generic[M_co]):
     def restart(self, first_cycle: int, removed: IntArray, added: IntArray, points: Array) -> None:
         """Replace map points `removed` (n,) by `added` (k,) at `points` (k, 2), and drop the prior.
 
-        Poses before `first_cycle` leave the window, and what is known of them is dropped as well. The window
-        keeps its later poses with their odometry. A new prior must be set, on all that remains.
+        Poses before `first_cycle` leave the window. A new prior must be set, on all that remains.
         """
-        self.epoch, self.submaps, self.inactive = self.epoch + 1, None, InactiveMap()
+        self.submaps, self.inactive = None, InactiveMap()
         self.held, self.prior = None, gtsam.GaussianFactorGraph()
-        self._drop_before(first_cycle, np.append(self.variables.keyframes, removed))
+        self.variables.remove(np.append(self.variables.keyframes, removed))
+        self._drop_before(first_cycle)
         self.variables.insert(added, points.ravel())
 
-    def _drop_before(self, first_cycle: int, also: IntArray = NO_KEYS) -> None:
-        """Remove the poses before a cycle, other variables (k,) with them, and all factors of the window."""
+    def _drop_before(self, first_cycle: int) -> None:
+        """Remove the poses before a cycle, and all factors of the window."""
         leaving = np.arange(self.first_cycle, first_cycle)
         for cycle in leaving.tolist():
             self._drop_oldest(cycle)
         self.variables.first_cycle = first_cycle
-        self.variables.remove(np.append(also, pose_keys(leaving)))
+        self.variables.remove(pose_keys(leaving))
         self.window.clear()
 
     def set_prior(self, keys: IntArray, mean: Array, information: Array) -> None:
         """Set the prior to a Gaussian of ascending keys (k,), with mean (n,) and information (n, n)."""
         root = np.asarray(np.linalg.cholesky(information).T, np.float64)
         prior = absolute_factor(keys, root, self.variables, mean)
-        self.prior = graph_of(as_hessian_factor(graph_of(prior)))
+        self.prior = graph_of(gtsam.HessianFactor(graph_of(prior)))

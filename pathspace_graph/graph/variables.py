@@ -17,58 +17,43 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache, cached_property
-from typing import ClassVar, Final, TypeVar, cast
+from copy import copy
+from functools import cached_property
+from typing import ClassVar, Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.sensor import SENSOR_SIZE
 
-CONTROL_LETTERS: Final = ("l", "r")
-"""The keys of a boundary's control points have this letter, by the label of the boundary (left, right)."""
+CONTROL_LETTERS: Final = ("l", "r")  # by the label of the boundary (left, right)
 LANDMARK_LETTER: Final = "m"
-"""The keys of landmarks have this letter."""
 CALIBRATION_LETTER: Final = "b"
-"""The key of the odometry's calibration has this letter."""
 SENSOR_LETTER: Final = "c"
-"""The key of the sensor's calibration has this letter."""
 POSE_LETTER: Final = "x"
-"""The keys of poses have this letter."""
-POSE: Final = 3
-"""A pose has this number of entries: x, y, theta."""
-POINT: Final = 2
-"""Every other variable but the sensor's calibration has this number of entries."""
-CALIBRATION_KEY: Final = int(gtsam.symbol(CALIBRATION_LETTER, 0))
-"""Key of the odometry's calibration."""
-SENSOR_KEY: Final = int(gtsam.symbol(SENSOR_LETTER, 0))
-"""Key of the sensor's calibration. The keys of all points and poses are greater."""
-
-INDEX_BITS: Final = 56
-"""GTSAM keeps the index of a symbol in this number of low bits, and its letter in the highest byte."""
+POSE: Final = 3  # entries of a pose: x, y, theta
+POINT: Final = 2  # entries of every other variable but the sensor's calibration
+INDEX_BITS: Final = 56  # low bits of a key, which hold its index; its letter is in the highest byte
+UNKNOWN: Final = -1  # column of a key that a layout does not hold
+NO_KEYS: Final = np.zeros(0, np.intp)
 _NAMES_IN_MESSAGE: Final = 3
-"""A message names at most this number of keys."""
 
 
-@cache
 def letter_keys(letter: str) -> tuple[int, int]:
     """Return the first key of a letter, and the first key after its last one."""
     first = int(gtsam.symbol(letter, 0))
     return first, first + (1 << INDEX_BITS)
 
 
-FIRST_POSE: Final = letter_keys(POSE_LETTER)[0]
-"""Poses have the last keys: every key from this one on belongs to a pose."""
-_SIZES: Final = (POINT, SENSOR_SIZE, POSE)
-ORIGIN_KEY: Final = int(gtsam.symbol("y", 0))
-"""Key of the origin of the map frame, which is a pose at (0, 0, 0) by definition."""
+CALIBRATION_KEY: Final = letter_keys(CALIBRATION_LETTER)[0]
+SENSOR_KEY: Final = letter_keys(SENSOR_LETTER)[0]  # the keys of all points and poses are greater
+FIRST_POSE: Final = letter_keys(POSE_LETTER)[0]  # every key from this one on belongs to a pose
+ORIGIN_KEY: Final = letter_keys("y")[0]  # the origin of the map frame, a pose at (0, 0, 0) by definition
 _FIRST_LANDMARK: Final = letter_keys(LANDMARK_LETTER)[0]
 _FIRST_CONTROL: Final = tuple(letter_keys(letter)[0] for letter in CONTROL_LETTERS)
-
-
+_SIZES: Final = (POINT, SENSOR_SIZE, POSE)
 _LETTERS: Final = (CALIBRATION_LETTER, SENSOR_LETTER, *CONTROL_LETTERS, LANDMARK_LETTER, POSE_LETTER)
 _LETTER_ENDS: Final = np.array([letter_keys(letter) for letter in _LETTERS], np.intp).ravel()
 
@@ -99,7 +84,6 @@ def indices(keys: IntArray) -> IntArray:
 
 
 def are_poses(keys: IntArray) -> BoolArray:
-    """Return which keys belong to poses."""
     return np.asarray(keys >= FIRST_POSE)
 
 
@@ -133,23 +117,15 @@ def names(keys: IntArray) -> str:
     return ", ".join(name(key) for key in keys[:_NAMES_IN_MESSAGE].tolist())
 
 
-T = TypeVar("T", bound=NDArray[np.generic])
-
-UNKNOWN = -1
-"""Column of a key that a layout does not hold."""
-
-
 class Layout:
-    """A layout assigns the columns of a flat vector to keys in ascending order."""
+    """Columns of a flat vector by ascending keys (K,): their widths (K,) and first columns (K,)."""
 
-    constant: ClassVar[bool] = True
-    """Nothing changes a layout once it is made but what it caches."""
+    constant: ClassVar[bool] = True  # nothing changes but what is cached
 
     def __init__(self, keys: IntArray) -> None:
         self.keys = keys
         laid_out = _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES, _LETTER_ENDS)
         self.widths, self.starts, self.size, self._letter_ends = laid_out
-        """Each key has this number of columns (K,), and begins at this one (K,)."""
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
@@ -186,22 +162,13 @@ class Layout:
         return np.where(places >= 0, self.starts[places], UNKNOWN) if len(self.keys) else places
 
     def entries(self, keys: IntArray) -> IntArray:
-        """Return all columns (n,) of keys (k,), one key after the other.
-
-        ValueError where the layout does not hold one of them.
-        """
+        """Return all columns (n,) of keys (k,), one key after the other; ValueError for an unknown key."""
         places = self.places(keys)
         return spread(self.starts[places], self.widths[places])
 
     def block(self, letter: str) -> slice:
-        """Return the columns of all keys of a letter."""
         first = 2 * _LETTERS.index(letter)
         return slice(*self._letter_ends[first : first + 2])
-
-    def begin(self, key: int) -> int:
-        """Return the first column of a key, or where it would be if the layout held the key."""
-        place = int(self.keys.searchsorted(key))
-        return int(self.starts[place]) if place < len(self.keys) else self.size
 
 
 @compiled
@@ -220,66 +187,50 @@ def rotation_blocks(size: int, columns: IntArray, angles: Array) -> Array:
     return matrix
 
 
-def _inserted(array: T, at: int, values: T) -> T:
-    """Return an array with values inserted before an index; `np.insert` takes ten times as long."""
-    return cast(T, np.concatenate([array[:at], values, array[at:]]))
-
-
 class Variables:
     """Value for each key, and the reference that its unknown is measured from.
 
-    Linear factors are functions of `value - reference`. The reference of a variable is its first value and
-    never changes, so the factors of the prior need no shift when their variables move.
+    Linear factors are functions of `value - reference`. The reference is the first value and never changes,
+    so the factors of the prior need no shift when their variables move.
     """
 
     def __init__(self) -> None:
-        self.layout = Layout(np.zeros(0, np.intp))
-        self.values: Array = np.zeros(0)
-        """Values (n,): calibration, points (m) and poses (m, m, rad)."""
-        self.reference: Array = np.zeros(0)
-        """First values (n,)."""
-        self.linearized: Array = np.zeros(0)
-        """Linearization points (n,): the values when the factors were linearized last."""
-        self.first_cycle = 0
-        """Perception cycle of the window's oldest pose; older poses are keyframes."""
+        self.layout = Layout(NO_KEYS)
+        self.values: Array = np.zeros(0)  # (n,) calibrations, points (m) and poses (m, m, rad)
+        self.reference: Array = np.zeros(0)  # (n,) first values
+        self.linearized: Array = np.zeros(0)  # (n,) values at which the factors were linearized last
+        self.first_cycle = 0  # of the window's oldest pose; older poses are keyframes
         self._first_pose = self.layout, -1, 0  # layout, first cycle, and where the window's poses begin
 
     def copy(self) -> Variables:
         """Return variables with the same keys and copies of the values."""
-        other = Variables()
-        other.layout, other.reference = self.layout, self.reference
+        other = copy(self)
         other.values, other.linearized = self.values.copy(), self.linearized.copy()
-        other.first_cycle = self.first_cycle
         return other
 
     @property
     def keys(self) -> IntArray:
-        """Return all keys (K,), ascending."""
         return self.layout.keys
 
     def insert(self, keys: IntArray, values: Array, reference: Array | None = None) -> None:
-        """Insert variables: ascending, new keys (k,), and their values (n,) one after the other.
+        """Insert ascending, new keys (k,) with their values (n,); ValueError where a key is known already.
 
-        Their references are the values, unless `reference` (n,) is given for variables that come back.
-        ValueError where a key is known already.
+        References are the values, unless `reference` (n,) is given for variables that come back.
         """
-        reference = values if reference is None else reference
         if len(keys) == 0:
             return
-        if (self.layout.positions(keys) >= 0).any():
+        known, added = self.layout, Layout(keys)
+        both = np.concatenate([known.keys, keys])
+        order = both.argsort(kind="stable")
+        ascending = both[order]
+        if (ascending[1:] == ascending[:-1]).any():
             raise ValueError(f"expected new keys, found {name(int(keys[0]))} or a later one of them known")
-        place = int(self.layout.keys.searchsorted(keys[0]))
-        if place != self.layout.keys.searchsorted(keys[-1]):  # known keys lie between the new ones
-            half = len(keys) // 2
-            width = int(sizes(keys[:half]).sum())
-            self.insert(keys[:half], values[:width], reference[:width])
-            self.insert(keys[half:], values[width:], reference[width:])
-            return
-        at = self.layout.begin(int(keys[0]))
-        self.layout = Layout(_inserted(self.layout.keys, place, keys))
-        self.values = _inserted(self.values, at, values)
-        self.reference = _inserted(self.reference, at, reference)
-        self.linearized = _inserted(self.linearized, at, values)
+        starts = np.concatenate([known.starts, added.starts + known.size])
+        entries = spread(starts[order], np.concatenate([known.widths, added.widths])[order])
+        self.layout, reference = Layout(ascending), values if reference is None else reference
+        self.values = np.concatenate([self.values, values])[entries]
+        self.reference = np.concatenate([self.reference, reference])[entries]
+        self.linearized = np.concatenate([self.linearized, values])[entries]
 
     def remove(self, keys: IntArray) -> None:
         if len(keys) == 0:
@@ -293,7 +244,7 @@ class Variables:
 
     @contextmanager
     def looked_at(self) -> Iterator[None]:
-        """Restore all values at the end: to look at the estimate must not change it."""
+        """Restore all values at the end, since looking at the estimate must not change it."""
         values = self.values.copy()
         try:
             yield
@@ -353,7 +304,8 @@ class Variables:
         """Return a view of the window's poses (P, 3), oldest first."""
         known = self._first_pose
         if known[0] is not self.layout or known[1] != self.first_cycle:
-            begin = self.layout.begin(pose_key(self.first_cycle))
+            count = len(self.keys) - int(self.keys.searchsorted(pose_key(self.first_cycle)))
+            begin = self.layout.size - POSE * count
             known = self._first_pose = self.layout, self.first_cycle, begin
         return self.values[known[2] :].reshape(-1, POSE)
 
@@ -364,10 +316,7 @@ class Variables:
     def gtsam_values(self, keys: IntArray) -> gtsam.Values:
         """Return the values of keys (k,) for GTSAM: a pose is a `Pose2`, any other variable a vector."""
         values = gtsam.Values()
-        starts, poses = self.layout.columns(keys).tolist(), are_poses(keys).tolist()
-        for key, start, width, is_pose in zip(
-            keys.tolist(), starts, sizes(keys).tolist(), poses, strict=True
-        ):
-            own = self.values[start : start + width]
-            values.insert(key, gtsam.Pose2(*own) if is_pose else own)
+        own = np.split(self.of(keys), sizes(keys).cumsum()[:-1])
+        for key, value in zip(keys.tolist(), own if len(keys) else [], strict=True):
+            values.insert(key, gtsam.Pose2(*value) if key >= FIRST_POSE else value)
         return values

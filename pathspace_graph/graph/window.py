@@ -19,6 +19,7 @@ from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_f
 from .rows import KeptRows, OdometryChain, Rows, among, at_reference, jacobian_factors, stacked_factor
 from .variables import (
     CALIBRATION_LETTER,
+    NO_KEYS,
     POSE,
     POSE_LETTER,
     SENSOR_LETTER,
@@ -31,54 +32,43 @@ from .variables import (
     sizes,
 )
 
-NO_OWNERS: Final = np.zeros(0, np.intp)
-SENSOR_LEVER: Final = 10.0
-"""A change of the sensor's calibration moves detections by about this much (m by its unit): they are ten
-metres away, and the vehicle drives at ten metres a second."""
+SENSOR_LEVER: Final = 10.0  # m by unit of the sensor's calibration, of detections 10 m away at 10 m/s
 
 
 @dataclass(frozen=True)
 class SmootherSettings:
     """Settings of the fixed-lag smoother."""
 
-    lag: float
-    """Poses stay in the window for this time (s)."""
+    lag: float  # time (s) for which poses stay in the window
     tolerances: tuple[float, float]
-    """Factors are linearized again where a point or a position has moved by the first tolerance (m), or a
-    heading by the second (rad)."""
-    keyframe_interval: float
-    """Length of path (m) between the keyframes of the submaps."""
+    """Motion of a point or position (m), and of a heading (rad), beyond which rows are linearized again."""
+    keyframe_interval: float  # length of path (m) between the keyframes of the submaps
     sigmas_calibrations: tuple[float, ...]
     """Prior standard deviations of the calibrations: scale error (-) and yaw-rate bias (rad/s) of the
     odometry, and five of the sensor where they are estimated."""
-    calibrations: tuple[float, ...] = ()
-    """Prior means of the same; zero by default."""
-    max_poses: int = 400
-    """The window holds at most this number of poses."""
-    relative: bool = False
-    """While the loop is open, each part of the map is known in the frame of a pose beside it. The rows of the
-    map must not change under a rigid motion of all variables."""
+    calibrations: tuple[float, ...] = ()  # prior means of the same; zero by default
+    max_poses: int = 400  # most poses in the window
 
 
 class MapRows(Protocol):
-    """What the engine must know about a map: its rows, and the variables that they depend on."""
+    """What the engine must know about a map: its rows, and the variables that they depend on.
+
+    While the loop is open, a rigid motion of all variables must not change the rows.
+    """
 
     variables: Variables
     reached_inactive: bool
-    """If true, a row of the last call of `rows` should be on an inactive map point, but is not."""
+    """Whether a row of the last call of `rows` should be on an inactive map point, but is not."""
 
     @property
     def structure(self) -> object:
-        """Return an object that is replaced by another one when the weak priors get other variables."""
+        """Return an object that is another one once the weak priors have other variables."""
 
     def changed(self) -> IntArray:
         """Return the cycles (k,) whose detections in use have changed since the last linearization."""
 
     def rows(self, cycles: IntArray) -> list[Rows]:
-        """Return rows of the detections of some cycles at the variables' values.
-
-        The pose is the first key of a row, and the cycle is its owner.
-        """
+        """Return rows of the detections of some cycles, the pose as first key and the cycle as owner."""
 
     def correct(self) -> None:
         """Correct the detections by the present calibration of the sensor."""
@@ -106,25 +96,16 @@ M_co = TypeVar("M_co", bound=MapRows, covariant=True)
 
 
 class WindowFactors(Generic[M_co]):
-    """Factors of the poses in the window and of the map.
-
-    A factor is linearized again where a map point or a position in it has moved farther than the first
-    tolerance (m) since the last linearization, or a heading farther than the second (rad).
-    """
+    """Factors of the poses in the window and of the map, linearized again beyond tolerances (m, rad)."""
 
     def __init__(self, map_rows: M_co, tolerances: tuple[float, float]) -> None:
         self.map, self.variables = map_rows, map_rows.variables
-        self.odometry = OdometryChain()
-        """Odometry between each pose of the window and the next."""
-        self.exact = False
-        """If true, the tolerances are zero: factors of all variables that moved are linearized again."""
+        self.odometry = OdometryChain()  # between each pose of the window and the next
+        self.exact = False  # whether the tolerances are zero
         self._lengthened = -1  # the rows of this cycle lack the odometry that leads on from it
-        self.measured = KeptRows()
-        """Rows of detections, and of the odometry to the next cycle, by perception cycle."""
-        self.gauge = KeptRows()
-        """Nonlinear weak priors."""
+        self.measured = KeptRows()  # of detections, and of the odometry to the next cycle, by cycle
+        self.gauge = KeptRows()  # nonlinear weak priors
         self.linear_gauge = KeptRows()
-        """Linear weak priors."""
         self._tolerances = tolerances
         self._structure: object = None
 
@@ -134,32 +115,24 @@ class WindowFactors(Generic[M_co]):
         return [*self.measured.groups, *self.gauge.groups, *self.linear_gauge.groups]
 
     def fresh_rows(self, cycles: IntArray) -> list[Rows]:
-        """Return the rows of some cycles and the weak priors on the active map points, as `fresh` does."""
-        weak = [*self.map.gauge(False), *self.map.linear_gauge(False)]
-        return at_reference([*self._rows(cycles), *weak], self.variables)
+        """Return the rows of some cycles and the weak priors on the active map points, linearized now."""
+        return at_reference([*self._rows(cycles), *self._weak(False)], self.variables)
 
     def fresh(self, cycles: IntArray, whole: bool) -> list[gtsam.GaussianFactor]:
-        """Return factors of some cycles and weak priors, linearized at the variables' values.
-
-        The factors that are kept do not change. The weak priors are on the active map points, or on all if
-        `whole`.
-        """
-        weak = [*self.map.gauge(whole), *self.map.linear_gauge(whole)]
+        """Return factors of some cycles and weak priors, on all points if `whole`, linearized now."""
         measured = at_reference(self._rows(cycles), self.variables)
         factors = jacobian_factors(measured, self.variables.layout)
-        return [*factors.values(), *stacked_factor(weak, self.variables)]
+        return [*factors.values(), *stacked_factor(self._weak(whole), self.variables)]
 
     def weak_on(self, keys: IntArray) -> list[gtsam.GaussianFactor]:
         """Return the weak priors that hold any of some active map points (k,), as one factor."""
-        weak = [*self.map.gauge(False), *self.map.linear_gauge(False)]
-        touching = [rows.where(np.asarray(np.isin(rows.keys, keys).any(axis=1))) for rows in weak]
+        touching = [
+            rows.where(np.asarray(np.isin(rows.keys, keys).any(axis=1))) for rows in self._weak(False)
+        ]
         return [*stacked_factor(touching, self.variables)]
 
     def relinearize(self, cycles: IntArray, inactive: IntArray) -> bool:
-        """Linearize stale rows again, and return true.
-
-        Where one of them would hold an inactive variable (k,), nothing changes and the result is false.
-        """
+        """Linearize stale rows again; false, and nothing changes, if one would hold an inactive key (k,)."""
         moved = self._moved()
         stale = self._stale(cycles, moved)
         groups = self._rows(stale)
@@ -189,11 +162,13 @@ class WindowFactors(Generic[M_co]):
     def _rows(self, cycles: IntArray) -> list[Rows]:
         return [*self.map.rows(cycles), *self.odometry.rows(self.variables, cycles)]
 
+    def _weak(self, whole: bool) -> list[Rows]:
+        return [*self.map.gauge(whole), *self.map.linear_gauge(whole)]
+
     def _moved(self) -> IntArray:
         """Return the keys of variables that moved by more than the tolerance since their linearization.
 
-        The odometry's calibration is never among them, since every row is linear in it. That of the sensor
-        moves the foot points of detections.
+        Every row is linear in the odometry's calibration, but that of the sensor moves foot points.
         """
         layout = self.variables.layout
         tolerance, poses = np.zeros(layout.size), layout.block(POSE_LETTER)
@@ -215,10 +190,10 @@ class WindowFactors(Generic[M_co]):
     def _relinearize_gauge(self, moved: IntArray) -> None:
         if self.map.structure is not self._structure:
             self.gauge, self.linear_gauge, self._structure = KeptRows(), KeptRows(), self.map.structure
-            self.linear_gauge.replace(NO_OWNERS, self.map.linear_gauge(False), self.variables)
+            self.linear_gauge.replace(NO_KEYS, self.map.linear_gauge(False), self.variables)
         if (self.exact and len(moved)) or not self.gauge.groups:
             self.gauge = KeptRows()
-            self.gauge.replace(NO_OWNERS, self.map.gauge(False), self.variables)
+            self.gauge.replace(NO_KEYS, self.map.gauge(False), self.variables)
             return
         stale = np.unique(self.gauge.holding(moved))
         if len(stale):
@@ -245,8 +220,7 @@ class UserFactors:
     def __init__(self) -> None:
         self._active: list[_UserFactor] = []
         self._inactive: list[_UserFactor] = []
-        self.given = False
-        """The flag is set once the user has given any factor, which may be absolute."""
+        self.given = False  # whether the user has ever given a factor, which may be absolute
 
     def add(self, factors: Sequence[gtsam.NonlinearFactor]) -> bool:
         """Add factors that `check_factors` lets pass, and return whether any of them holds a pose."""
@@ -278,7 +252,7 @@ class UserFactors:
         return _linear(removed, variables)
 
     def deactivate(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
-        """Deactivate factors on one of the map points (k,) and on no pose, and returns them linearized."""
+        """Deactivate factors on one of the map points (k,) and on no pose, and return them linearized."""
         inactive, self._active = self._split(lambda one: one.holds_any(keys) and not one.holds_pose)
         self._inactive += inactive
         return _linear(inactive, variables)
@@ -287,16 +261,17 @@ class UserFactors:
         self._active, self._inactive = self._active + self._inactive, []
 
     def _split(self, condition: Callable[[_UserFactor], bool]) -> tuple[list[_UserFactor], list[_UserFactor]]:
-        meets = [condition(one) for one in self._active]
-        chosen = [one for one, met in zip(self._active, meets, strict=True) if met]
-        return chosen, [one for one, met in zip(self._active, meets, strict=True) if not met]
+        chosen: list[_UserFactor] = []
+        others: list[_UserFactor] = []
+        for one in self._active:
+            (chosen if condition(one) else others).append(one)
+        return chosen, others
 
 
 def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables, next_cycle: int) -> None:
     """Raise a SettingsError for the first factor that is not one, or whose keys or numbers cannot be used.
 
-    A factor may hold any variable, poses of the window, and that of the next cycle, which is linearized where
-    the newest one is. It must give finite numbers.
+    It may hold any variable, poses of the window, and that of the next cycle, linearized at the newest one.
     """
     if not factors:
         return
@@ -334,14 +309,13 @@ def _unusable(row: int, expected: str, found: object) -> SettingsError:
 
 
 def _linear(factors: Sequence[_UserFactor], variables: Variables) -> list[gtsam.GaussianFactor]:
-    return [linear for linear in (_linearized(one, variables) for one in factors) if linear is not None]
+    return [linear for one in factors if (linear := _linearized(one, variables)) is not None]
 
 
 def _linearized(one: _UserFactor, variables: Variables) -> gtsam.GaussianFactor | None:
     """Return `1/2 |A d - b|^2` with d = value - reference.
 
-    The tangent of `gtsam.Pose2` is in the frame of the pose, and our unknowns are in the map frame. So with R
-    the rotation of the pose, `A_xy` becomes `A_xy R'`.
+    The tangent of `gtsam.Pose2` is in the frame of the pose, so `A_xy` becomes `A_xy R'` in the map frame.
     """
     linear = one.factor.linearize(variables.gtsam_values(one.keys))
     if linear is None:
@@ -356,7 +330,7 @@ def _linearized(one: _UserFactor, variables: Variables) -> gtsam.GaussianFactor 
 def as_nonlinear(factor: gtsam.GaussianFactor, variables: Variables) -> gtsam.LinearContainerFactor:
     """Return a linear factor on our unknowns as a factor of a nonlinear graph, about the variables' values.
 
-    This is the inverse of the linearization of a user's factor: `A_xy R` on each pose, and `b - A d_now`.
+    The inverse of `_linearized`: `A_xy R` on each pose, and `b - A d_now`.
     """
     layout = Layout(np.sort(np.array(list(factor.keys()), np.intp)))
     information, vector = normal_equations(graph_of(factor), layout)

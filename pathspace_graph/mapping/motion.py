@@ -196,5 +196,4 @@ def smoother_settings(settings: MapperSettings) -> SmootherSettings:
         keyframe_interval=KEYFRAME_INTERVAL,
         sigmas_calibrations=settings.sigmas_calibrations,
         calibrations=settings.calibrations,
-        relative=True,
     )

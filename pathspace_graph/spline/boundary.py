@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
-from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_foot_points
+from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_joint_foot_points
 from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.labels import LEFT, RIGHT
@@ -147,9 +147,10 @@ class Boundary:
 
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
         """Refine the foot points of points (m, 2), starting at the parameters u (m,)."""
-        s, unwrapped = self.settings, self.extended(control_points)
-        low, high = u - s.refine_room, self.believed(u + s.refine_room)
-        return refine_foot_points(self.tables, unwrapped, points, u, low, high, s.refine_iterations)
+        s, alone = self.settings, np.zeros(len(points), np.intp)
+        search = u, u - s.refine_room, self.believed(u + s.refine_room), s.refine_iterations
+        unwrapped = self.extended(control_points)
+        return refine_joint_foot_points(self.tables.alone, unwrapped, points, alone, *search)
 
     @property
     def trusted(self) -> float:

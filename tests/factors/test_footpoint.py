@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,7 +16,7 @@ from pathspace_graph.factors.bspline import (
     periodic_knots,
     uniform_knots,
 )
-from pathspace_graph.factors.footpoint import FootPoints, foot_points, refine_foot_points
+from pathspace_graph.factors.footpoint import FootPoints, foot_points, refine_joint_foot_points
 
 GRID = 400
 """Coarse grid steps over the domain."""
@@ -25,6 +27,14 @@ def curve_points(tables: SpanPolynomials, control_points: Array, u: Array) -> Ar
     values, span = tables.evaluate(u)
     columns = span[:, None] + np.arange(-tables.degree, 1)
     return np.einsum("kj,kjd->kd", values[0], control_points[columns])
+
+
+def refine_foot_points(
+    tables: SpanPolynomials, control_points: Array, points: Array, *search: Any
+) -> FootPoints:
+    """The refinement on one curve."""
+    alone = np.zeros(len(points), np.intp)
+    return refine_joint_foot_points(tables.alone, control_points, points, alone, *search)
 
 
 def whole(tables: SpanPolynomials, control_points: Array, points: Array, step: float = 0.0) -> FootPoints:

@@ -10,12 +10,12 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.bspline import SpanPolynomials, periodic_knots
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.gtsam_factors import (
+    boundary_point_factor,
     calibrated_odometry_factor,
-    odometry_factor,
     pose_array,
     smoothness_factors,
     spacing_factors,
-    spline_projection_factor,
+    spline_projection_factors,
 )
 from pathspace_graph.factors.linear import linear_factor
 from pathspace_graph.factors.odometry import IntegratedOdometry
@@ -162,7 +162,9 @@ def test_without_calibration_both_odometry_factors_agree() -> None:
     values.insert(0, gtsam.Pose2(1.0, 2.0, 3.0))
     values.insert(1, gtsam.Pose2(2.0, 2.5, -3.0))
     values.insert(2, np.zeros(2))
-    native = gtsam.JacobianFactor(odometry_factor(0, 1, odometry).linearize(values))
+    noise = gtsam.noiseModel.Gaussian.Information(odometry.whitener.T @ odometry.whitener)
+    between = gtsam.BetweenFactorPose2(0, 1, gtsam.Pose2(*odometry.delta), noise)
+    native = gtsam.JacobianFactor(between.linearize(values))
     own = gtsam.JacobianFactor(calibrated_odometry_factor(0, 1, 2, odometry).linearize(values))
     scale = np.abs(native.getA()).max()
     np.testing.assert_allclose(own.getA()[:, :6], native.getA(), atol=1e-9 * scale)
@@ -176,8 +178,8 @@ def test_periodic_stretch_across_the_seam_holds_only_its_own_keys() -> None:
     points = 6.0 * np.column_stack([np.cos(angle), np.sin(angle)])
     tables = SpanPolynomials(periodic_knots(3.0 * np.arange(size + 1.0), DEGREE), DEGREE, True)
     u = whole_period_search(tables, points, np.array([[7.0, 1.0], [7.2, 1.3]]))
-    factor = spline_projection_factor(
-        99,
+    (factor,) = spline_projection_factors(
+        np.full(2, 99),
         list(range(size)),
         tables,
         points_vehicle=np.array([[2.0, 0.0], [2.2, 0.3]]),
@@ -213,8 +215,8 @@ def whole_period_search(tables: SpanPolynomials, distinct: Array, points: Array)
 
 def straight_factor(u: Array, points: Array) -> tuple[gtsam.CustomFactor, gtsam.Values]:
     """Readings beside a straight boundary along the x axis, from a pose at the origin."""
-    factor = spline_projection_factor(
-        99,
+    (factor,) = spline_projection_factors(
+        np.full(len(u), 99),
         list(range(SIZE)),
         TABLES,
         points_vehicle=points,
@@ -251,8 +253,11 @@ def test_a_factor_holds_only_the_keys_of_its_stretch() -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
+    none = np.zeros(0)
     with pytest.raises(ValueError, match="at least one"):
-        straight_factor(np.zeros(0), np.zeros((0, 2)))
+        boundary_point_factor(
+            list(range(SIZE)), TABLES, points_map=np.zeros((0, 2)), sigma=none, low=none, high=none
+        )
     with pytest.raises(ValueError, match="expected as many"):
         straight_factor(np.zeros(2), np.zeros((1, 2)))
     with pytest.raises(ValueError, match="expected 2 distances"):
@@ -284,7 +289,7 @@ def test_a_linear_factor_over_many_keys() -> None:
     rng = np.random.default_rng(0)
     keys, dims = [9, 4, 7, 1, 30], [2, 3, 2, 1, 3]
     A, b, x = rng.normal(size=(4, 11)), rng.normal(size=4), rng.normal(size=11)
-    factor = gtsam.JacobianFactor(linear_factor(keys, dims, A, b))
+    factor = gtsam.JacobianFactor(linear_factor(np.array(keys), np.array(dims), A, b))
     delta = gtsam.VectorValues()
     for key, part in zip(keys, np.split(x, np.cumsum(dims)[:-1]), strict=True):
         delta.insert(key, part)
@@ -305,4 +310,4 @@ def test_a_linear_factor_that_does_not_fit_is_refused(
     keys: list[int], dims: list[int], shape: tuple[int, int], rows: int
 ) -> None:
     with pytest.raises(ValueError, match="expected"):
-        linear_factor(keys, dims, np.zeros(shape), np.zeros(rows))
+        linear_factor(np.array(keys), np.array(dims), np.zeros(shape), np.zeros(rows))

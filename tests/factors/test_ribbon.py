@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.bspline import SpanPolynomials, uniform_knots
-from pathspace_graph.factors.gtsam_factors import pose_array, ribbon_factor
+from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.residuals import RIBBON, beyond_edge
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import SENSOR_SIZE
@@ -80,8 +80,8 @@ def test_the_factors_jacobians(kind: str, with_sensor: bool) -> None:
     pose, count = gtsam.Pose2(3.0, -1.0, 0.7), len(u)
     keys = [int(gtsam.symbol("a", j)) for j in range(len(ribbon))]
     sensor_key = int(gtsam.symbol("c", 0)) if with_sensor else None
-    factor = ribbon_factor(
-        int(gtsam.symbol("x", 0)),
+    (factor,) = spline_projection_factors(
+        np.full(count, int(gtsam.symbol("x", 0))),
         keys,
         tables,
         points_vehicle=to_vehicle(points, np.tile(pose_array(pose), (count, 1))),
@@ -123,8 +123,8 @@ def test_the_factor_asks_for_equal_numbers() -> None:
     tables, ribbon = straight_ribbon((2.0, 2.0))
     keys = [int(gtsam.symbol("a", j)) for j in range(len(ribbon))]
     one, two = np.zeros(1), np.zeros((2, 2))
-    with pytest.raises(ValueError, match="as many detections"):
-        ribbon_factor(
-            0, keys, tables, points_vehicle=two, covariances=np.tile(np.eye(2), (2, 1, 1)), sides=one,
-            low=one, high=one, sigma_model=0.1, huber=2.0,
+    with pytest.raises(ValueError, match="as many poses, detections"):
+        spline_projection_factors(
+            np.zeros(2, np.intp), keys, tables, points_vehicle=two, covariances=np.tile(np.eye(2), (2, 1, 1)),
+            sides=one, low=one, high=one, sigma_model=0.1, huber=2.0,
         )  # fmt: skip

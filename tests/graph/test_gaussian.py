@@ -11,7 +11,6 @@ import pytest
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.graph.gaussian import (
-    as_hessian_factor,
     cholesky,
     condition,
     eliminate,
@@ -317,7 +316,7 @@ def test_a_graph_of_graphs_nets_and_factors_has_all_of_their_factors() -> None:
     np.testing.assert_allclose(found, hessian, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(found_vector, vector, rtol=1e-8, atol=1e-8)
     np.testing.assert_array_equal(keys_of(again), KEYS)
-    whole = graph_of(as_hessian_factor(again))
+    whole = graph_of(gtsam.HessianFactor(again))
     assert whole.size() == 1
     np.testing.assert_allclose(normal_equations(whole, LAYOUT)[0], hessian, rtol=1e-8, atol=1e-8)
 
@@ -335,7 +334,7 @@ def test_the_binding_gives_views_that_nobody_owns(name: str) -> None:
 
 def test_the_linear_term_of_a_hessian_factor_is_such_a_view_too() -> None:
     factor, *_ = random_factor(np.random.default_rng(18), LEFT_KEYS)
-    array = as_hessian_factor(graph_of(factor)).linearTerm()
+    array = gtsam.HessianFactor(graph_of(factor)).linearTerm()
     assert not array.flags.owndata and array.base is None
 
 

@@ -166,16 +166,16 @@ def test_the_active_variables_are_all_others_also_when_more_become_known() -> No
     drive.drive(8)
     smoother = drive.smoother
     inactive, layout = smoother.inactive, smoother.variables.layout
-    assert inactive.active(layout) is layout
+    assert inactive.active(layout)[0] is layout
     drive.deactivate(3)
-    active = inactive.active(smoother.variables.layout)
+    active, _ = inactive.active(smoother.variables.layout)
     np.testing.assert_array_equal(
         active.keys, np.setdiff1d(smoother.variables.keys, control_keys(0, np.arange(3)))
     )
-    assert inactive.active(smoother.variables.layout) is active
+    assert inactive.active(smoother.variables.layout)[0] is active
     new = control_keys(1, np.arange(2))
     smoother.variables.insert(new, np.zeros(4))
-    found = inactive.active(smoother.variables.layout)
+    found, _ = inactive.active(smoother.variables.layout)
     np.testing.assert_array_equal(found.keys, np.union1d(active.keys, new))
     drive.deactivate(5)
     assert not np.isin(control_keys(0, np.arange(5)), smoother.layout.keys).any()

@@ -15,7 +15,7 @@ from pathspace_graph.factors.gtsam_factors import (
     pose_array,
     smoothness_factors,
     spacing_factors,
-    spline_projection_factor,
+    spline_projection_factors,
 )
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, odometry_residuals
@@ -215,8 +215,8 @@ def nonlinear_graph(scene: Scene) -> gtsam.NonlinearFactorGraph:
 
 def projection_factor(scene: Scene, label: int, slot: int) -> gtsam.CustomFactor:
     rows = np.flatnonzero(scene.slots[label] == slot)
-    return spline_projection_factor(
-        gtsam.symbol("x", int(slot)),
+    (factor,) = spline_projection_factors(
+        np.full(len(rows), gtsam.symbol("x", int(slot))),
         CONTROL_KEYS[label],
         TABLES,
         points_vehicle=scene.points[label][rows],
@@ -226,6 +226,7 @@ def projection_factor(scene: Scene, label: int, slot: int) -> gtsam.CustomFactor
         sigma_model=SIGMA_MODEL,
         huber=HUBER,
     )
+    return factor
 
 
 def to_values(scene: Scene, state: Array) -> gtsam.Values:

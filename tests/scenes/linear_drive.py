@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.graph.inactive import InactiveMap
 from pathspace_graph.graph.rows import OdometryChain, Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import (
@@ -134,6 +135,7 @@ class LinearDrive:
         )
         self.track = LinearTrack(self.seed)
         self.smoother = FixedLagSmoother(settings, self.track)
+        self.smoother.inactive = InactiveMap()  # these rows change under a rigid motion of all variables
         self.smoother.window.odometry = LinearOdometry()
         self.rng = np.random.default_rng(self.seed + 100)
         self.start = self.rng.normal(size=POSE)
