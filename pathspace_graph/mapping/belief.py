@@ -29,10 +29,8 @@ _LEAST_VARIANCE: Final = 1e-12
 class Transformed:
     """The moments of a function of a Gaussian, by the cubature rule."""
 
-    mean: Array
-    """(q,) Mean of the function."""
-    covariance: Array
-    """(q, q) Covariance of the function."""
+    mean: Array  # (q,) mean of the function
+    covariance: Array  # (q, q) covariance of the function
     slope: Array
     """(q, d) Statistical linearization `C_yx C_xx^-1`. The covariance of the function with a
     variable z that it does not depend on is `slope @ C_xz`, which is exact for Gaussians."""
@@ -73,8 +71,7 @@ def transform(function: Callable[[Array], Array], mean: Array, covariance: Array
 
 
 _ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
-HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE
-"""Number of entries of the state before its points."""
+HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE  # number of entries of the state before its points
 SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)
 """Entries of the sensor's calibration in the state."""
 
@@ -93,12 +90,9 @@ class Belief:
     def __init__(self, pose: Array, covariance: Array, calibration_sigma: Array | None = None) -> None:
         sigma, known = np.zeros(HEAD - POSE), () if calibration_sigma is None else calibration_sigma
         sigma[: len(known)] = known
-        self.mean: Array = np.concatenate([pose, np.zeros(HEAD - POSE)])
-        """(n,) Mean of x."""
-        self.covariance: Array = block_diag(covariance, np.diag(sigma**2))
-        """(n, n) Covariance of x."""
-        self.twist: Array = np.zeros(POSE)
-        """(3,) Twist of the vehicle, in m/s, m/s and rad/s."""
+        self.mean: Array = np.concatenate([pose, np.zeros(HEAD - POSE)])  # (n,) mean of x
+        self.covariance: Array = block_diag(covariance, np.diag(sigma**2))  # (n, n) covariance of x
+        self.twist: Array = np.zeros(POSE)  # (3,) twist of the vehicle, in m/s, m/s and rad/s
 
     @classmethod
     def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Self:

@@ -32,11 +32,9 @@ class CurveMap:
 
     def __init__(self, settings: MapperSettings, state: State | None = None) -> None:
         self.settings = settings
-        self.state = state or State()
-        """Curves and all variables."""
+        self.state = state or State()  # curves and all variables
         self.variables = self.state.variables
-        self.detections = DetectionTable()
-        """Detections of the poses in the window."""
+        self.detections = DetectionTable()  # detections of the poses in the window
         self.held_by_prior = False
         """Whether the prior holds the spacing and shape of the curves, so that the window does not."""
         self.scatter: dict[int, Array] = {}

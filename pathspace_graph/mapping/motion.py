@@ -19,8 +19,7 @@ from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
 from .path import DrivenPath
 
-DOUBT_CYCLES: Final = 10
-"""Cycles from one judgement of all calibrations to the next."""
+DOUBT_CYCLES: Final = 10  # cycles from one judgement of all calibrations to the next
 KEYFRAME_INTERVAL: Final = 12.0
 """Distance of the keyframes in whose frames the drive is kept until the loop closes (m along the path)."""
 
@@ -29,28 +28,20 @@ KEYFRAME_INTERVAL: Final = 12.0
 class BiasMeasurement:
     """A measured bias of the yaw rate: what a vehicle at rest measures."""
 
-    value: float
-    """Mean yaw rate (rad/s)."""
-    sigma: float
-    """Its standard deviation (rad/s)."""
+    value: float  # mean yaw rate (rad/s)
+    sigma: float  # its standard deviation (rad/s)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMotion:
     """The motion that leads to a cycle, and what was found out about the odometry."""
 
-    odometry: IntegratedOdometry
-    """Relative pose, with its covariance."""
-    twists: Array
-    """(k, 3) Twists since the last cycle, in m/s, m/s and rad/s."""
-    doubted: bool = False
-    """Whether the detections contradict the odometry, and their own motion replaces it."""
-    missing: bool = False
-    """Whether no twist was measured for long."""
-    stuck: bool = False
-    """Whether the twist stays the same to the last digit."""
-    bias: BiasMeasurement | None = None
-    """What the vehicle has measured at rest, where it has just done so."""
+    odometry: IntegratedOdometry  # relative pose, with its covariance
+    twists: Array  # (k, 3) twists since the last cycle, in m/s, m/s and rad/s
+    doubted: bool = False  # whether the detections contradict the odometry, and their own motion replaces it
+    missing: bool = False  # whether no twist was measured for long
+    stuck: bool = False  # whether the twist stays the same to the last digit
+    bias: BiasMeasurement | None = None  # what the vehicle has measured at rest, where it has just done so
     durations: Array | None = None
     """(k,) Times for which the twists hold, s; None where the motion is not that of the odometry."""
     excess: Array = field(default_factory=lambda: np.zeros(3))

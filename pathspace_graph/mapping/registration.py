@@ -19,36 +19,27 @@ HEADING: Final = 0.8
 """Largest angle between the heading and that of the beginning where the loop may close (rad)."""
 START_LATERAL: Final = 5.0
 """Largest distance from the start at which the vehicle crosses its line, without which no loop closes (m)."""
-START_HEADING: Final = 0.5
-"""Largest angle between the directions of the start and of that crossing (rad)."""
-WINDOW: Final = 2.0
-"""Age of the oldest detections that are registered (s)."""
-BEGINNING: Final = 60.0
-"""Length of the curves that counts as their beginning (m)."""
-BEGINNING_SHARE: Final = 0.6
-"""Largest share of a short curve that counts as its beginning."""
-REACH: Final = 3.0
-"""Largest distance from the curves of detections that the first iteration uses (m)."""
-SHRINK: Final = 0.7
-"""Factor on `REACH` for each further iteration, down to `closing.inlier_distance`."""
+START_HEADING: Final = 0.5  # largest angle between the directions of the start and of that crossing (rad)
+WINDOW: Final = 2.0  # age of the oldest detections that are registered (s)
+BEGINNING: Final = 60.0  # length of the curves that counts as their beginning (m)
+BEGINNING_SHARE: Final = 0.6  # largest share of a short curve that counts as its beginning
+REACH: Final = 3.0  # largest distance from the curves of detections that the first iteration uses (m)
+SHRINK: Final = 0.7  # factor on `REACH` for each further iteration, down to `closing.inlier_distance`
 ITERATIONS: Final = 7
 START_STEP: Final = 2.0
 """Distance of the poses of the beginning from which the registration starts where the vehicle is lost (m)."""
 START_CHI2: Final = 16.3
 """Their largest squared Mahalanobis distance under its uncertainty: 99.9 % of chi-square with 3 degrees."""
 MIN_DETECTIONS: Final = 25
-MIN_INLIERS: Final = 5
-"""Least number of inliers on each boundary."""
+MIN_INLIERS: Final = 5  # least number of inliers on each boundary
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A rigid correction of the newest poses and their detections."""
 
-    centre: Array
-    """(2,) Centre of the rotation, the newest position, in m, map frame."""
-    vector: Array
-    """(3,) Translation (x, y) in m after the rotation by the third entry (rad)."""
+    centre: Array  # (2,) centre of the rotation, the newest position, in m, map frame
+    vector: Array  # (3,) translation (x, y) in m after the rotation by the third entry (rad)
 
     def apply(self, points: Array) -> Array:
         """Return the moved points (m, 2)."""
@@ -66,13 +57,10 @@ class Motion:
 class Sightings:
     """Coloured detections, where the vehicle believes that they are."""
 
-    rows: IntArray
-    """(m,) Rows of the detections in their table."""
+    rows: IntArray  # (m,) rows of the detections in their table
     labels: IntArray
-    points: Array
-    """(m, 2) Positions in m, map frame."""
-    covariances: Array
-    """(m, 2, 2) Covariances in m^2, map frame."""
+    points: Array  # (m, 2) positions in m, map frame
+    covariances: Array  # (m, 2, 2) covariances in m^2, map frame
     explained: BoolArray
     """(m,) Whether the newest curves explain the detection: only these can contradict a place."""
 
@@ -86,19 +74,13 @@ class Sightings:
 class Matches:
     """The detections whose foot points are inside a stretch of their curve, for one motion."""
 
-    rows: IntArray
-    """(m,) Rows of the detections in their table."""
+    rows: IntArray  # (m,) rows of the detections in their table
     labels: IntArray
-    u: Array
-    """(m,) Parameters of the foot points (m)."""
-    inlier: BoolArray
-    """(m,) Whether the detection is within `inlier_distance` of the curve."""
-    explained: BoolArray
-    """(m,) Whether the newest curves explain the detection."""
-    hessian: Array
-    """(3, 3) Information about the motion, from the detections within reach."""
-    negative_gradient: Array
-    """(3,) Negative gradient of the cost by the motion, from the same detections."""
+    u: Array  # (m,) parameters of the foot points (m)
+    inlier: BoolArray  # (m,) whether the detection is within `inlier_distance` of the curve
+    explained: BoolArray  # (m,) whether the newest curves explain the detection
+    hessian: Array  # (3, 3) information about the motion, from the detections within reach
+    negative_gradient: Array  # (3,) negative gradient of the cost by the motion, from the same detections
 
     def inliers(self, label: int) -> tuple[IntArray, Array]:
         """Return the rows (k,) and the parameters (k,) of one boundary's inliers."""
@@ -110,11 +92,9 @@ class Matches:
 class RefinedMotion:
     """Motion at the end of the registration."""
 
-    motion: Motion
-    """Motion of the detections onto their curves."""
+    motion: Motion  # motion of the detections onto their curves
     matches: Matches
-    covariance: Array
-    """(3, 3) Covariance of the motion (m, m, rad)."""
+    covariance: Array  # (3, 3) covariance of the motion (m, m, rad)
 
 
 def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool:

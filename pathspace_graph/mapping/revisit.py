@@ -20,13 +20,10 @@ from pathspace_graph.graph.variables import POSE, Layout, pose_keys
 class Revisit:
     """The pose of one cycle in the frame of an earlier one's, as it was measured: `A (y(x) - y0)`."""
 
-    earlier: int
-    """Cycle in whose frame the pose is."""
+    earlier: int  # cycle in whose frame the pose is
     later: int
-    local: Array
-    """(3,) The measured pose y0 (m, m, rad)."""
-    root: Array
-    """(3, 3) A, a square root of its information."""
+    local: Array  # (3,) the measured pose y0 (m, m, rad)
+    root: Array  # (3, 3) A, a square root of its information
 
     def factor(self) -> RelativeFactor:
         """Return the measurement as a factor of the engine."""

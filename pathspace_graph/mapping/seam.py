@@ -18,10 +18,8 @@ EXTRAPOLATED: Final = 2
 """Knot intervals past the confirmed end whose parameters are mapped to the closed curve."""
 JOIN_MARGIN: Final = 10.0
 """Length before the end of a curve, beside `BEGINNING`, within which the seam lies (m)."""
-JOIN_SHARE: Final = 0.5
-"""Share of a short curve past which the seam lies."""
-OVERLAP_STEP: Final = 1.0
-"""Step at which points of the overlap are placed on the beginning (m)."""
+JOIN_SHARE: Final = 0.5  # share of a short curve past which the seam lies
+OVERLAP_STEP: Final = 1.0  # step at which points of the overlap are placed on the beginning (m)
 OVERLAP_ROOM: Final = 4.0
 """Room about its expected place in which a point of the overlap is searched for (m along the curve)."""
 SEAM_MARGIN: Final = 0.5
@@ -32,12 +30,9 @@ SEAM_MARGIN: Final = 0.5
 class Overlap:
     """The correspondence between a curve's end and its beginning."""
 
-    period: float
-    """Length of the closed curve in the open curve's parameter (m)."""
-    u: Array
-    """(k,) Increasing parameters of the open curve's end, from the seam on."""
-    w: Array
-    """(k,) Parameters of the same places on the beginning, from 0 on."""
+    period: float  # length of the closed curve in the open curve's parameter (m)
+    u: Array  # (k,) increasing parameters of the open curve's end, from the seam on
+    w: Array  # (k,) parameters of the same places on the beginning, from 0 on
 
     def new_parameter(self, u: Array) -> Array:
         """Map parameters of the open curve to those of the closed one, which are not wrapped."""
@@ -49,12 +44,9 @@ class PeriodicCurve:
     """The periodic curve that replaces an open one."""
 
     overlap: Overlap
-    knots: Array
-    """(m + 2 p + 1,) Periodic knots."""
-    points: Array
-    """(m, 2) Control points in m, map frame."""
-    old_from_new: Array
-    """(n, m) Matrix E of the change of variables: `C_old = E C_new`."""
+    knots: Array  # (m + 2 p + 1,) periodic knots
+    points: Array  # (m, 2) control points in m, map frame
+    old_from_new: Array  # (n, m) matrix E of the change of variables: `C_old = E C_new`
 
 
 def make_periodic(

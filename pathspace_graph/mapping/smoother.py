@@ -26,12 +26,9 @@ from .motion import smoother_settings
 class Gating:
     """The coloured detections of the newest pose, as they were tested."""
 
-    rows: IntArray
-    """(k,) Detections, by row of the table."""
-    in_view: BoolArray
-    """(k,) Whether the detection lies beside the part of its curve that the pose sees."""
-    innovation: Array
-    """(k,) Distance of each from its curve before the update, in standard deviations of it."""
+    rows: IntArray  # (k,) detections, by row of the table
+    in_view: BoolArray  # (k,) whether the detection lies beside the part of its curve that the pose sees
+    innovation: Array  # (k,) distance of each from its curve before the update, in standard deviations of it
 
 
 class CurveSmoother(FixedLagSmoother[CurveMap]):

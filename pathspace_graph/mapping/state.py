@@ -29,18 +29,13 @@ class Curves:
     """
 
     boundaries: tuple[Boundary, ...]
-    labels: IntArray
-    """(k,) Labels of the curves, ascending."""
-    active: tuple[IntArray, ...]
-    """Active control points of each curve, by index."""
-    tables: tuple[SpanPolynomials, ...]
-    """Tables of each whole curve."""
-    spans: Spans
-    """All spans of closed curves; an open curve begins at its first active control point."""
+    labels: IntArray  # (k,) labels of the curves, ascending
+    active: tuple[IntArray, ...]  # active control points of each curve, by index
+    tables: tuple[SpanPolynomials, ...]  # tables of each whole curve
+    spans: Spans  # all spans of closed curves; an open curve begins at its first active control point
     active_from: Array
     """(k,) Parameter before which an open curve is inactive; minus infinity if all is active."""
-    keys: IntArray
-    """(m,) Keys of all control points."""
+    keys: IntArray  # (m,) keys of all control points
 
     @classmethod
     def of(cls, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> Self:
@@ -106,10 +101,8 @@ class State:
     """The boundaries and the variables: control points (m) and poses (m, m, rad), map frame."""
 
     def __init__(self, variables: Variables | None = None) -> None:
-        self.variables = variables or Variables()
-        """Control points, calibration and poses by key."""
-        self.boundaries: dict[int, Boundary] = {}
-        """Curves, sorted by label as their control points are."""
+        self.variables = variables or Variables()  # control points, calibration and poses by key
+        self.boundaries: dict[int, Boundary] = {}  # curves, sorted by label as their control points are
         self.active_stretch: dict[int, IntArray] = {}
         """Active control points (k,) of a boundary that is partly inactive: one stretch in driving order, by
         index from the boundary's first control point."""

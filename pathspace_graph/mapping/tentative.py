@@ -16,14 +16,10 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.settings.online import GrowthSettings
 
-MERGE_CHI: Final = 2.5
-"""Gate of a smeared detection about a track, in sigmas of both together."""
-MERGE_MOST: Final = 2.0
-"""Its limit in merge radii: the next cone of the row is farther away."""
-RESTORED: Final = 0.3
-"""Standard deviation of a cone that is taken back from a curve (m)."""
-MAX_TRACKS: Final = 1000
-"""Tracks of each label that are kept, the ones that were seen last."""
+MERGE_CHI: Final = 2.5  # gate of a smeared detection about a track, in sigmas of both together
+MERGE_MOST: Final = 2.0  # its limit in merge radii: the next cone of the row is farther away
+RESTORED: Final = 0.3  # standard deviation of a cone that is taken back from a curve (m)
+MAX_TRACKS: Final = 1000  # tracks of each label that are kept, the ones that were seen last
 
 
 class TentativeTracks:
@@ -35,10 +31,8 @@ class TentativeTracks:
         """(n, 2) Weighted mean of each track's detections in m, map frame."""
         self.information: Array = np.zeros((0, 2, 2))
         """(n, 2, 2) Information of each track (1/m^2): the sum of its detections' inverse covariances."""
-        self.counts: IntArray = np.zeros(0, np.intp)
-        """(n,) Number of detections."""
-        self.last_t: Array = np.zeros(0)
-        """(n,) Stamp of the newest detection (s)."""
+        self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
+        self.last_t: Array = np.zeros(0)  # (n,) stamp of the newest detection (s)
 
     def add(self, points: Array, covariances: Array, t: float) -> None:
         """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
@@ -175,12 +169,9 @@ class Sighting:
     """Orange cones as they were detected in one cycle."""
 
     cycle: int
-    pose: Array
-    """(3,) Pose of the vehicle, map frame."""
-    twist: Array
-    """(3,) Twist of the vehicle (m/s, m/s, rad/s)."""
-    detections: Detections
-    """Detections of orange cones only."""
+    pose: Array  # (3,) pose of the vehicle, map frame
+    twist: Array  # (3,) twist of the vehicle (m/s, m/s, rad/s)
+    detections: Detections  # detections of orange cones only
 
 
 class OrangeCones:
@@ -190,8 +181,7 @@ class OrangeCones:
     its detections, as the poses of their cycles place them.
     """
 
-    MOST: Final = 500
-    """Newest cycles that are remembered, to be placed again when poses are corrected."""
+    MOST: Final = 500  # newest cycles that are remembered, to be placed again when poses are corrected
 
     def __init__(self, settings: GrowthSettings, sigma: float) -> None:
         """Keep how detections are merged, and a standard deviation (m) that none of them averages out."""

@@ -26,14 +26,12 @@ from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
-NEWEST: Final = 3
-"""Newest cones that, with the end of a curve, say how far it runs beside the path."""
+NEWEST: Final = 3  # newest cones that, with the end of a curve, say how far it runs beside the path
 RECALL: Final = 25.0
 """Length of the newest stretches of path and curves (m): in a second round, the first one tells nothing."""
 NEARER: Final = 0.5
 """A cone that was passed is passed again only where the path comes nearer to it by more than this (m)."""
-LENGTH_FREE: Final = 50.0
-"""Length of an open curve that is allowed whatever the path driven (m)."""
+LENGTH_FREE: Final = 50.0  # length of an open curve that is allowed whatever the path driven (m)
 LENGTH_DRIVEN: Final = 2.0
 """Further length allowed for each metre driven (m/m): a curve that zigzags between false cones exceeds it."""
 
@@ -45,8 +43,7 @@ class Growth:
         self.settings = smoother.map.settings.growth
         self.tentative = {label: TentativeTracks(self.settings) for label in BOUNDARIES}
         """Detections that no curve explains, by label."""
-        self.notice = ""
-        """What is said in the cycle in which a boundary stops growing."""
+        self.notice = ""  # what is said in the cycle in which a boundary stops growing
         self._smoother, self._map, self._state = smoother, smoother.map, smoother.map.state
         self._full: set[int] = set()
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))

@@ -25,28 +25,20 @@ from pathspace_graph.spline.bspline import BSpline
 
 from .growth import RECALL, undisputed
 
-REACH: Final = 12.5
-"""Farthest track from the vehicle that the stretch leads through (m)."""
+REACH: Final = 12.5  # farthest track from the vehicle that the stretch leads through (m)
 MEMORY: Final = 0.35
 """Time for which a track that is not confirmed counts (s): a detection of nothing is not repeated."""
 GAP: Final = 11.0
 """Largest distance of neighbouring tracks of a row (m): two regular gaps, as a cone may never be detected."""
-TURN: Final = 2.0
-"""Largest turn of a row from one track to the next where both coincide (rad)."""
-TURN_RATE: Final = 0.1
-"""Decrease of `TURN` with the distance to the next track (rad/m)."""
-TURN_COST: Final = 1.0
-"""The next track of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)."""
-MIN_WIDTH: Final = 1.5
-"""Least distance of a row from the other boundary (m)."""
-WIDTH_RATIO: Final = 1.8
-"""Largest ratio of successive tracks' distances from the other boundary."""
-WIDTH_SLACK: Final = 1.0
-"""Further growth allowed of that distance (m)."""
+TURN: Final = 2.0  # largest turn of a row from one track to the next where both coincide (rad)
+TURN_RATE: Final = 0.1  # decrease of `TURN` with the distance to the next track (rad/m)
+TURN_COST: Final = 1.0  # the next track of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)
+MIN_WIDTH: Final = 1.5  # least distance of a row from the other boundary (m)
+WIDTH_RATIO: Final = 1.8  # largest ratio of successive tracks' distances from the other boundary
+WIDTH_SLACK: Final = 1.0  # further growth allowed of that distance (m)
 TAIL: Final = 20.0
 """Length at the end of the confirmed curves that tells where the track leads and how wide it is (m)."""
-TAIL_STEP: Final = 1.0
-"""Step of the points along that length (m)."""
+TAIL_STEP: Final = 1.0  # step of the points along that length (m)
 BEGIN_LATERAL: Final = 1.5
 """Distance beside the vehicle from which the row of a boundary that has not begun is searched (m)."""
 SIGMA_CONE: Final = 0.1
@@ -54,8 +46,7 @@ SIGMA_CONE: Final = 0.1
 SIGMA_BEND: Final = 1.0
 """Standard deviation of the second difference of control points about that of a straight line (m). It widens
 the band between tracks that are far apart, and beyond the last one."""
-MIN_TRACKS: Final = 2
-"""Least number of tracks for a tentative curve of a boundary that has not begun."""
+MIN_TRACKS: Final = 2  # least number of tracks for a tentative curve of a boundary that has not begun
 
 
 # --- rows of tracks --------------------------------------------------------------------------------------
@@ -65,18 +56,13 @@ MIN_TRACKS: Final = 2
 class Row:
     """One boundary as far as it is known, and the tracks that may continue it."""
 
-    side: float
-    """Sign of the signed distance from the other row (left positive)."""
-    line: Array
-    """(n, 2) At least two points of the row in driving order (m, map frame)."""
-    direction: Array
-    """(2,) Unit vector in which the row leads on from its last point."""
-    candidates: Array
-    """(k, 2) Tracks that may continue the row (m, map frame)."""
+    side: float  # sign of the signed distance from the other row (left positive)
+    line: Array  # (n, 2) at least two points of the row in driving order (m, map frame)
+    direction: Array  # (2,) unit vector in which the row leads on from its last point
+    candidates: Array  # (k, 2) tracks that may continue the row (m, map frame)
     chosen: list[int] = field(default_factory=list)
     """Candidates that the row continues through, by index in driving order."""
-    ended: bool = False
-    """Whether no candidate continues the row, wherever the other one leads."""
+    ended: bool = False  # whether no candidate continues the row, wherever the other one leads
 
     @property
     def end(self) -> Array:
@@ -156,16 +142,11 @@ def _has_width(row: Row, other: Row, points: Array) -> BoolArray:
 class Outlook:
     """A boundary with its tentative stretch."""
 
-    boundary: Boundary
-    """Knots, those of the tentative stretch too."""
-    known: Array
-    """(n, 2) Control points of the confirmed curve (m, map frame)."""
-    confirmed_until: float
-    """Parameter up to which the curve is confirmed (m)."""
-    tracks: Array
-    """(k, 2) Tracks that the tentative stretch leads through (m, map frame)."""
-    variances: Array
-    """(k,) Variance of each in any direction (m^2), seen from the vehicle."""
+    boundary: Boundary  # knots, those of the tentative stretch too
+    known: Array  # (n, 2) control points of the confirmed curve (m, map frame)
+    confirmed_until: float  # parameter up to which the curve is confirmed (m)
+    tracks: Array  # (k, 2) tracks that the tentative stretch leads through (m, map frame)
+    variances: Array  # (k,) variance of each in any direction (m^2), seen from the vehicle
     placement: Placement | None
     """How control points were placed for the tentative stretch; None where there is none."""
 
