@@ -1,27 +1,20 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import Spans
-from pathspace_graph.factors.footpoint import (
-    SEARCH_ITERATIONS,
-    TOLERANCES,
-    FootPoints,
-    refine_joint_foot_points,
-)
+from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, TOLERANCES, refine_joint_foot_points
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.residuals import ProjectionRows, detection_rows, pair_residuals, project
+from pathspace_graph.factors.residuals import detection_rows, pair_residuals
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.factors.sensor import SensorRows, corrected
+from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.graph.rows import Parts, Rows, among, stacked_rows
-from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys, pose_keys
+from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import Gauge
 
 from .detections import DetectionTable
 from .state import State, factor_numbers
@@ -75,27 +68,6 @@ class CurveMap:
         )
         self._refined = rows, u
         return [Rows(*parts)]
-
-    def measuring_keys(self, cycles: IntArray) -> IntArray:
-        """Return the keys (m, k) that the detections of cycles (m,) depend on beside the curves.
-
-        These are the pose, and the calibration of the sensor where it is estimated.
-        """
-        poses = pose_keys(cycles)[:, None]
-        if not len(self.variables.sensor):
-            return poses
-        return np.concatenate([poses, np.full_like(poses, SENSOR_KEY)], axis=1)
-
-    def project(self, rows: IntArray, points: Array, foot: FootPoints) -> tuple[ProjectionRows, SensorRows]:
-        """Return the distances of detections (m,) at points (m, 2) from their foot points, not whitened.
-
-        The second result says how they depend on the sensor's calibration.
-        """
-        detections, variables = self.detections, self.variables
-        poses, sigma_model = variables.poses_at(detections.cycle[rows]), self.settings.spline.sigma_model
-        projected = project(points, detections.covariance[rows], poses, foot, sigma_model)
-        residual, normals = projected.residual, foot.normal_unit
-        return projected, detections.sensor_rows(rows, normals, residual, poses, variables.sensor)
 
     def correct(self) -> None:
         """Do nothing: detections are corrected when their points are asked for."""
@@ -158,19 +130,16 @@ class CurveMap:
         rows hold the active control points, or all of them if `whole`.
         """
         smooth, anchors = [], []
-        for label, gauge in self._gauges(whole):
-            points, held = self.state.control_points(label), np.eye(2) / self.settings.gauge.sigma_anchor
-            bent = (gauge.bending[:, :, None] * points[gauge.triples]).sum(axis=1)
+        for label, boundary in self.state.boundaries.items():
+            gauge = boundary.gauge_on(boundary.everything if whole else self.state.active(label))
             if not self.held_by_prior:
+                points = self.state.control_points(label)[gauge.triples]
+                bent = (gauge.bending[:, :, None] * points).sum(axis=1)
                 smooth.append(self._rows(label, gauge.triples, _by_axis(gauge.bending), bent.ravel()))
             active = gauge.points[:, None]
-            held = np.tile(held, (len(active), 1))
+            held = np.tile(np.eye(2) / self.settings.gauge.sigma_anchor, (len(active), 1))
             anchors.append(self._rows(label, active, held, np.zeros(len(held))))
         return [stacked_rows(groups) for groups in (smooth, anchors) if groups]
-
-    def _gauges(self, whole: bool) -> Iterator[tuple[int, Gauge]]:
-        for label, boundary in self.state.boundaries.items():
-            yield label, boundary.gauge_on(boundary.everything if whole else self.state.active(label))
 
     def _rows(self, label: int, points: IntArray, jacobian: Array, residual: Array) -> Rows:
         """Return rows, equally many for each row of `points` (m, k); neighbouring points share an owner."""

@@ -10,7 +10,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import rotated, to_map
-from pathspace_graph.factors.sensor import SensorRows, corrected, sensor_rows
+from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
@@ -107,15 +107,6 @@ class DetectionColumns:
         """Return the covariances (m, 2, 2) in m^2 in the map frame, by the poses of their cycles."""
         return rotated(self.covariance[rows], variables.poses_at(self.cycle[rows])[:, 2])
 
-    def sensor_rows(
-        self, rows: IntArray, directions: Array, residual: Array, poses: Array, sensor: Array
-    ) -> SensorRows:
-        """Return `factors.sensor:sensor_rows` of residuals (m,) along unit vectors (m, 2), map frame.
-
-        The detections were made from poses (m, 3), and the sensor's calibration (5,) may be empty.
-        """
-        return sensor_rows(directions, residual, poses, self.measured[rows], self.twist[rows], sensor)
-
     def keep_from(self, cycle: int) -> None:
         """Remove the detections of all cycles before `cycle`."""
         first = int(self.cycle.searchsorted(cycle))
@@ -166,15 +157,8 @@ class DetectionTable(DetectionColumns):
     @property
     def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array]:
         """Return the columns that say what is in use, where, and as what it was measured."""
-        return (
-            self.cycle,
-            self.boundary,
-            self.used,
-            self.u,
-            self.measured,
-            self.twist,
-            self.covariance,
-        )
+        decided = self.cycle, self.boundary, self.used, self.u
+        return *decided, self.measured, self.twist, self.covariance
 
     def used_on(self, label: int) -> IntArray:
         """Return the rows in use on the boundary `label`."""

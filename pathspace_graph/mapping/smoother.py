@@ -9,11 +9,12 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import Spans
 from pathspace_graph.factors.footpoint import TOLERANCES, FootPoints, joint_foot_points
 from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.factors.residuals import sigma_across
+from pathspace_graph.factors.residuals import project, sigma_across
+from pathspace_graph.factors.sensor import sensor_rows
 from pathspace_graph.graph.inactive import Follower
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.variables import pose_keys
+from pathspace_graph.graph.variables import SENSOR_KEY, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import relocate
@@ -93,19 +94,12 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
     def _associate(self, rows: IntArray, curve: IntArray) -> None:
         """Put those detections (m,) into use that pass the gate of their curve (m,), by all poses' places."""
-        state, points = self.map.state, self.map.detections.points_map(rows, self.variables)
-        low, high = self._view(rows, curve, np.array([state.pose_u[label] for label in state.boundaries]))
-        foot = state.curves.find(state.map_points, points, curve, low, high)
-        self._accept(rows, curve, points, foot)
-
-    def _view(self, rows: IntArray, curve: IntArray, pose_u: Array) -> tuple[Array, Array]:
-        """Return the stretch [low, high] of its curve (m,) that each detection may belong to.
-
-        `pose_u` (k, P) are the parameters of the window's poses on every curve.
-        """
-        gate = self.map.settings.gate
-        seen_from = pose_u[curve, self.map.detections.cycle[rows] - self.first_cycle]
-        return seen_from - gate.view_behind, seen_from + gate.view_ahead
+        state, detections, gate = self.map.state, self.map.detections, self.map.settings.gate
+        points = detections.points_map(rows, self.variables)
+        pose_u = np.array([state.pose_u[label] for label in state.boundaries])
+        seen_from = pose_u[curve, detections.cycle[rows] - self.first_cycle]
+        stretch = seen_from - gate.view_behind, seen_from + gate.view_ahead
+        self._accept(rows, curve, points, state.curves.find(state.map_points, points, curve, *stretch))
 
     def _accept(self, rows: IntArray, curve: IntArray, points: Array, foot: FootPoints) -> Array:
         """Put those detections (m,) into use that pass the gate of their curve (m,).
@@ -141,14 +135,18 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         It comes from the uncertainty of the pose, of the control points and of the sensor's calibration. The
         detections are at points (m, 2), map frame.
         """
-        cycles = self.map.detections.cycle[rows]
-        keys = np.concatenate(
-            [self.map.measuring_keys(cycles), self.map.state.curves.keys[foot.columns]], axis=1
-        )
-        projected, by = self.map.project(rows, points, foot)
+        detections, sensor = self.map.detections, self.variables.sensor
+        cycles, measured, twists = detections.cycle[rows], detections.measured[rows], detections.twist[rows]
+        poses, sigma_model = self.variables.poses_at(cycles), self.map.settings.spline.sigma_model
+        projected = project(points, detections.covariance[rows], poses, foot, sigma_model)
+        residual = projected.residual
+        by_sensor = sensor_rows(foot.normal_unit, residual, poses, measured, twists, sensor).by_sensor
         by_control = projected.by_control.reshape(len(rows), 2 * foot.basis.shape[1])
-        jacobian = np.concatenate([projected.by_pose, by.by_sensor, by_control], axis=1)
-        return self.predicted_covariance(Rows(keys, jacobian, projected.residual, cycles))[:, 0, 0]
+        jacobian = np.concatenate([projected.by_pose, by_sensor, by_control], axis=1)
+        seen_from = np.stack([pose_keys(cycles), np.full(len(rows), SENSOR_KEY)], axis=1)
+        seen_from = seen_from[:, : 2 if len(sensor) else 1]
+        keys = np.concatenate([seen_from, self.map.state.curves.keys[foot.columns]], axis=1)
+        return self.predicted_covariance(Rows(keys, jacobian, residual, cycles))[:, 0, 0]
 
     # --- the newest pose beside the curves ---------------------------------------------------------------
 
@@ -199,8 +197,9 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
     def deactivate_distant(self) -> None:
         """Restrict each step to what the window can touch, and some room for the next cycles.
 
-        This changes no result, see `graph.inactive`. An open curve's inactive part grows as the vehicle
-        drives on. A closed curve's active part is chosen again when it no longer holds what the window needs.
+        This changes no result of a closed map (`graph.inactive`), whose active part is chosen again when it
+        no longer holds what the window needs. The inactive part of an open one grows as the vehicle drives
+        on, and the map may differ by decimetres from one that is solved whole.
         """
         state = self.map.state
         needed = {label: self._needed(label) for label in state.boundaries}

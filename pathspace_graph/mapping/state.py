@@ -57,7 +57,7 @@ class Curves:
         )
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
-        """Return whether boundaries, whose active control points are all unless given, are these curves."""
+        """Return whether these are the curves of boundaries with these active control points, or with all."""
         if len(boundaries) != len(self.boundaries):
             return False
         laid_out = zip(self.tables, self.active, strict=True)

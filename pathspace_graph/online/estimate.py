@@ -102,12 +102,11 @@ class MapperEstimate:
         cones that were seen less often, and is fitted anew in each call. A curve that has not begun may
         consist of a tentative stretch alone.
         """
-        boundaries = {}
         with self.smoother.variables.looked_at():
-            for label, outlook in self._outlooks().items():
-                spline = outlook.spline
-                until = spline.domain[1] if self.closed else outlook.confirmed_until
-                boundaries[label] = SplineBoundary(spline, NO_COVARIANCE, until)
+            boundaries = {
+                label: SplineBoundary(outlook.spline, NO_COVARIANCE, outlook.confirmed_until)
+                for label, outlook in self._outlooks().items()
+            }
         return Map(self.closed, boundaries, points=self.orange.points())
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
@@ -173,10 +172,30 @@ class MapperEstimate:
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
 
-        The factors hold the active variables, which `values` returns. The graph shares nothing with the
-        mapper: optimize it, print its errors, or compute its marginals with GTSAM's own classes.
+        The factors hold the active variables, which `values` returns. Linearized at the estimate, they are
+        the mapper's own system in GTSAM's tangents of the poses. The graph shares nothing with the mapper:
+        optimize it, print its errors, or compute its marginals with GTSAM's own classes.
         """
-        return window_graph(self.smoother)
+        smoother, track, settings = self.smoother, self.smoother.map, self.settings
+        factors: list[gtsam.NonlinearFactor] = []
+        anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
+        for label, boundary in self.boundaries.items():
+            active = track.state.active(label)
+            factors += _detection_factors(track, label, active)
+            if not track.held_by_prior:
+                factors += _gauge_factors(label, boundary, active, settings.gauge)
+            keys = control_keys(label, boundary.first + active).tolist()
+            points = track.state.control_points(label)[active]
+            factors += [gtsam.PriorFactorPoint2(*pair, anchor) for pair in zip(keys, points, strict=True)]
+        intervals = enumerate(smoother.window.odometry.intervals, start=smoother.first_cycle)
+        factors += [odometry_factor(cycle, interval) for cycle, interval in intervals]
+        factors += smoother.user_factors.factors
+        prior = factors_of(smoother.absolute_prior())
+        factors += [as_nonlinear(factor, smoother.variables) for factor in prior]
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in factors:
+            graph.add(factor)
+        return graph
 
     def values(self) -> gtsam.Values:
         """Return the active variables: poses as `Pose2`, control points and the calibration as points."""
@@ -268,10 +287,6 @@ class MapperEstimate:
         self.smoother.refresh()
         return self.smoother.map.state.control_points(label)
 
-    def pose_parameter(self, label: int) -> float:
-        """Return the parameter (m) of the newest pose's foot point; it increases from lap to lap."""
-        return float(self.smoother.map.state.pose_u[label][-1])
-
     @property
     def poses(self) -> Array:
         """Return a view of the poses (P, 3) in the window, the oldest first, map frame."""
@@ -288,33 +303,6 @@ class MapperEstimate:
 
 
 # --- the window as nonlinear factors ---------------------------------------------------------------------
-
-
-def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
-    """Return projection, spacing, smoothness, odometry, user and prior factors on the active variables.
-
-    Linearized at the estimate, the graph is the mapper's own system in GTSAM's tangents of the poses.
-    """
-    track, state, settings = smoother.map, smoother.map.state, smoother.map.settings
-    factors: list[gtsam.NonlinearFactor] = []
-    anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
-    for label, boundary in state.boundaries.items():
-        active = state.active(label)
-        factors += _detection_factors(track, label, active)
-        if not track.held_by_prior:
-            factors += _gauge_factors(label, boundary, active, settings.gauge)
-        keys = control_keys(label, boundary.first + active).tolist()
-        points = state.control_points(label)[active]
-        factors += [gtsam.PriorFactorPoint2(*pair, anchor) for pair in zip(keys, points, strict=True)]
-    intervals = enumerate(smoother.window.odometry.intervals, start=smoother.first_cycle)
-    factors += [odometry_factor(cycle, interval) for cycle, interval in intervals]
-    factors += smoother.user_factors.factors
-    prior = factors_of(smoother.absolute_prior())
-    factors += [as_nonlinear(factor, smoother.variables) for factor in prior]
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph
 
 
 def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gtsam.CustomFactor]:

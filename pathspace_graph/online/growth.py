@@ -23,7 +23,7 @@ from pathspace_graph.mapping.path import (
     crosses,
 )
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
+from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
 NEWEST: Final = 3  # newest cones that, with the end of a curve, say how far it runs beside the path
@@ -156,10 +156,8 @@ class Growth:
         boundary.add_cones(found.points, u)
         self.tentative[label].remove(found.indices)
         rows = detections.pending(label)
-        points = detections.points_map(rows, self._map.variables)
-        offset = points[:, None, :] - found.points[None]
-        radius = self.settings.merge_radius
-        near = np.hypot(offset[:, :, 0], offset[:, :, 1]).min(axis=1) < radius
+        points, radius = detections.points_map(rows, self._map.variables), self.settings.merge_radius
+        _, near = nearest_within(points, found.points, radius)
         rows, points = rows[near], points[near]
         low = np.full(len(rows), u[0] - radius)
         high = boundary.believed(np.full(len(rows), np.inf))
@@ -183,7 +181,7 @@ class Growth:
         points = tracks.points[indices]
         if len(points) == 0:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
-        path = path_ahead if end is None else _newest(path_ahead, end)
+        path = path_ahead if end is None else newest(path_ahead, end.station)
         stations, lateral = path.locate(points)
         sides = SIDES[label] * lateral
         possible = (stations <= path_ahead.stations[-1]) & (sides > 0.0)
@@ -218,7 +216,7 @@ class Growth:
         No boundary crosses the path driven, the other boundary or itself, on their newest stretches: in a
         second lap of an open loop it runs along its own first one.
         """
-        path = _newest(path_ahead, end)
+        path = newest(path_ahead, end.station)
         lines = [path.points[path.stations <= path.driven]]
         for other, boundary in self._state.boundaries.items():
             begin = boundary.confirmed_end - RECALL
@@ -292,8 +290,7 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
     first = int(boundary.cone_parameters.searchsorted(boundary.confirmed_end - RECALL))
     beside = np.full((len(boundary.observed), 2), np.nan)  # nothing is known of others
     beside[: len(known)] = known[: len(beside)]
-    newest = path_ahead.since(path_ahead.driven - RECALL).locate(boundary.observed[first:])
-    now = np.stack(newest, axis=1)
+    now = np.stack(newest(path_ahead).locate(boundary.observed[first:]), axis=1)
     before, passed = beside[first:], beside[first:, 0] <= path_ahead.driven
     stays = passed & (np.abs(now[:, 1]) > np.abs(before[:, 1]) - NEARER)
     now[stays] = before[stays]
@@ -305,9 +302,9 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
     return kept, beside[:kept]
 
 
-def _newest(path_ahead: PathAhead, end: End) -> PathAhead:
-    """Return the path along which the end of a curve may grow: not that of an earlier round."""
-    return path_ahead.since(min(end.station, path_ahead.driven) - RECALL)
+def newest(path_ahead: PathAhead, station: float = np.inf) -> PathAhead:
+    """Return the path without earlier rounds: from `RECALL` before the vehicle, or before a station (m)."""
+    return path_ahead.since(min(station, path_ahead.driven) - RECALL)
 
 
 def _distances(points: Array) -> Array:

@@ -17,13 +17,13 @@ from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import SIDES, DrivenPath, along_and_across, crosses
-from pathspace_graph.mapping.tentative import TentativeTracks
+from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
 
-from .growth import RECALL, undisputed
+from .growth import newest, undisputed
 
 REACH: Final = 12.5  # farthest track from the vehicle that the stretch leads through (m)
 MEMORY: Final = 0.35
@@ -259,8 +259,8 @@ def extended_rows(
     """Return the row of each boundary, extended through its tentative tracks, and the indices of these."""
     tracks = {label: _tracks(track, label, tentative[label], t) for label in BOUNDARIES}
     rows = {label: _row(track, label, tentative[label].points[tracks[label]]) for label in BOUNDARIES}
-    newest = path.points[path.stations >= path.length - RECALL]
-    extend_rows(rows[LEFT], rows[RIGHT], newest, track.settings.growth.threshold)
+    driven = newest(path.ahead(track.state.poses[-1], 0.0)).points
+    extend_rows(rows[LEFT], rows[RIGHT], driven, track.settings.growth.threshold)
     return {label: (row, tracks[label][row.chosen]) for label, row in rows.items()}
 
 
@@ -271,15 +271,13 @@ def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> I
     earlier stretch again.
     """
     settings, state = track.settings.growth, track.state
-    offset = tracks.points - state.poses[-1, :2]
-    near = np.hypot(offset[:, 0], offset[:, 1]) < REACH
+    near = np.hypot(*(tracks.points - state.poses[-1, :2]).T) < REACH
     believed = (tracks.counts >= settings.sightings) | (tracks.last_t > t - MEMORY)
     indices = np.flatnonzero(near & believed)
     if label in state.boundaries:
         mapped = state.boundaries[label].observed
-        offset = tracks.points[indices, None] - mapped
-        distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
-        indices = indices[(distance > settings.threshold).all(axis=1)]
+        _, is_mapped = nearest_within(tracks.points[indices], mapped, settings.threshold)
+        indices = indices[~is_mapped]
     return indices[undisputed(track, label, tracks.points[indices], settings.merge_radius)]
 
 

@@ -106,7 +106,10 @@ class GateSettings(Positive):
 
 @dataclass(frozen=True)
 class FarSettings(Positive):
-    """The inactive part of the map, which is not solved for in every cycle: it changes speed, not results."""
+    """The inactive part of the map, which is not solved for in every cycle.
+
+    On a closed map it changes the speed only; an open one may move by decimetres with `far.stretch`.
+    """
 
     stretch: float = 12.0
     """Least length behind the vehicle of which an open curve's control points become inactive, m."""
