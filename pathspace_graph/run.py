@@ -113,8 +113,7 @@ def _ask(estimator: OnlineEstimator, method: str, *arguments: Any) -> Any:
 class ObservedCycle:
     """A cycle that is over, as an observer sees it: its input, its result, and the estimator as it stands.
 
-    The map, the readings and the window are taken when first asked for, once for all observers: before the
-    next cycle. They must not be changed.
+    Map, readings and window are taken when first asked for, once for all observers, and must not be changed.
     """
 
     estimator: OnlineEstimator

@@ -79,12 +79,10 @@ SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)
 class Belief:
     """Gaussian over `x = [pose | calibration of odometry and sensor | points]`.
 
-    The pose (x, y, theta) and the points (x, y) are in the map frame, in m and rad. The calibration of the
-    odometry is the scale error of the speeds and the bias of the yaw rate (rad/s), that of the sensor is
-    `factors.sensor:SENSOR`.
-
-    A model depends on few entries of x, so only those get cubature points. All others follow by the joint
-    covariance, which is what the full rule would give for them, without its cubic cost.
+    Pose (x, y, theta) and points (x, y) are in the map frame, in m and rad. The calibration is the scale
+    error of the speeds, the bias of the yaw rate (rad/s), and `factors.sensor:SENSOR`. Only the entries of x
+    that a model depends on get cubature points. The others follow by the joint covariance, as by the full
+    rule but without its cubic cost.
     """
 
     def __init__(self, pose: Array, covariance: Array, calibration_sigma: Array | None = None) -> None:
@@ -98,8 +96,7 @@ class Belief:
     def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Self:
         """Return the belief at the first odometry stamp, with an empty map.
 
-        The priors of the sensor are the wide ones: a filter that has explained its errors by something else
-        cannot take that back, as a window can.
+        The priors of the sensor are wide: unlike a window, a filter cannot explain past errors anew.
         """
         calibration = np.array([settings.sigma_scale, settings.sigma_bias, *sensor.widened().sigmas])
         belief = cls(np.zeros(POSE), np.diag(np.square(settings.sigmas_start)), calibration)
@@ -165,10 +162,7 @@ class Belief:
     def update(
         self, columns: IntArray, function: Callable[[Array], Array], measured: Array, noise: Array
     ) -> None:
-        """Make one Kalman update: `measured` (q,) is `function(x[columns])` plus noise of covariance (q, q).
-
-        The function maps points (k, d) to (k, q), row by row.
-        """
+        """Update by `measured` (q,): `function(x[columns])`, row by row, plus noise of covariance (q, q)."""
         predicted = transform(function, self.mean[columns], self.covariance[np.ix_(columns, columns)])
         root = square_root(predicted.covariance + noise)
         cross = predicted.slope @ self.covariance[columns]
@@ -178,10 +172,7 @@ class Belief:
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
 
     def predict_detections(self, points: IntArray) -> Transformed:
-        """Predict the corrected detections of points (k,): mean (2 k,) and covariance (2 k, 2 k).
-
-        They are in the vehicle frame. An error of the sensor's calibration moves them, too.
-        """
+        """Predict the corrected detections of points (k,), vehicle frame, in order x0, y0, x1, and so on."""
         columns = self.measuring_columns(point_columns(points))
         covariance = self.covariance[np.ix_(columns, columns)]
         return transform(self.measuring(points), self.mean[columns], covariance)
@@ -216,8 +207,7 @@ class Belief:
     def transform_points(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
         """Replace the points [start, stop) by `matrix` (k, stop - start) times them, for both coordinates.
 
-        Independent noise with standard deviations sigma (k,) in m is added to them. The change is linear, so
-        this is what the cubature rule gives.
+        Independent noise of sigma (k,) in m is added. The change is linear, and exact by the cubature rule.
         """
         low, high = HEAD + POINT * start, HEAD + POINT * stop
         full = np.kron(matrix, np.eye(POINT))

@@ -48,7 +48,7 @@ class CurveMap:
         """Return `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections in use of ascending cycles.
 
         The keys are [pose | control points of the span]; w is the root of the Huber weight, and zero if the
-        foot point is not interior. The refined parameters u are stored in the table only by `linearized`.
+        foot point is not interior. `linearized` stores the refined parameters u.
         """
         state, detections = self.state, self.detections
         if not state.boundaries or len(cycles) == 0:
@@ -97,9 +97,9 @@ class CurveMap:
         self.state.drop_oldest_pose_u()
 
     def replaced_by(self, scatter: dict[int, Array], cones: dict[int, Array]) -> None:
-        """Note that curves of a batch have taken the place of the ones before, with the prior that has them.
+        """Note that curves and prior are those of a batch.
 
-        Cones scatter about them by sigmas (m,), and were detected at parameters (k,), by label.
+        By label, cones scatter about the curves by sigmas (m,), and were detected at parameters (k,).
         """
         self.held_by_prior, self.scatter, self.cones = True, scatter, cones
 
@@ -111,10 +111,7 @@ class CurveMap:
         return self.state.curves if self.state.boundaries else None
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """Return the spacing `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`.
-
-        The rows hold the active control points, or all of them if `whole`.
-        """
+        """Return `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`, on all points if `whole`."""
         if not self.state.boundaries or self.held_by_prior:
             return []
         pairs, nominal, keys, owner = (self.state.whole_curves if whole else self.state.curves).pairs
@@ -124,10 +121,9 @@ class CurveMap:
         return [Rows(keys, jacobian, off / sigma, owner)]
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Return the linear priors: smoothness `D c / (sigma_smoothness spacing)`, and anchors.
+        """Return smoothness `D c / (sigma_smoothness spacing)` and anchors, on all points if `whole`.
 
-        An anchor holds each control point where it is, so weakly that it only keeps the system regular. The
-        rows hold the active control points, or all of them if `whole`.
+        An anchor holds each control point where it is, so weakly that it only keeps the system regular.
         """
         smooth, anchors = [], []
         for label, boundary in self.state.boundaries.items():
@@ -161,11 +157,11 @@ def _curve_rows(
     names: tuple[int, int],
     tolerances: tuple[float, ...],
 ) -> tuple[IntArray, Array, bool, Parts]:
-    """Return the parts of `CurveMap.rows`, after the detections by row and their refined parameters (m,).
+    """Return detections by row, their refined parameters (m,), and the parts of `CurveMap.rows`.
 
-    The third result is whether one has slid to where a curve is inactive. Curves have control points (n, 2),
-    labels (k,), keys (n,), and parameters (k,) up to which and from which on they may be used. The table has
-    the columns of `DetectionTable.associated`.
+    The third result says whether one has slid to where a curve is inactive. Curves have control points
+    (n, 2), labels (k,), keys (n,), and parameters (k,) up to which and from which on they may be used. The
+    table has the columns of `DetectionTable.associated`.
     """
     control_points, labels, control_keys, trusted, active_from = curves
     room, iterations, _, sigma_model, huber = limits

@@ -20,8 +20,7 @@ from pathspace_graph.labels import UNKNOWN
 class DetectionColumns:
     """What the sensor measured: columns of equal length, the oldest detection first.
 
-    A subclass adds the columns of its associations; only the table's own methods write to any column. Points
-    are corrected by the calibration of the sensor when they are asked for.
+    A subclass adds columns of its associations. Points are corrected by the sensor's calibration on demand.
     """
 
     cycle: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
@@ -44,9 +43,9 @@ class DetectionColumns:
 
     @classmethod
     def of(cls, cycles: Sequence[Detections], first: int = 0, twists: Array | None = None) -> Self:
-        """Build the table of consecutive perception cycles, numbered from `first`; nothing is in use.
+        """Build the table of consecutive cycles, numbered from `first`, with no detection in use.
 
-        The vehicle moved with twists (k, 3) at the cycles, in m/s, m/s and rad/s; by default it stood still.
+        The vehicle has twists (k, 3) at the cycles (m/s, m/s, rad/s), by default zero.
         """
         counts = [len(one.labels) for one in cycles]
         moving = np.zeros((len(cycles), 3)) if twists is None else twists
@@ -65,9 +64,9 @@ class DetectionColumns:
         """Fill the subclass's columns as they are before any association."""
 
     def append(self, detections: Detections, cycle: int, twist: Array | None = None) -> slice:
-        """Add detections behind those of their cycle and before later ones, not in use; return their rows.
+        """Add unused detections at the end of their cycle's; return their rows.
 
-        The vehicle moved with this twist (3,), in m/s, m/s and rad/s; by default it stood still.
+        The twist (3,) of the vehicle (m/s, m/s, rad/s) is zero by default.
         """
         start, columns = int(self.cycle.searchsorted(cycle, side="right")), vars(self)
         new = vars(type(self).of([detections], cycle, None if twist is None else twist[None]))
@@ -169,10 +168,10 @@ class DetectionTable(DetectionColumns):
         return np.flatnonzero(~self.used & (self.label == label))
 
     def open_to(self, labels: IntArray, since: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the rows (m,) that each of some boundaries (k,) is tested for, from its `since` (k,) on.
+        """Return the rows (m,) to test for boundaries (k,) from `since` (k,) on, and the boundary of each.
 
         These are the rows out of use, and those of unknown colour that the other boundary uses: if both
-        boundaries accept one, it is ambiguous. The second result (m,) is the index of the boundary.
+        boundaries accept one, it is ambiguous.
         """
         return _open_rows(labels, since, self.label, self.boundary, self.used, UNKNOWN)
 

@@ -164,8 +164,8 @@ LATERAL_GAP: Final = 0.8
 """Distance beyond which a cone is behind the row if one beside it is nearer to the path by more (m)."""
 STATION_MARGIN: Final = 0.3  # least distance past the end of a curve of what extends it (m along the path)
 END_BEHIND: Final = 5.0
-"""Farthest that the end of a curve is behind the vehicle (m along the path): a stranded end is carried on,
-and an older stretch of the path across the infield may be nearer to it, which means nothing."""
+"""Farthest that the end of a curve is behind the vehicle (m along the path), since a stranded end is carried
+on. An older stretch of the path across the infield may be nearer to it."""
 STRANDED: Final = 2.0
 """Distance behind the vehicle beyond which an end that nothing extends is carried on (m)."""
 CARRIED_TO: Final = 1.0  # distance behind the vehicle to which a stranded end is carried on (m)
@@ -202,10 +202,9 @@ def chain(candidates: Candidates, end: End | None) -> IntArray:
     """Return the indices of the candidates, sorted by station, that may follow one another.
 
     A candidate i may follow the end of the curve if `side_i <= side_end + LATERAL_CHANGE + LATERAL_RATE
-    (s_i - s_end)`; without a curve the first candidate takes the place of the end. No candidate allows the
-    next one more than that, or a row would be left for the next lane's, step by step. Of candidates at about
-    the same station only those nearest to the path remain: a second row behind the first belongs to another
-    stretch of the track.
+    (s_i - s_end)`; without a curve the first candidate takes the place of the end. All are held against the
+    end, or a row would drift to the next lane's, step by step. Of candidates at about the same station only
+    those nearest to the path remain: a second row is of another stretch of the track.
     """
     stations, sides = candidates.stations, candidates.sides
     in_front = np.flatnonzero(in_front_row(stations, sides, BESIDE, LATERAL_GAP))
@@ -220,8 +219,7 @@ def chain(candidates: Candidates, end: End | None) -> IntArray:
 def in_front_row(stations: Array, sides: Array, beside: float, gap: float) -> BoolArray:
     """Return which points are in the row nearest to the path, from their stations and sides (n,), in m.
 
-    A point is behind that row if another one is less than `beside` (m) from it along the path, and nearer to
-    the path by more than `gap` (m).
+    A point is behind it if another one within `beside` (m) along the path is nearer by more than `gap` (m).
     """
     near = np.abs(stations - stations[:, None]) < beside
     return np.asarray(~(near & (sides < sides[:, None] - gap)).any(axis=1))

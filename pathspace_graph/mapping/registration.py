@@ -110,8 +110,7 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
 def passes_start(state: State, path: DrivenPath, motion: Motion) -> bool:
     """Return whether the newest path, moved, crosses the line at which the drive began, on its road.
 
-    A vehicle that comes back to a later place of its beginning has not closed a lap: on a skidpad it does so
-    in each round.
+    In each round of a skidpad the vehicle is on its beginning again, but has not closed a lap.
     """
     start, turn = path.beginning[0, :2], rotation(path.beginning[0, 2])
     newest = motion.apply(path.points[path.stations > path.length - BEGINNING])
@@ -134,8 +133,8 @@ def register(
 
     Iterated closest points on the curves minimize `sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The
     `covariance` P (3, 3) of the newest pose is the prior, because detections along a straight or an arc leave
-    the motion free. If P is larger than what the iteration can bridge, the iteration starts from the best
-    pose of the `beginning` (k, 3), the first stretch of the drive. `times` are the stamps of the poses (s).
+    the motion free. If P is larger than the iteration can bridge, it starts from the best pose of the
+    `beginning` (k, 3) of the drive. `times` are the stamps of the poses (s).
     """
     recent, state = _recent(track, times), track.state
     prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
@@ -155,10 +154,7 @@ def register(
 
 
 def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
-    """Return whether the newest detections reach the beginning of the curves from where they are believed.
-
-    Where they do not, `register` can only agree if the vehicle is lost.
-    """
+    """Return whether `register` can agree without the vehicle being lost: detections reach the beginning."""
     recent, state = _recent(track, times), track.state
     unmoved = Motion(state.poses[-1, :2], np.zeros(3))
     found = _match(state, state.whole_curves, settings, recent, unmoved, _beginning(state), REACH)
@@ -275,8 +271,7 @@ def sigma_of_information(information: Array) -> float:
 def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:
     """Return whether nearly all of enough detections are inliers, on a long stretch of every boundary.
 
-    Detections that the newest curves do not explain are clutter, of another stretch of the road, or ahead of
-    all that was mapped yet: where they are no inliers, they say nothing.
+    Outliers count only if the newest curves explain them: others are clutter, or of road not mapped yet.
     """
     asked = matches.explained
     count, inliers = int(asked.sum()), int(matches.inlier[asked].sum())
@@ -289,9 +284,8 @@ def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bo
 def is_certain(matches: Matches, posterior: Array, settings: ClosingSettings, lost: bool = False) -> bool:
     """Return whether the motion is certain in every direction.
 
-    The limit is wider after a long stretch of the beginning has been driven again, because more detections
-    would add little. It is not wider if the vehicle is `lost`: then one place along a straight agrees as well
-    as the next.
+    The limit is wider once a long stretch of the beginning was driven again, as more detections would add
+    little, unless the vehicle is `lost`: then one place along a straight agrees as well as the next.
     """
     sigma = worst_sigma(posterior)
     driven_again = float(np.median(matches.u[matches.inlier]))

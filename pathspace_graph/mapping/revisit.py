@@ -1,8 +1,7 @@
 """A revisit: the pose of the vehicle as seen from an earlier one, by the cones that were seen from both.
 
-A drive may come back to a road without having driven a lap: the rounds of a skidpad, a lane that leads into a
-circuit. No loop closes there, and both boundaries are arcs along which a pose may slide. The cones themselves
-hold it in every direction.
+Where a drive meets its road again without a lap, as on a skidpad, a pose may slide along both boundaries. The
+cones themselves hold it in every direction.
 """
 
 from dataclasses import dataclass

@@ -58,10 +58,10 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         """Put detections into use that lie on a curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
         d is the signed distance, sigma its own standard deviation, and g its gradient by pose and control
-        points, whose joint covariance is Sigma. The newest pose's detections are tested, and for the labels
-        in `retest`, whose curves have grown, all of the window that are not in use. A detection of unknown
-        colour is used only if exactly one curve accepts it. The newest pose's parameter on each curve is
-        found in the same search. Without `use`, no detection is tested, and only that parameter is found.
+        points, whose joint covariance is Sigma. The newest pose's detections are tested, and all unused ones
+        of the window for the labels in `retest`, whose curves have grown. A detection of unknown colour is
+        used if exactly one curve accepts it. The same search finds the newest pose's parameter on each curve;
+        without `use`, nothing else is done.
         """
         detections = self.map.detections
         rows, curve = self._untested(retest)
@@ -83,10 +83,9 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         self._associate(rows[rows < new.stop], curve[rows < new.stop])
 
     def reassociate(self) -> None:
-        """Associate all detections of the window anew, after the curves were replaced.
+        """Associate all detections of the window with new curves, on which the poses have been located.
 
-        The poses must have their parameters on the new curves. The uncertainty is that of the prior and the
-        odometry alone, since no detection is in use.
+        The uncertainty is that of the prior and the odometry alone, since no detection is in use.
         """
         self.map.detections.release_all()
         self.factorize()
@@ -102,10 +101,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         self._accept(rows, curve, points, state.curves.find(state.map_points, points, curve, *stretch))
 
     def _accept(self, rows: IntArray, curve: IntArray, points: Array, foot: FootPoints) -> Array:
-        """Put those detections (m,) into use that pass the gate of their curve (m,).
-
-        Return the distance of each from its curve, in standard deviations (m,).
-        """
+        """Put detections (m,) into use that pass the gate of their curve (m,); return the innovations."""
         detections, state, gate = self.map.detections, self.map.state, self.map.settings.gate
         sigma_model = self.map.settings.spline.sigma_model
         limits = (sigma_model, gate.sigma_floor, gate.rough, gate.chi, gate.chi_unknown, UNKNOWN)
@@ -130,10 +126,9 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         return detections.open_to(labels, since)
 
     def joint_variance(self, rows: IntArray, points: Array, foot: FootPoints) -> Array:
-        """Return `g_i' Sigma g_i` (m,) in m^2: the variance of each residual of detections (m,).
+        """Return `g_i' Sigma g_i` (m,) in m^2 of detections (m,) at points (m, 2), map frame.
 
-        It comes from the uncertainty of the pose, of the control points and of the sensor's calibration. The
-        detections are at points (m, 2), map frame.
+        It is the variance of each residual by pose, control points and calibration of the sensor.
         """
         detections, sensor = self.map.detections, self.variables.sensor
         cycles, measured, twists = detections.cycle[rows], detections.measured[rows], detections.twist[rows]
@@ -151,10 +146,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
     # --- the newest pose beside the curves ---------------------------------------------------------------
 
     def _find(self, rows: IntArray, curve: IntArray, points: Array) -> FootPoints:
-        """Find the foot points of detections at points (m, 2), each on its own curve (m,) and in its view.
-
-        The newest pose's foot point on every curve is found in the same search and noted in the state.
-        """
+        """Find the foot points of detections (m,), each on its curve (m,), and locate the newest pose."""
         state, gate = self.map.state, self.map.settings.gate
         curves, s = state.curves, self.map.settings.spline
         foot, beside = _in_view(

@@ -22,10 +22,9 @@ SAMPLE: Final = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """The active part of every curve: curves 0 to k - 1 in the order of their labels.
+    """The active parts of all curves, side by side by label, so that one pass projects all detections.
 
-    So detections of both boundaries are projected in one pass. The control points of all curves are rows of
-    one array, as `State.map_points` has them.
+    The control points of all curves are rows of one array, `State.map_points`.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -68,10 +67,9 @@ class Curves:
 
     @cached_property
     def pairs(self) -> tuple[IntArray, Array, IntArray, IntArray]:
-        """Return the pairs of neighbouring active control points.
+        """Return the pairs of neighbouring active control points, by rows (r, 2) of `State.map_points`.
 
-        The result has the rows (r, 2) of both in `State.map_points`, their nominal distances (r,) in m, their
-        keys (r, 2), and the numbers (r,) of the factors that hold the spacing.
+        Their nominal distances (r,) in m, keys (r, 2), and the numbers (r,) of their factors follow.
         """
         before, rows, owners, nominal = 0, [], [], []
         for label, boundary, active in zip(self.labels.tolist(), self.boundaries, self.active, strict=True):
@@ -220,7 +218,7 @@ class State:
             self.active_stretch[label] = np.append(back, indices)
 
     def activate_only(self, active: dict[int, IntArray]) -> None:
-        """Make the given control points active and no others; by default, or where it is empty, all are."""
+        """Make the given control points active, by label, and no others; all of a label that is missing."""
         self.active_stretch = active
 
     # --- poses beside the curves -------------------------------------------------------------------------

@@ -38,8 +38,7 @@ class TentativeTracks:
         """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
 
         A detection is of the track to which it is nearest, in `merge_radius` or in sigmas, whichever says
-        less: far sightings of one cone are smeared along their rays. Tracks that were not seen for
-        `forget_after` seconds are removed first.
+        less: far sightings of one cone are smeared along their rays. Tracks older than `forget_after` go.
         """
         self._keep(self.last_t > t - self.settings.forget_after)
         if len(points) == 0:
@@ -149,10 +148,7 @@ def newest_of(stamps: Array, most: int) -> BoolArray:
 
 
 def nearest_within(points: Array, known: Array, radius: float) -> tuple[IntArray, BoolArray]:
-    """Return the nearest of the known points (n, 2) to each point (m, 2), and whether it is within a radius.
-
-    The first result (m,) is an index, which means nothing where no point is known.
-    """
+    """Return the index (m,) of the known point nearest to each point (m, 2), and whether within a radius."""
     if len(known) == 0:
         return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
     offset = points[:, None, :] - known[None, :, :]
@@ -175,10 +171,10 @@ class Sighting:
 
 
 class OrangeCones:
-    """Orange cones as points of the map: gates, and lanes that lead to a track.
+    """Orange cones as points of the map, at gates and along lanes that lead to a track.
 
-    They bound no road, so no curve goes through them, and they don't hold the vehicle. Each is the mean of
-    its detections, as the poses of their cycles place them.
+    Each is the mean of its detections, placed by the poses of their cycles. They bound no road and don't hold
+    the vehicle.
     """
 
     MOST: Final = 500  # newest cycles that are remembered, to be placed again when poses are corrected
@@ -197,10 +193,7 @@ class OrangeCones:
             self._place(sighting, sensor)
 
     def place_again(self, sensor: Array, *known: tuple[int, Array]) -> None:
-        """Place all detections anew by better known poses: a first cycle, and poses (P, 3) from it on.
-
-        Where several have a cycle, the last one counts.
-        """
+        """Place all detections by better poses (P, 3) from a first cycle on, of which the last ones count."""
         self._tracks = {}
         for k, one in enumerate(self._sightings):
             for first, poses in known:

@@ -56,9 +56,7 @@ class FixedLagMapper(MapperEstimate):
     """
 
     def __init__(
-        self,
-        settings: MapperSettings | None = None,
-        odometry_sigma: Array | KnownNoise | None = None,
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = settings or MapperSettings()
         noise = known_noise(odometry_sigma)
@@ -83,10 +81,7 @@ class FixedLagMapper(MapperEstimate):
         self._placed_until = 0.0  # path driven (m) up to which the vehicle is not lost (`is_lost`)
 
     def update(
-        self,
-        odometry: Odometry,
-        detections: Detections,
-        factors: Sequence[gtsam.NonlinearFactor] = (),
+        self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor] = ()
     ) -> CycleResult:
         """Process one perception cycle: the twists since the last cycle, and its detections.
 
@@ -167,7 +162,8 @@ class FixedLagMapper(MapperEstimate):
         watch.lap("simplify")
         jump, notice = self.loop.go_on(closes, watch.spent)
         if jump is not None:
-            self._place_orange_again()
+            window = self.smoother.first_cycle, self.poses
+            self.orange.place_again(self.smoother.variables.sensor, (0, self.corrected_poses), window)
         watch.lap("swap")
         if self.loop.is_searching:
             jump, notice = self._find(reading)
@@ -176,7 +172,7 @@ class FixedLagMapper(MapperEstimate):
             self.growth.clear()
         self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
-        notice = "; ".join(text for text in (notice, self.growth.notice, reading.notice, learned) if text)
+        notice = "; ".join(filter(None, (notice, self.growth.notice, reading.notice, learned)))
         return self._result(cycle.detections.t, watch.laps, jump, notice)
 
     def _without(
@@ -187,7 +183,9 @@ class FixedLagMapper(MapperEstimate):
         The mapper is as it was before the cycle each time. The notice says what has failed.
         """
         self.recovery.failures += 1
-        unused, seen = self._unused, cycle.detections
+        number, unused, seen = self.recovery.failures, self._unused, cycle.detections
+        why = f": {type(error).__name__}: {error}" if number == 1 else f" (failure {number})"
+        failed = " ".join(f"an update failed{why}".split())
         nothing = Detections(seen.t, seen.points_vehicle[:0], seen.covariances[:0], seen.labels[:0])
         blind = replace(cycle, detections=nothing)
         attempts = {
@@ -202,18 +200,10 @@ class FixedLagMapper(MapperEstimate):
                 continue
             self.recovery.called(again)
             self._unused = unused if cycle.late else None
-            return replace(result, notice=self._failed(error, consequence, result.notice))
+            return replace(result, notice="; ".join(filter(None, (failed, consequence, result.notice))))
         self.recovery.take_back(self, self.front_end.gate)
         self._unused = unused if cycle.late else cycle.odometry
-        result = self._result(cycle.detections.t, {}, None, "")
-        return replace(result, notice=self._failed(error, "the cycle is not used"))
-
-    def _failed(self, error: Exception, consequence: str, notice: str = "") -> str:
-        number = self.recovery.failures
-        why = f": {type(error).__name__}: {error}" if number == 1 else f" (failure {number})"
-        return "; ".join(
-            text for text in (" ".join(f"an update failed{why}".split()), consequence, notice) if text
-        )
+        return self._result(cycle.detections.t, {}, None, f"{failed}; the cycle is not used")
 
     def _admit(
         self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor]
@@ -253,16 +243,9 @@ class FixedLagMapper(MapperEstimate):
         motion, t = reading.motion, reading.detections.t
         predict(self.smoother, self.path, motion, t, self.settings)
         cycle, twist = self.smoother.next_cycle - 1, motion.odometry.twist
-        self.orange.add(Sighting(cycle, self.poses[-1].copy(), twist, reading.orange), self._sensor)
+        orange = Sighting(cycle, self.poses[-1].copy(), twist, reading.orange)
+        self.orange.add(orange, self.smoother.variables.sensor)
         self.loop.record.measured(reading)
-
-    @property
-    def _sensor(self) -> Array:
-        return self.smoother.variables.sensor
-
-    def _place_orange_again(self) -> None:
-        window = self.smoother.first_cycle, self.poses
-        self.orange.place_again(self._sensor, (0, self.corrected_poses), window)
 
     def _classify(self, reading: Reading) -> None:
         detections, motion, cycle = reading.detections, reading.motion, self.smoother.next_cycle - 1

@@ -105,9 +105,9 @@ class Growth:
         return True
 
     def _extend(self, label: int, path_ahead: PathAhead, behind: float) -> bool:
-        """Extend a curve through all candidates, or extrapolate a stranded end; True if it has grown.
+        """Extend a curve through all candidates, or carry on a stranded end; True if it has grown.
 
-        The end's station is searched on the path from `behind` (m) behind the vehicle on.
+        The end is located on the path from `behind` (m) behind the vehicle on.
         """
         end = self.end(label, path_ahead, behind)
         found = self._candidates(label, path_ahead, end)
@@ -202,8 +202,8 @@ class Growth:
     def _certain(self, label: int, path_ahead: PathAhead, found: Candidates) -> IntArray:
         """Return the candidates, by index, up to the first one ahead that is not known well enough.
 
-        It waits until it was seen near, and so do all behind it: in a hairpin, the row of the way back may be
-        known before the next cone of the way there. One that was passed is left out.
+        In a hairpin, the row of the way back may be known before the next cone of the way there. A candidate
+        that was passed is left out.
         """
         known = self.tentative[label].sigmas(found.indices) < self.settings.sigma
         waiting = np.flatnonzero(~known & (found.stations > path_ahead.driven))
@@ -213,8 +213,8 @@ class Growth:
     def _uncrossed(self, label: int, path_ahead: PathAhead, end: End, found: Candidates) -> IntArray:
         """Return the candidates, by index, up to the first that is reached only across a line.
 
-        No boundary crosses the path driven, the other boundary or itself, on their newest stretches: in a
-        second lap of an open loop it runs along its own first one.
+        Lines are the newest stretches of the path driven and of both boundaries, which in a second lap of an
+        open loop run along their first ones.
         """
         path = newest(path_ahead, end.station)
         lines = [path.points[path.stations <= path.driven]]
@@ -232,8 +232,7 @@ class Growth:
     def end(self, label: int, path_ahead: PathAhead, behind: float) -> End:
         """Return the confirmed end of a curve, located on the path from `behind` (m) behind the vehicle on.
 
-        Its distance from the path is the median of the newest cones', so that one wrong cone leads no
-        further.
+        Its distance from the path is the median with the newest cones', so that one wrong cone leads nowhere.
         """
         boundary = self._state.boundaries[label]
         u = np.array([boundary.confirmed_end])
@@ -264,10 +263,10 @@ class Growth:
 
 
 def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> BoolArray:
-    """Return whether places (n, 2) have at least as many detections of `label` around them as of the other.
+    """Return whether places (n, 2) have at least as many detections of `label` within `radius` (m) as others.
 
-    A sensor that now and then takes a cone for one of the other boundary sees its true colour more often. All
-    coloured detections of the window within `radius` (m) count, in use or not.
+    A sensor that now and then confuses colours sees the true one more often. All coloured detections of the
+    window count, in use or not.
     """
     detections = track.detections
     rows = np.flatnonzero(detections.label != UNKNOWN)
@@ -281,11 +280,9 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
     """Return how many of a curve's cones, from its first on, are in the order in which they were passed.
 
     The order of cones ahead is predicted with an arc. In a hairpin, the row of the way back may be nearer
-    than the row of the way there, and only after the vehicle has passed the cones is their order certain.
-    Only the last `RECALL` metres of the curve are checked, and the first cone there counts as in order.
-
-    `known` (n, 2) are the station and the distance of the first n cones beside the path, as they were in the
-    cycle before, and the second result (m, 2) as they are now.
+    than that of the way there, so the order is certain only once they were passed. The last `RECALL` metres
+    of the curve are checked, whose first cone counts as in order. `known` (n, 2) are station and distance
+    beside the path of the first n cones in the cycle before, and the second result (m, 2) those of now.
     """
     first = int(boundary.cone_parameters.searchsorted(boundary.confirmed_end - RECALL))
     beside = np.full((len(boundary.observed), 2), np.nan)  # nothing is known of others

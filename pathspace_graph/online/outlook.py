@@ -1,7 +1,6 @@
 """The outlook: the open curves as they lead on, through tentative tracks beyond their confirmed ends.
 
-The tentative stretch is no part of the graph. It is fitted to the tracks whenever the map is asked for, so it
-can't harm the estimate, and it is taken back as soon as the tracks contradict it.
+The tentative stretch is no part of the graph: it is fitted anew whenever the map is asked for.
 """
 
 from collections.abc import Mapping, Sequence
@@ -90,8 +89,8 @@ class Row:
 def extend_rows(left: Row, right: Row, driven: Array, threshold: float) -> None:
     """Continue both rows through their candidates, each time the one that lags behind.
 
-    Each row bounds where the other may lead: it stays on its own side, at about the width that the track has.
-    No row crosses the driven path (n, 2). A track nearer to a row's end than `threshold` (m) is passed over.
+    A row stays on its side of the other, at about the width of the track, and does not cross the driven path
+    (n, 2). A track nearer to a row's end than `threshold` (m) is passed over.
     """
     waiting = [left, right]
     while waiting:
@@ -168,9 +167,8 @@ def joint_covariance_of(
 ) -> tuple[Array, list[slice]]:
     """Return the joint covariance of the control points of all curves, and the block of each curve.
 
-    `joint` is the covariance of the known control points of all curves and, last, of the pose `vehicle` (3,),
-    from which the tracks were seen. The placement is linear in both, in the tracks' own errors, and in the
-    second differences, which have the standard deviation `SIGMA_BEND`.
+    `joint` is that of the known control points and, last, of the pose `vehicle` (3,) from which the tracks
+    were seen. The placement is linear in both, in the tracks' errors, and in the second differences.
     """
     changes, noises, blocks, begin, end, eye = [], [], [], 0, 0, np.eye(POINT)
     for outlook in outlooks:
@@ -267,8 +265,7 @@ def extended_rows(
 def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> IntArray:
     """Return the indices of the tracks near the vehicle that are confirmed or were seen just now.
 
-    A track at a cone that the curve has already is left out: across an infield, the sensor sees the row of an
-    earlier stretch again.
+    Tracks at cones of the curve are left out: across an infield the sensor sees an earlier stretch again.
     """
     settings, state = track.settings.growth, track.state
     near = np.hypot(*(tracks.points - state.poses[-1, :2]).T) < REACH
