@@ -53,10 +53,13 @@ class Recovery:
         first = len(self._calls) if self._doubtful is None else self._doubtful
         self._calls = [*self._calls[:first], *map(instead, self._calls[first:])]
         self._doubtful = None
-        self.take_back(estimator, *shared)
+        self._go_back(estimator, *shared)
 
     def take_back(self, estimator: object, *shared: object) -> None:
         """Take an estimator back to what it was after the last call that was noted."""
+        self._go_back(estimator, *shared)
+
+    def _go_back(self, estimator: object, *shared: object) -> None:
         if self._copy is None:
             raise RuntimeError("expected a copy of the estimator, found none")
         attributes = self._held(self._copy, estimator, shared)  # the copy stays, for the next failure
@@ -67,7 +70,7 @@ class Recovery:
                 again()
             except Exception:  # it did not fail before: something outside has changed
                 self._calls = self._calls[:done]
-                self.take_back(estimator, *shared)
+                self._go_back(estimator, *shared)
                 return
 
     def _held(

@@ -192,9 +192,8 @@ class Stopwatch:
 
     def lap(self, name: str) -> None:
         """Add the time since the last call to the stage `name`."""
-        now = time.perf_counter()
-        self.laps[name] = self.laps.get(name, 0.0) + now - self._last
-        self._last = now
+        begin, self._last = self._last, time.perf_counter()
+        self.laps[name] = self.laps.get(name, 0.0) + self._last - begin
 
 
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:

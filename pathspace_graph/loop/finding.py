@@ -179,6 +179,10 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
         judged[others] &= explained[others] | ~wrong
         unmapped &= judged
     innovations, offered = tested.innovation[used], judged & ~unmapped
+    sigma, last = np.nan, smoother.last_step
+    if closed and last is not None:
+        half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose is the last block
+        sigma = worst_sigma(half.T @ half)
     return Evidence(
         t=smoother.times[-1],
         offered=int(offered.sum()),
@@ -186,7 +190,7 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
         used=int(used.sum()),
         innovations=float(innovations @ innovations),
         closed=closed,
-        sigma=_sigma_of_position(smoother) if closed else np.nan,
+        sigma=sigma,
         offered_by=_by_boundary(labels[offered]),
         explained_by=_by_boundary(labels[explained]),
         unmapped=_by_boundary(labels[unmapped]),
@@ -196,15 +200,6 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
 def _by_boundary(labels: IntArray) -> tuple[int, int]:
     left, right = np.bincount(labels, minlength=len(BOUNDARIES)).tolist()
     return left, right
-
-
-def _sigma_of_position(smoother: CurveSmoother) -> float:
-    """Return the standard deviation (m) of the last solved position in its worst direction."""
-    last = smoother.last_step
-    if last is None:
-        return np.nan
-    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose has the last columns
-    return worst_sigma(half.T @ half)
 
 
 class Search:

@@ -128,7 +128,11 @@ class TrackLoop:
             self.health = Health(DEGRADED, "the two boundaries of the map cross")
         if self._known_loop.is_whole and self.record.unsolvable is None:
             self.mending.contradictions.observe(smoother.map, self._known_loop, new, detections.t)
-        self._begin_search()
+        if self.health.condition == LOST and self._known_loop.is_whole and self._lap_batch is None:
+            smoother.map.detections.release_all()  # the map stays as it was before
+            self._search, self._lost = Search(smoother), self.health
+            self.mending.contradictions.clear()
+            self.record.give_up("the vehicle was lost")
 
     def doubt_calibrations(self, reading: Reading) -> str:
         """Widen the priors of calibrations that the drive contradicts, unless closed; return a notice."""
@@ -312,15 +316,6 @@ class TrackLoop:
             self._begin_batch(recurrence)
 
     # --- a vehicle that is lost --------------------------------------------------------------------------
-
-    def _begin_search(self) -> None:
-        """Take all detections of the window out of use, if the vehicle is lost on a map after its batch."""
-        ready = self._known_loop.is_whole and self._lap_batch is None
-        if self.health.condition == LOST and ready:
-            self._smoother.map.detections.release_all()
-            self._search, self._lost = Search(self._smoother), self.health
-            self.mending.contradictions.clear()
-            self.record.give_up("the vehicle was lost")
 
     def find_back(self, *, sees_road: bool) -> tuple[Array | None, str]:
         """Start the window anew where a lost vehicle is found; return its jump (3,) and a notice.

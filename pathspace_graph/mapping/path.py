@@ -61,8 +61,9 @@ class DrivenPath:
 
     def update(self, pose: Array) -> None:
         """Extend the path to `pose` (3,), map frame."""
-        self._keep_beginning(pose)
-        position = pose[:2]
+        position, known = pose[:2], self.beginning[-1:, :2]
+        if self.length <= MEMORY and (np.hypot(*(position - known).T) >= BEGINNING_STEP).all():
+            self.beginning = np.concatenate([self.beginning, pose[None]])
         if len(self.points) == 0:
             self.points, self.stations = position[None].copy(), np.zeros(1)
             self._last = position.copy()
@@ -92,13 +93,6 @@ class DrivenPath:
             if ahead @ heading <= 0.0 or np.hypot(*ahead) > reach:
                 return
             self.points, self.stations = self.points[:-1], self.stations[:-1]
-
-    def _keep_beginning(self, pose: Array) -> None:
-        if self.length > MEMORY:
-            return
-        first = len(self.beginning) == 0
-        if first or np.hypot(*(pose[:2] - self.beginning[-1, :2])) >= BEGINNING_STEP:
-            self.beginning = np.concatenate([self.beginning, pose[None]])
 
     def steer(self, twists: Array) -> None:
         """Update the curvature by `w / v` of body twists (k, 3), if the vehicle is fast enough."""

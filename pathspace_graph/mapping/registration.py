@@ -141,13 +141,16 @@ def register(
     stretches, centre, vector = _beginning(state), state.poses[-1, :2].copy(), np.zeros(3)
     lost = is_lost(covariance, settings)
     if lost:
-        starts = [v for v in _motions(state.poses[-1], beginning) if v @ prior @ v < START_CHI2]
-        curves = state.whole_curves
+        along = np.hypot(*np.diff(beginning[:, :2], axis=0, prepend=beginning[:1, :2]).T).cumsum()
+        _, first = np.unique(along // START_STEP, return_index=True)
+        motions = beginning[first] - state.poses[-1]
+        motions[:, 2] = wrap_angle(motions[:, 2])
+        starts, curves = [vector, *(v for v in motions if v @ prior @ v < START_CHI2)], state.whole_curves
         inliers = [
             _match(state, curves, settings, recent, Motion(centre, v), stretches, REACH).inlier.sum()
-            for v in [vector, *starts]
+            for v in starts
         ]
-        vector = [vector, *starts][int(np.argmax(inliers))]
+        vector = starts[int(np.argmax(inliers))]
     found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
     agree = agrees(found.matches, list(state.boundaries), settings)
     return found if agree and is_certain(found.matches, found.covariance, settings, lost) else None
@@ -195,15 +198,6 @@ def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
     """Return whether a pose with this covariance (3, 3) is less certain than the registration can bridge."""
     prior = np.linalg.inv(covariance * settings.prior_scale**2)
     return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < REACH**-2)
-
-
-def _motions(pose: Array, beginning: Array) -> list[Array]:
-    """Return motions (3,) from a pose (3,) to poses of the beginning (k, 3) that are `START_STEP` apart."""
-    along = np.hypot(*np.diff(beginning[:, :2], axis=0, prepend=beginning[:1, :2]).T).cumsum()
-    _, first = np.unique(along // START_STEP, return_index=True)
-    motions = beginning[first] - pose
-    motions[:, 2] = wrap_angle(motions[:, 2])
-    return list(motions)
 
 
 def _recent(track: CurveMap, times: Sequence[float]) -> Sightings:

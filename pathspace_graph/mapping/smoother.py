@@ -147,8 +147,10 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
     def _find(self, rows: IntArray, curve: IntArray, points: Array) -> FootPoints:
         """Find the foot points of detections (m,), each on its curve (m,), and locate the newest pose."""
-        state, gate = self.map.state, self.map.settings.gate
-        curves, s = state.curves, self.map.settings.spline
+        state, gate, s = self.map.state, self.map.settings.gate, self.map.settings.spline
+        curves, room = state.curves, (gate.station_behind, gate.station_ahead)
+        if float(np.hypot(*(state.poses[-1, :2] - state.poses[-2, :2]))) < gate.station_step:
+            room = s.refine_room, s.refine_room
         foot, beside = _in_view(
             curves.spans,
             state.map_points,
@@ -158,7 +160,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             self.map.detections.cycle[rows] - self.first_cycle,
             [state.pose_u[label] for label in state.boundaries],
             state.poses[-1],
-            (gate.view_behind, gate.view_ahead, *self._search_room()),
+            (gate.view_behind, gate.view_ahead, *room),
             s.search_step,
             s.search_iterations,
             TOLERANCES,
@@ -167,13 +169,6 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             lost = along < 0.0 or abs(distance) > gate.station_lateral
             state.locate_newest(label, self._relocated(label) if lost else u)
         return FootPoints(*foot)
-
-    def _search_room(self) -> tuple[float, float]:
-        """Return how far behind and ahead (m) of its last parameter the vehicle's foot point is searched."""
-        settings, poses = self.map.settings, self.variables.poses
-        if float(np.hypot(*(poses[-1, :2] - poses[-2, :2]))) < settings.gate.station_step:
-            return settings.spline.refine_room, settings.spline.refine_room
-        return settings.gate.station_behind, settings.gate.station_ahead
 
     def _relocated(self, label: int) -> float:
         """Return the parameter of a vehicle that was not found beside the curve in the ordinary search."""

@@ -81,10 +81,7 @@ class MapperEstimate:
         return Map(False, boundaries, joint)
 
     def _closed_map(self, joint: Array) -> Map:
-        """Return the closed map, whose control points have a covariance (2m, 2m) from the graph.
-
-        What a curve with few control points cannot follow is added: no number of detections averages it out.
-        """
+        """Return the closed map: the graph's covariance (2m, 2m), and what few control points can't show."""
         shape, scatter = self.settings.spline.sigma_shape, self.smoother.map.scatter
         boundaries, at = {}, 0
         for label, boundary in self.boundaries.items():
@@ -98,9 +95,8 @@ class MapperEstimate:
     def outline(self) -> Map:
         """Return a copy of the present map without covariances, which takes a hundredth of the time.
 
-        An open curve is confirmed up to `confirmed_until`. From there on it is tentative: it leads through
-        cones that were seen less often, and is fitted anew in each call. A curve that has not begun may
-        consist of a tentative stretch alone.
+        Past `confirmed_until` an open curve is tentative: fitted in each call through cones that were seen
+        less often. A curve that has not begun may consist of a tentative stretch alone.
         """
         with self.smoother.variables.looked_at():
             boundaries = {
@@ -112,10 +108,9 @@ class MapperEstimate:
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
         """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
 
-        This is what a controller asks for in each cycle, so it is fast, and nothing of the estimate changes.
-        While the loop is open, it goes on beyond the confirmed ends through the cones of `outline`, and says
-        where. While the vehicle is lost on a closed map, it is the road as it has been mapped since then.
-        SettingsError is raised where a length is out of its range.
+        It is fast, for a controller in each cycle. While the loop is open, it goes on beyond the confirmed
+        ends through the cones of `outline`, and says where. While the vehicle is lost on a closed map, it is
+        the road as mapped since then. SettingsError is raised where a length is out of its range.
         """
         if not self.smoother.times:
             return track_ahead({}, np.zeros(POSE), distance, step)
@@ -135,8 +130,8 @@ class MapperEstimate:
     def looked_at(self) -> AbstractContextManager[None]:
         """Return a context in which the mapper may be asked for anything, and its estimate stays as it is.
 
-        Without it, `control_points` leaves the inactive part of an open map up to date, which may move later
-        estimates by millimetres.
+        Without it, `control_points` refreshes the inactive part of an open map, and may move later estimates
+        by millimetres.
         """
         return self.smoother.variables.looked_at()
 
@@ -205,8 +200,7 @@ class MapperEstimate:
         """Return the joint covariance (q, q) of any variables (k,), in the order of their keys.
 
         Control points are in m, poses (x, y, theta) in m and rad, both in the map frame; the calibration is
-        (-, rad/s). SettingsError is raised for a key that is not a variable: its pose has left the window, or
-        its curve has new knots.
+        (-, rad/s). SettingsError is raised for a key of a pose outside the window or of former knots.
         """
         wanted = np.array(keys, np.intp)
         unknown = wanted[self.smoother.variables.layout.positions(wanted) == UNKNOWN_PLACE]
@@ -266,8 +260,7 @@ class MapperEstimate:
     def wait(self) -> None:
         """Wait for the batch whose result the next update may take, however long that takes.
 
-        A replay calls this before each update, so that the same log always gives the same map. A vehicle does
-        not: there an update waits for no batch longer than the time since the cycle before.
+        A replay calls this before each update, so that the same log always gives the same map.
         """
         self.loop.wait()
 
@@ -308,8 +301,7 @@ class MapperEstimate:
 def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gtsam.CustomFactor]:
     """Return a spline-projection factor for each cycle of the detections in use on a boundary.
 
-    Their foot points may move as far as a step refines them, where the curve is active. They are corrected
-    by the sensor's calibration where it is estimated.
+    Foot points may move as far as a step refines them, where the curve is active.
     """
     detections, settings = track.detections, track.settings
     boundary, rows = track.state.boundaries[label], detections.used_on(label)

@@ -85,11 +85,10 @@ class FixedLagMapper(MapperEstimate):
     ) -> CycleResult:
         """Process one perception cycle: the twists since the last cycle, and its detections.
 
-        The call is refused as a ReadingError, and nothing has changed, where it holds anything that cannot be
-        used (`front_end.gate`, `settings.online`). Impossible detections are dropped and counted in the
-        result. The next call goes on from the newest cycle that was used. The twists are a stream: each is
-        held until the next one, and those in force before the newest cycle are left out. So a caller hands
-        over the twists since the last call in order, and where some are lost, the last one is held.
+        A cycle that cannot be used (`front_end.gate`, `settings.online`) raises a ReadingError and changes
+        nothing; impossible detections are dropped and counted in the result. The twists are a stream: each is
+        held until the next one, those in force before the newest cycle are left out, and where some are lost,
+        the last one is held.
 
         A late cycle, with a stamp before the newest one's, is used at its time if that is inside the window,
         and is refused otherwise. It brings no twists that are newer than the newest cycle, and no factors.
@@ -98,18 +97,17 @@ class FixedLagMapper(MapperEstimate):
 
         Where another process solves the lap as a batch, the call waits for it no longer than the time since
         the cycle before, and the map is replaced in a later cycle if need be. A replay of a log calls `wait`
-        before, so that it does not depend on how fast the machine is.
+        before, so that it does not depend on the speed of the machine.
 
-        `factors` are GTSAM factors of your own on poses in the window (`pose_key`, `next_pose_key`: `Pose2`),
-        on control points (`control_keys`: `Point2`) and on the calibration. Each is relinearized at every
-        step until one of its poses leaves the window; then it is part of the prior. A factor on control
-        points alone is kept until the loop closes, which replaces the control points. If a key is not a
-        variable of the graph, or a number not finite, SettingsError is raised and nothing is changed. Its
-        lengths are those at scale 1.
+        `factors` are GTSAM factors of your own, at scale 1, on poses in the window (`pose_key`,
+        `next_pose_key`: `Pose2`), on control points (`control_keys`: `Point2`) and on the calibration. Each
+        is relinearized at every step until one of its poses leaves the window; then it is part of the prior.
+        One on control points alone is kept until the loop closes. SettingsError is raised, and nothing is
+        changed, if a key is not a variable of the graph or a number not finite.
 
-        Nothing else is raised. Where a step fails, the mapper goes back to what it was before the cycle.
-        Then it takes the cycle again and leaves the loop alone, or uses no detections, or leaves the cycle
-        out. The notice says which, and `recovery.failures` counts.
+        Nothing else is raised. Where a step fails, the mapper goes back to before the cycle and takes it
+        again with the loop left alone, or without detections, or not at all. The notice says which, and
+        `recovery.failures` counts.
         """
         factors = tuple(factors)
         self.recovery.before(self, self.front_end.gate)
