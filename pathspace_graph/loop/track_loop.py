@@ -53,10 +53,8 @@ class TrackLoop:
         self.settings = smoother.map.settings
         self.closed = False  # whether the loop has closed: the map has its final size
         self.health = Health()  # how far the newest estimate can be trusted
-        self.corrected_poses: Array = np.zeros((0, 3))
-        """(k, 3) Poses of the first k cycles as the closing of the loop has corrected them."""
-        self.lap_seconds = float("nan")
-        """Wall time (s) of the batch of the lap in its own process, once it has replaced the prior."""
+        self.corrected_poses: Array = np.zeros((0, 3))  # (k, 3) of the first k cycles, since closing
+        self.lap_seconds = float("nan")  # wall time (s) of the lap's batch, once it has replaced the prior
         self.late_cycles = 0  # cycles by which the slowest batch is late in a vehicle, by its wall time
         self.record = DriveRecord(self.settings, noise)
         self.revisits = Revisits(smoother, path, self.record)

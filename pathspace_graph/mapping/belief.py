@@ -72,8 +72,7 @@ def transform(function: Callable[[Array], Array], mean: Array, covariance: Array
 
 _ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
 HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE  # number of entries of the state before its points
-SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)
-"""Entries of the sensor's calibration in the state."""
+SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)  # entries of the sensor's calibration
 
 
 class Belief:

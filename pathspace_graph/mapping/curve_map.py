@@ -28,14 +28,10 @@ class CurveMap:
         self.state = state or State()  # curves and all variables
         self.variables = self.state.variables
         self.detections = DetectionTable()  # detections of the poses in the window
-        self.held_by_prior = False
-        """Whether the prior holds the spacing and shape of the curves, so that the window does not."""
-        self.scatter: dict[int, Array] = {}
-        """(m,) Standard deviation of cones about a boundary's curve at each control point (m), if known."""
-        self.cones: dict[int, Array] = {}
-        """(k,) Parameters of the cones of a closed boundary (m), where they are known."""
-        self.reached_inactive = False
-        """Whether a foot point of the latest `rows` has slid to an inactive part of a curve."""
+        self.held_by_prior = False  # whether the prior holds the curves' spacing and shape
+        self.scatter: dict[int, Array] = {}  # (m,) sigma of cones at each control point, if known (m)
+        self.cones: dict[int, Array] = {}  # (k,) parameters of the cones of a closed boundary (m), if known
+        self.reached_inactive = False  # whether the latest `rows` reach inactive control points
         self._refined: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
     # --- detections --------------------------------------------------------------------------------------

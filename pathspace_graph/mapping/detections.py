@@ -31,12 +31,10 @@ class DetectionColumns:
     """(m, 3) Twists of the vehicle then, in m/s, m/s and rad/s."""
     covariance: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     """(m, 2, 2) Covariances of the positions in m^2, vehicle frame."""
-    label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Colour by the sensor: LEFT, RIGHT or UNKNOWN."""
+    label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # colour: LEFT, RIGHT or UNKNOWN
     changed: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
     """Whether the association has changed since the detection's cycle was last linearized."""
-    sensor: Array = field(default_factory=lambda: np.zeros(0))
-    """(5,) or (0,) Calibration of the sensor by which `point` is corrected; it is no column."""
+    sensor: Array = field(default_factory=lambda: np.zeros(0))  # by which `point` is corrected; no column
 
     def __len__(self) -> int:
         return len(self.cycle)
@@ -127,12 +125,9 @@ class DetectionColumns:
 class DetectionTable(DetectionColumns):
     """Detections with the boundary curve that each of them is associated with."""
 
-    boundary: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Label of that boundary; UNKNOWN until it is decided."""
-    u: Array = field(default_factory=lambda: np.zeros(0))
-    """Parameter of the foot point of each detection in use (m)."""
-    used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
-    """Whether the detection is a row of the factor graph."""
+    boundary: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # its label, or UNKNOWN
+    u: Array = field(default_factory=lambda: np.zeros(0))  # parameter of the foot point (m)
+    used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))  # whether a row of the graph
 
     def _clear_associations(self) -> None:
         self.boundary, self.u, self.used = self.label.copy(), np.zeros(len(self)), np.zeros(len(self), bool)

@@ -42,8 +42,7 @@ class MeasuredMotion:
     missing: bool = False  # whether no twist was measured for long
     stuck: bool = False  # whether the twist stays the same to the last digit
     bias: BiasMeasurement | None = None  # what the vehicle has measured at rest, where it has just done so
-    durations: Array | None = None
-    """(k,) Times for which the twists hold, s; None where the motion is not that of the odometry."""
+    durations: Array | None = None  # (k,) times for which the twists hold (s); None if not the odometry's
     excess: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) or (k, 3) Standard deviation of a twist that is held for long, beside that of its noise."""
 

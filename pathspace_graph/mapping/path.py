@@ -11,14 +11,12 @@ from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.labels import LEFT, RIGHT
 
 STEP: Final = 0.3  # least distance of neighbouring positions of the stored path (m)
-MEMORY: Final = 60.0
-"""Length of the stored path behind the vehicle, and of the first stretch, which closing needs (m)."""
+MEMORY: Final = 60.0  # length of the stored path behind the vehicle, and of the stored first stretch (m)
 BEGINNING_STEP: Final = 1.0  # least distance of neighbouring poses of the stored first stretch (m)
 MAX_CURVATURE: Final = 0.3  # largest curvature of the predicted path (1/m): that of a tight hairpin
 CURVATURE_GAIN: Final = 0.4  # share of a cycle's measured curvature in the smoothed one
 MIN_SPEED: Final = 1.0  # speed (m/s) below which yaw rate over speed is too uncertain to be a curvature
-SIDES: Final = {LEFT: 1.0, RIGHT: -1.0}
-"""Sign of the signed distance from the path (left positive) at which each boundary lies."""
+SIDES: Final = {LEFT: 1.0, RIGHT: -1.0}  # sign of the distance from the path of each boundary
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +48,9 @@ class DrivenPath:
     """A polyline that grows with the vehicle, and the curvature of its present turn."""
 
     def __init__(self) -> None:
-        self.points: Array = np.zeros((0, 2))
-        """(n, 2) Kept positions (x, y) in m, map frame, at least `STEP` apart."""
+        self.points: Array = np.zeros((0, 2))  # (n, 2) kept positions in m, map frame, at least `STEP` apart
         self.stations: Array = np.zeros(0)  # (n,) path length up to each of them (m)
-        self.beginning: Array = np.zeros((0, 3))
-        """(k, 3) Poses (x, y, theta) on the first stretch, which is as long as the memory."""
+        self.beginning: Array = np.zeros((0, 3))  # (k, 3) poses (x, y, theta) on the first stretch
         self.length = 0.0  # length of the driven path: the station of the vehicle (m)
         self.curvature = 0.0  # smoothed curvature of the present turn (1/m), left positive
         self._last: Array = np.zeros(2)
@@ -150,18 +146,15 @@ def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
 
 # --- cones that come next --------------------------------------------------------------------------------
 
-LATERAL_CHANGE: Final = 1.5
-"""How much farther from the path the next cone may be than the newest ones of the curve (m)."""
+LATERAL_CHANGE: Final = 1.5  # how much farther from the path the next cone may be than the newest ones (m)
 LATERAL_RATE: Final = 0.2  # growth of `LATERAL_CHANGE` with the distance along the path (m/m)
 BESIDE: Final = 2.0  # distance along the path below which cones stand beside each other (m)
-LATERAL_GAP: Final = 0.8
-"""Distance beyond which a cone is behind the row if one beside it is nearer to the path by more (m)."""
+LATERAL_GAP: Final = 0.8  # how much nearer to the path a cone beside another one hides it (m)
 STATION_MARGIN: Final = 0.3  # least distance past the end of a curve of what extends it (m along the path)
 END_BEHIND: Final = 5.0
 """Farthest that the end of a curve is behind the vehicle (m along the path), since a stranded end is carried
 on. An older stretch of the path across the infield may be nearer to it."""
-STRANDED: Final = 2.0
-"""Distance behind the vehicle beyond which an end that nothing extends is carried on (m)."""
+STRANDED: Final = 2.0  # distance behind the vehicle beyond which an end without candidates is carried on (m)
 CARRIED_TO: Final = 1.0  # distance behind the vehicle to which a stranded end is carried on (m)
 MIN_LATERAL: Final = 0.5  # least distance from the path of an end that is carried on (m)
 MIN_CARRY: Final = 0.5  # least length by which an end is carried on (m)

@@ -15,10 +15,8 @@ from .curve_map import CurveMap
 from .path import DrivenPath
 from .state import Curves, State
 
-HEADING: Final = 0.8
-"""Largest angle between the heading and that of the beginning where the loop may close (rad)."""
-START_LATERAL: Final = 5.0
-"""Largest distance from the start at which the vehicle crosses its line, without which no loop closes (m)."""
+HEADING: Final = 0.8  # largest angle between the headings now and at the beginning for closing (rad)
+START_LATERAL: Final = 5.0  # largest distance from the start at which its line is crossed to close a loop (m)
 START_HEADING: Final = 0.5  # largest angle between the directions of the start and of that crossing (rad)
 WINDOW: Final = 2.0  # age of the oldest detections that are registered (s)
 BEGINNING: Final = 60.0  # length of the curves that counts as their beginning (m)
@@ -26,10 +24,8 @@ BEGINNING_SHARE: Final = 0.6  # largest share of a short curve that counts as it
 REACH: Final = 3.0  # largest distance from the curves of detections that the first iteration uses (m)
 SHRINK: Final = 0.7  # factor on `REACH` for each further iteration, down to `closing.inlier_distance`
 ITERATIONS: Final = 7
-START_STEP: Final = 2.0
-"""Distance of the poses of the beginning from which the registration starts where the vehicle is lost (m)."""
-START_CHI2: Final = 16.3
-"""Their largest squared Mahalanobis distance under its uncertainty: 99.9 % of chi-square with 3 degrees."""
+START_STEP: Final = 2.0  # distance of the poses of the beginning where a lost vehicle is tried (m)
+START_CHI2: Final = 16.3  # their squared Mahalanobis distance at most: 99.9 % of chi-square, 3 degrees
 MIN_DETECTIONS: Final = 25
 MIN_INLIERS: Final = 5  # least number of inliers on each boundary
 
@@ -61,8 +57,7 @@ class Sightings:
     labels: IntArray
     points: Array  # (m, 2) positions in m, map frame
     covariances: Array  # (m, 2, 2) covariances in m^2, map frame
-    explained: BoolArray
-    """(m,) Whether the newest curves explain the detection: only these can contradict a place."""
+    explained: BoolArray  # (m,) whether the newest curves explain it, so that it can contradict a place
 
     @classmethod
     def of_points(cls, rows: IntArray, labels: IntArray, points: Array) -> Self:

@@ -14,16 +14,12 @@ from pathspace_graph.spline.knots import curvature_weighted_breaks, refit, thin
 
 from .registration import BEGINNING
 
-EXTRAPOLATED: Final = 2
-"""Knot intervals past the confirmed end whose parameters are mapped to the closed curve."""
-JOIN_MARGIN: Final = 10.0
-"""Length before the end of a curve, beside `BEGINNING`, within which the seam lies (m)."""
+EXTRAPOLATED: Final = 2  # knot intervals past the confirmed end that are mapped to the closed curve
+JOIN_MARGIN: Final = 10.0  # length before the end of a curve, and `BEGINNING`, in which the seam lies (m)
 JOIN_SHARE: Final = 0.5  # share of a short curve past which the seam lies
 OVERLAP_STEP: Final = 1.0  # step at which points of the overlap are placed on the beginning (m)
-OVERLAP_ROOM: Final = 4.0
-"""Room about its expected place in which a point of the overlap is searched for (m along the curve)."""
-SEAM_MARGIN: Final = 0.5
-"""Distance from the seam below which a cone was also detected at the beginning, and counts once (m)."""
+OVERLAP_ROOM: Final = 4.0  # room about its expected place in which a point of the overlap is searched (m)
+SEAM_MARGIN: Final = 0.5  # distance from the seam below which a cone is one of the beginning (m)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,10 +14,8 @@ from pathspace_graph.graph.variables import CONTROL_LETTERS, Variables, control_
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
-POINTS_PER_FACTOR: Final = 6
-"""Consecutive control points whose weak priors are one factor: there are few factors, and each is small."""
-SAMPLE: Final = 0.25
-"""Step at which curves are sampled where they are compared with each other and with cones (m)."""
+POINTS_PER_FACTOR: Final = 6  # consecutive control points whose weak priors are one factor
+SAMPLE: Final = 0.25  # step at which curves are sampled for comparison with curves and cones (m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +30,7 @@ class Curves:
     active: tuple[IntArray, ...]  # active control points of each curve, by index
     tables: tuple[SpanPolynomials, ...]  # tables of each whole curve
     spans: Spans  # all spans of closed curves; an open curve begins at its first active control point
-    active_from: Array
-    """(k,) Parameter before which an open curve is inactive; minus infinity if all is active."""
+    active_from: Array  # (k,) parameter before which an open curve is inactive; -inf if all is active
     keys: IntArray  # (m,) keys of all control points
 
     @classmethod
@@ -104,8 +101,7 @@ class State:
         self.active_stretch: dict[int, IntArray] = {}
         """Active control points (k,) of a boundary that is partly inactive: one stretch in driving order, by
         index from the boundary's first control point."""
-        self.pose_u: dict[int, Array] = {}
-        """(P,) Parameter of each pose's foot point on each boundary, which increases from lap to lap."""
+        self.pose_u: dict[int, Array] = {}  # (P,) parameters of the poses, increasing from lap to lap
         self._curves: Curves | None = None
 
     def copy(self) -> Self:

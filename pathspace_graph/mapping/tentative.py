@@ -27,10 +27,8 @@ class TentativeTracks:
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
-        self.points: Array = np.zeros((0, 2))
-        """(n, 2) Weighted mean of each track's detections in m, map frame."""
-        self.information: Array = np.zeros((0, 2, 2))
-        """(n, 2, 2) Information of each track (1/m^2): the sum of its detections' inverse covariances."""
+        self.points: Array = np.zeros((0, 2))  # (n, 2) weighted mean of a track's detections in m, map frame
+        self.information: Array = np.zeros((0, 2, 2))  # (n, 2, 2) sum of its inverse covariances (1/m^2)
         self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
         self.last_t: Array = np.zeros(0)  # (n,) stamp of the newest detection (s)
 

@@ -34,11 +34,9 @@ from pathspace_graph.snapshot import restore, save
 from .estimate import MapperEstimate
 from .growth import Growth
 
-ROAD: Final = 10.0
-"""Length of both boundaries beside a lost vehicle from which on they are a road (m)."""
+ROAD: Final = 10.0  # length of both boundaries beside a lost vehicle that make a road (m)
 
-PLACED: Final = 20.0
-"""Path (m) for which a vehicle stays certain enough of its place that only detections can close the loop."""
+PLACED: Final = 20.0  # path for which a vehicle stays so certain that only detections can close the loop (m)
 
 
 def careful(process: partial[CycleResult]) -> partial[CycleResult]:
@@ -74,8 +72,7 @@ class FixedLagMapper(MapperEstimate):
         if self.settings.open_lap.prior == "window":
             self.loop.record.give_up("no batch of the lap was asked for")
         self.recovery = Recovery()
-        self.new_road: FixedLagMapper | None = None
-        """The road beside a lost vehicle, mapped anew in the frame of the pose in which the search began."""
+        self.new_road: FixedLagMapper | None = None  # road beside a lost vehicle, from where the search began
         self._unused: Odometry | None = None  # twists of a cycle that was left out
         self._grown: frozenset[int] = frozenset()
         self._placed_until = 0.0  # path driven (m) up to which the vehicle is not lost (`is_lost`)

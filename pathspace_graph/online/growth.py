@@ -27,13 +27,10 @@ from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nea
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
 NEWEST: Final = 3  # newest cones that, with the end of a curve, say how far it runs beside the path
-RECALL: Final = 25.0
-"""Length of the newest stretches of path and curves (m): in a second round, the first one tells nothing."""
-NEARER: Final = 0.5
-"""A cone that was passed is passed again only where the path comes nearer to it by more than this (m)."""
+RECALL: Final = 25.0  # newest stretch of path and curves (m): in a second round, the first tells nothing
+NEARER: Final = 0.5  # how much nearer the path must come to pass a passed cone again (m)
 LENGTH_FREE: Final = 50.0  # length of an open curve that is allowed whatever the path driven (m)
-LENGTH_DRIVEN: Final = 2.0
-"""Further length allowed for each metre driven (m/m): a curve that zigzags between false cones exceeds it."""
+LENGTH_DRIVEN: Final = 2.0  # further length for each metre driven, exceeded by zigzags between false cones
 
 
 class Growth:
@@ -41,8 +38,7 @@ class Growth:
 
     def __init__(self, smoother: CurveSmoother) -> None:
         self.settings = smoother.map.settings.growth
-        self.tentative = {label: TentativeTracks(self.settings) for label in BOUNDARIES}
-        """Detections that no curve explains, by label."""
+        self.tentative = {label: TentativeTracks(self.settings) for label in BOUNDARIES}  # unexplained cones
         self.notice = ""  # what is said in the cycle in which a boundary stops growing
         self._smoother, self._map, self._state = smoother, smoother.map, smoother.map.state
         self._full: set[int] = set()

@@ -25,23 +25,18 @@ from pathspace_graph.spline.bspline import BSpline
 from .growth import newest, undisputed
 
 REACH: Final = 12.5  # farthest track from the vehicle that the stretch leads through (m)
-MEMORY: Final = 0.35
-"""Time for which a track that is not confirmed counts (s): a detection of nothing is not repeated."""
-GAP: Final = 11.0
-"""Largest distance of neighbouring tracks of a row (m): two regular gaps, as a cone may never be detected."""
+MEMORY: Final = 0.35  # time for which an unconfirmed track counts (s): a detection of nothing is not repeated
+GAP: Final = 11.0  # largest distance of neighbours in a row (m): two regular gaps, as one may be missed
 TURN: Final = 2.0  # largest turn of a row from one track to the next where both coincide (rad)
 TURN_RATE: Final = 0.1  # decrease of `TURN` with the distance to the next track (rad/m)
 TURN_COST: Final = 1.0  # the next track of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)
 MIN_WIDTH: Final = 1.5  # least distance of a row from the other boundary (m)
 WIDTH_RATIO: Final = 1.8  # largest ratio of successive tracks' distances from the other boundary
 WIDTH_SLACK: Final = 1.0  # further growth allowed of that distance (m)
-TAIL: Final = 20.0
-"""Length at the end of the confirmed curves that tells where the track leads and how wide it is (m)."""
+TAIL: Final = 20.0  # length of the confirmed curves that tells where the track leads and how wide it is (m)
 TAIL_STEP: Final = 1.0  # step of the points along that length (m)
-BEGIN_LATERAL: Final = 1.5
-"""Distance beside the vehicle from which the row of a boundary that has not begun is searched (m)."""
-SIGMA_CONE: Final = 0.1
-"""Standard deviation of a cone's distance from a smooth curve (m), added to a track's own."""
+BEGIN_LATERAL: Final = 1.5  # distance beside the vehicle at which a row without a curve is searched (m)
+SIGMA_CONE: Final = 0.1  # of a cone's distance from a smooth curve (m), added to a track's own
 SIGMA_BEND: Final = 1.0
 """Standard deviation of the second difference of control points about that of a straight line (m). It widens
 the band between tracks that are far apart, and beyond the last one."""
@@ -59,8 +54,7 @@ class Row:
     line: Array  # (n, 2) at least two points of the row in driving order (m, map frame)
     direction: Array  # (2,) unit vector in which the row leads on from its last point
     candidates: Array  # (k, 2) tracks that may continue the row (m, map frame)
-    chosen: list[int] = field(default_factory=list)
-    """Candidates that the row continues through, by index in driving order."""
+    chosen: list[int] = field(default_factory=list)  # candidates taken, in order
     ended: bool = False  # whether no candidate continues the row, wherever the other one leads
 
     @property
@@ -146,8 +140,7 @@ class Outlook:
     confirmed_until: float  # parameter up to which the curve is confirmed (m)
     tracks: Array  # (k, 2) tracks that the tentative stretch leads through (m, map frame)
     variances: Array  # (k,) variance of each in any direction (m^2), seen from the vehicle
-    placement: Placement | None
-    """How control points were placed for the tentative stretch; None where there is none."""
+    placement: Placement | None  # of control points for the tentative stretch, if there is one
 
     @property
     def control_points(self) -> Array:
