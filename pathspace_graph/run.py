@@ -113,8 +113,7 @@ def _ask(estimator: OnlineEstimator, method: str, *arguments: Any) -> Any:
 class ObservedCycle:
     """A cycle that is over, as an observer sees it: its input, its result, and the estimator as it stands.
 
-    The map, the readings and the window are taken when first asked for, once for all observers: before the
-    next cycle. They must not be changed.
+    Map, readings and window are taken when first asked for, once for all observers, and must not be changed.
     """
 
     estimator: OnlineEstimator
@@ -193,9 +192,8 @@ class Stopwatch:
 
     def lap(self, name: str) -> None:
         """Add the time since the last call to the stage `name`."""
-        now = time.perf_counter()
-        self.laps[name] = self.laps.get(name, 0.0) + now - self._last
-        self._last = now
+        begin, self._last = self._last, time.perf_counter()
+        self.laps[name] = self.laps.get(name, 0.0) + self._last - begin
 
 
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:

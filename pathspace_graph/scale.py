@@ -40,10 +40,10 @@ PATIENCE: Final = 200  # number of cycles after which it is final in any case
 
 
 class SceneScale:
-    """Finds the scale of a scene, cycle by cycle, as soon as both sides of the road and a row are seen.
+    """Finder of a scene's scale, cycle by cycle, as soon as both sides of the road and a row are seen.
 
-    It is the smaller one of what width and gaps say, and 1 where they disagree: a wide road isn't a large
-    scene. A record in wrong units, out of the range of `SCALES`, has the scale 1.
+    It is the less extreme one of what width and gaps say, and 1 where they disagree, since a wide road isn't
+    a large scene, or where they are out of the range of `SCALES`.
     """
 
     def __init__(self, scale: float | None = None) -> None:
@@ -184,9 +184,9 @@ def in_scene(error: ReadingError, scale: float) -> ReadingError:
 def at_scale(estimator: C) -> C:
     """Let an online estimator map scenes of any size.
 
-    Lengths of odometry and detections are divided by `settings.scale`, and those of results are multiplied by
-    it. Where the setting is None, the first cycles tell the scale. If they tell another one than what was
-    believed, the estimator begins anew with it, and takes the cycles so far again.
+    Lengths of odometry and detections are divided by `settings.scale`, those of results multiplied by it.
+    Where it is None, the first cycles tell the scale. With each new one, the estimator begins anew and takes
+    the cycles so far again.
     """
     begin, step = estimator.__init__, estimator.update
 

@@ -99,26 +99,22 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
 
 def _move_poses(poses: Array, solved: Array) -> None:
     """Set the first poses of the window (P, 3) to the solved ones (k, 3), and move the others rigidly."""
-    last = len(solved) - 1
-    later = [relative(poses[last], pose) for pose in poses[last + 1 :]]
-    poses[: last + 1] = solved
-    for slot, delta in enumerate(later, start=last + 1):
-        poses[slot] = compose(poses[last], delta)
+    last = poses[len(solved) - 1].copy()
+    for pose in poses[len(solved) :]:
+        pose[:] = compose(solved[-1], relative(last, pose))
+    poses[: len(solved)] = solved
 
 
 # --- the gauge -------------------------------------------------------------------------------------------
 
 
 def hold_gauge(smoother: CurveSmoother) -> None:
-    """Hold where the closed map as a whole is, across its curves.
+    """Hold where the closed map as a whole is, across its curves, while its shape goes on to be estimated.
 
-    Only the beginning of the drive is known in the map frame, and every later detection is relative. So what
-    later laps tell of the gauge comes through the shape of the map alone: the better the curves beside the
-    start are known, the better is the heading of all the rest. This is true of the noise of detections, which
-    is new in every lap. But cones lie off a curve with few control points by the same distance in each lap.
-    The detections of many laps bend the curve to it, and a bend of centimetres beside the start turns the
-    whole map. So the gauge is held after a few laps, and the shape goes on to be estimated. What cones share
-    between laps is not averaged out, so no more is claimed of the map than was known then.
+    Only the beginning of the drive is known in the map frame: later laps tell of the gauge through the shape
+    of the curves beside the start alone. They average out the noise of detections, but cones lie off a curve
+    with few control points by the same distance in each lap. Many laps bend the curve to it, and a bend of
+    centimetres beside the start turns the whole map. So its uncertainty is frozen after a few laps.
     """
     state = smoother.map.state
     tangents = [state.spline(label).tangent_unit(b.abscissae) for label, b in state.boundaries.items()]

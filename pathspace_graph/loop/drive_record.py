@@ -36,10 +36,10 @@ from .recognition import RecognizedPlace
 
 
 def bend(poses: Array, known: Mapping[int, Array]) -> Array:
-    """Return the poses (n, 3) of a path that is bent, so that some of them have known values (3,), by index.
+    """Return the poses (n, 3) of a path bent so that some of them have known values (3,), by index.
 
-    A pose between two of these is the mean of where it is as seen from each, weighed by how near they are
-    along the path. A pose after the last one moves with it.
+    A pose between two of these is the mean of its places as seen from each, weighted by the nearness along
+    the path. A pose after the last one moves with it.
     """
     at, along = np.array(sorted(known)), path_lengths(poses)
     before = at.searchsorted(np.arange(len(poses)), side="right") - 1
@@ -79,9 +79,8 @@ class DriveRecord:
         self._prepared = False
 
     def give_up(self, reason: str) -> None:
-        """Drop the measurements, since the lap cannot be solved for this reason."""
-        if self.unsolvable is None:
-            self.unsolvable = reason
+        """Drop the measurements; the first reason counts."""
+        self.unsolvable = self.unsolvable or reason
         self._motions, self._seen, self._orange = [], [], []
 
     def measured(self, reading: Reading) -> None:

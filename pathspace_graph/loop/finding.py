@@ -1,9 +1,8 @@
 """Finding a vehicle that is lost on a closed map: hypotheses along the loop, until one is left.
 
-While the vehicle is lost, its detections are not used, so the map stays as it was. They are remembered on the
-path that odometry gives since then. The path and the detections are laid rigidly beside each place of the
-loop, and the best places are refined by the registration. The farther the vehicle drives, the fewer places
-agree. Once one is clearly better than all others, and twice in a row, the window starts anew there.
+While the vehicle is lost, its detections do not change the map. They are remembered on the path by odometry,
+which is laid rigidly beside each place of the loop, and the best places are refined by the registration. Once
+one is clearly better than all others, twice in a row, the window starts anew there.
 """
 
 from collections.abc import Callable, Mapping
@@ -86,10 +85,10 @@ class Loop:
 
 
 def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) -> BoolArray:
-    """Return which parameters (m,) of a closed curve lie between cones (k,) that are neighbours (m).
+    """Return which parameters (m,) of a closed curve lie between neighbouring cones at parameters (k,), in m.
 
-    The others lie in a gap, which is longer than `gap` times the median distance of neighbours, and farther
-    than the margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
+    The others lie in a gap, longer than `gap` times the median distance of neighbours, and farther than the
+    margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
     """
     if len(cones) < 2:
         return np.ones(len(u), bool)
@@ -167,8 +166,8 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
 
     On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
     for on the whole of their curve: they may be of a stretch across the infield. Three kinds say nothing
-    about the vehicle: those that are not `seen_again` (m,), of all detections of the cycle, those on the
-    curve of the other colour, and those beside a gap of the map.
+    about the vehicle: those not `seen_again` (m,) of all detections of the cycle, those on the curve of the
+    other colour, and those beside a gap of the map.
     """
     detections, settings = smoother.map.detections, smoother.map.settings.health
     closed, used = smoother.map.state.closed, detections.used[tested.rows]
@@ -185,6 +184,10 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
         judged[others] &= explained[others] | ~wrong
         unmapped &= judged
     innovations, offered = tested.innovation[used], judged & ~unmapped
+    sigma, last = np.nan, smoother.last_step
+    if closed and last is not None:
+        half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose is the last block
+        sigma = worst_sigma(half.T @ half)
     return Evidence(
         t=smoother.times[-1],
         offered=int(offered.sum()),
@@ -192,7 +195,7 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
         used=int(used.sum()),
         innovations=float(innovations @ innovations),
         closed=closed,
-        sigma=_sigma_of_position(smoother) if closed else np.nan,
+        sigma=sigma,
         offered_by=_by_boundary(labels[offered]),
         explained_by=_by_boundary(labels[explained]),
         unmapped=_by_boundary(labels[unmapped]),
@@ -202,15 +205,6 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
 def _by_boundary(labels: IntArray) -> tuple[int, int]:
     left, right = np.bincount(labels, minlength=len(BOUNDARIES)).tolist()
     return left, right
-
-
-def _sigma_of_position(smoother: CurveSmoother) -> float:
-    """Return the standard deviation (m) of the last solved position in its worst direction."""
-    last = smoother.last_step
-    if last is None:
-        return np.nan
-    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose has the last columns
-    return worst_sigma(half.T @ half)
 
 
 class Search:

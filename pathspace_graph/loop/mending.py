@@ -1,8 +1,8 @@
 """Mending: the curves of a closed map are led through cones that contradict them, and the drive solved again.
 
 A contradiction is a cone that is seen again and again where the closed map has none of its colour. The poses
-are right: the vehicle is held by the other boundary and by the stretches before and after. So the batch of
-the whole drive begins at these poses, with curves that lead through the cones that were seen.
+are right, held by the other boundary and by the stretches before and after. So the batch of the whole drive
+begins at these poses, with curves through the cones that were seen.
 """
 
 from dataclasses import dataclass, replace
@@ -81,9 +81,9 @@ class Contradictions:
             tracks.clear()
 
     def stretches(self, loop: Loop, t: float) -> list[Stretch]:
-        """Return the stretches whose cones contradict the curves of the loop, or stand in a gap, at t (s).
+        """Return the stretches whose cones contradict the loop or stand in a gap, once all are passed.
 
-        There are none until the vehicle has passed all of them, or `MOST` cones of a very long one.
+        Of a very long one, `MOST` cones passed are enough.
         """
         found = list[Stretch]()
         for label, tracks in self._tracks.items():
@@ -150,10 +150,7 @@ class Mending:
         return bool(self._stretches)
 
     def begin(self, poses: Array) -> ClosedMap:
-        """Return the map that the batch of the drive begins with, whose curves are led anew.
-
-        The poses (P, 3) are those of all cycles, in the map frame.
-        """
+        """Return the map that the batch of the drive begins with, with the poses (P, 3) of all cycles."""
         self._smoother.refresh()
         track, state = self._smoother.map, self._smoother.map.state
         longest = max(boundary.length for boundary in state.boundaries.values())
@@ -190,10 +187,9 @@ def carried(points: Array, before: Array, after: Array) -> Array:
 
 
 def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Array) -> BSpline:
-    """Return the closed curve of a boundary, led through the cones of its stretches.
+    """Return the closed curve of a boundary, led through the cones of its stretches, none beside them.
 
-    The cones of the curve are in the order in which the newest lap of the poses (P, 3) passes them. Those
-    that lie beside a row of the stretches' cones, or are one of them, are removed.
+    The cones are in the order in which the newest lap of the poses (P, 3) passes them.
     """
     state, settings = track.state, track.settings
     chosen = [stretch for stretch in stretches if stretch.label == label]

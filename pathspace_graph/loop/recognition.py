@@ -1,8 +1,7 @@
 """Place recognition: the newest stretch of the curves is registered with an earlier one.
 
-After a long lap the vehicle may be anywhere along the first few hundred metres. The detections of the last
-seconds agree with any place along a straight there. The open curves hold more: their newest stretch has the
-bends of the track in it, and these are where they were a lap before.
+After a long lap the vehicle may be anywhere along the first few hundred metres, and the detections of the
+last seconds agree with any place along a straight there. The bends in the newest stretch tell the place.
 """
 
 from dataclasses import dataclass
@@ -43,10 +42,7 @@ class RecognizedPlace:
 
 
 def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
-    """Return the place at which the newest stretch of the curves has been before.
-
-    The result is None where the vehicle is not lost, or its place is not found.
-    """
+    """Return the earlier place of the newest stretch; None if it is not found, or the vehicle is not lost."""
     settings, track = smoother.map.settings.closing, smoother.map
     if not may_tell_place(track.state, settings):
         return None
@@ -57,10 +53,9 @@ def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
 
 
 def may_tell_place(state: State, settings: ClosingSettings) -> bool:
-    """Return whether it is worth asking for the place.
+    """Return whether a lap lies between an earlier stretch and the newest one, and this may tell a place.
 
-    The curves hold a whole lap between an earlier stretch and the newest one, and the newest one, laid on
-    itself, holds the vehicle in every direction. A straight could as well lie farther along.
+    Laid on itself, the newest stretch must hold the vehicle in every direction, as no straight does.
     """
     end = min(boundary.confirmed_end for boundary in state.boundaries.values())
     if not STRETCH < BEGINNING_SHARE * end < end - STRETCH - settings.min_path:
@@ -74,8 +69,8 @@ def may_tell_place(state: State, settings: ClosingSettings) -> bool:
 def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) -> RecognizedPlace | None:
     """Return the only place at which the newest stretch of the curves agrees with an earlier stretch.
 
-    The `covariance` (3, 3) of the newest pose says how far the place may be from where the vehicle believes
-    to be. The result is None if no place agrees, if several do, or if the place along the track is uncertain.
+    It is searched for within the `covariance` (3, 3) of the newest pose. None if no place agrees, if several
+    do, or if the place along the track is uncertain.
     """
     state = track.state
     newest = {label: cones for label, (cones, _) in newest_stretch(state).items()}
@@ -87,10 +82,10 @@ def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) ->
     found: list[RecognizedPlace] = []
     for vector, low in _starts(state, prior, settings):
         place = _register(state, newest, Motion(centre, vector), low, prior, settings)
-        if place is not None:
-            apart = [place.motion.vector[:2] - other.motion.vector[:2] for other in found]
-            if all(np.hypot(*away) >= settings.overlap for away in apart):
-                found.append(place)
+        if place is not None and all(
+            np.hypot(*(place.motion.vector - other.motion.vector)[:2]) >= settings.overlap for other in found
+        ):
+            found.append(place)
     return found[0] if len(found) == 1 else None
 
 

@@ -1,10 +1,9 @@
 """Revisits: a drive that comes back to its road by another way is laid on the earlier pass.
 
 A lap closes where it began (`mapping.registration`). The second round of a skidpad does not, nor does a lane
-that leads into a circuit: the vehicle comes to a later place of its road, and not by way of the start. There
-the cones of the last metres are laid on those that were seen in the earlier pass (`front_end.scan_matching`).
-The pose that follows is a factor between two poses (`mapping.revisit`). The open map is optimized with it as
-with a closed loop, but goes on to grow.
+that leads into a circuit. There the cones of the last metres are laid on those seen in the earlier pass
+(`front_end.scan_matching`), which gives a factor between two poses (`mapping.revisit`). The open map is
+optimized with it as with a closed loop, but goes on to grow.
 """
 
 from typing import Final
@@ -99,10 +98,9 @@ class Revisits:
 
 
 def earlier_pass(poses: Array) -> int | None:
-    """Return the cycle of an earlier pass of the newest of the poses (P, 3), to which another way has led.
+    """Return the nearest cycle of the first earlier pass of the newest pose (P, 3), if another way led there.
 
-    It is the first such pass, and in it the nearest cycle. The ways are those to both passes, as seen from
-    there. Where they never part, the drive has come by way of its start, as a lap does.
+    Where the ways to both passes never part, the drive has come by way of its start, as a lap does.
     """
     stations, newest = path_lengths(poses), poses[-1]
     near = np.hypot(*(poses[:, :2] - newest[:2]).T) < RADIUS

@@ -53,10 +53,8 @@ class TrackLoop:
         self.settings = smoother.map.settings
         self.closed = False  # whether the loop has closed: the map has its final size
         self.health = Health()  # how far the newest estimate can be trusted
-        self.corrected_poses: Array = np.zeros((0, 3))
-        """(k, 3) Poses of the first k cycles as the closing of the loop has corrected them."""
-        self.lap_seconds = float("nan")
-        """Wall time (s) of the batch of the lap in its own process, once it has replaced the prior."""
+        self.corrected_poses: Array = np.zeros((0, 3))  # (k, 3) of the first k cycles, since closing
+        self.lap_seconds = float("nan")  # wall time (s) of the lap's batch, once it has replaced the prior
         self.late_cycles = 0  # cycles by which the slowest batch is late in a vehicle, by its wall time
         self.record = DriveRecord(self.settings, noise)
         self.revisits = Revisits(smoother, path, self.record)
@@ -93,10 +91,7 @@ class TrackLoop:
 
     @property
     def batch_ends(self) -> tuple[int, ...]:
-        """Return the cycles in which batches ended: their result was taken, or they were given up.
-
-        A late one that is under way is going to be given up.
-        """
+        """Return the cycles in which results of batches were taken, or they were or will be given up."""
         batch, ends = self._lap_batch, tuple(self._batch_ends)
         if batch is None or self._smoother.next_cycle <= batch.due <= batch.last:
             return ends
@@ -116,10 +111,7 @@ class TrackLoop:
     # --- what a cycle tells ------------------------------------------------------------------------------
 
     def judge(self, tested: Gating | None, new: slice, reading: Reading) -> None:
-        """Judge the estimate by the detections that were tested, or remember those of a lost vehicle.
-
-        The detections of the cycle are the rows `new` of the table.
-        """
+        """Judge the estimate by the tested detections, or remember the `new` rows of a lost vehicle."""
         smoother, detections = self._smoother, reading.detections
         if self._search is not None:
             corrected = smoother.map.detections.corrected(new, smoother.variables.sensor).copy()
@@ -134,13 +126,14 @@ class TrackLoop:
             self.health = Health(DEGRADED, "the two boundaries of the map cross")
         if self._known_loop.is_whole and self.record.unsolvable is None:
             self.mending.contradictions.observe(smoother.map, self._known_loop, new, detections.t)
-        self._begin_search()
+        if self.health.condition == LOST and self._known_loop.is_whole and self._lap_batch is None:
+            smoother.map.detections.release_all()  # the map stays as it was before
+            self._search, self._lost = Search(smoother), self.health
+            self.mending.contradictions.clear()
+            self.record.give_up("the vehicle was lost")
 
     def doubt_calibrations(self, reading: Reading) -> str:
-        """Widen the priors of calibrations that the drive contradicts, while the loop is open.
-
-        Return a notice in the first cycle in which it does.
-        """
+        """Widen the priors of calibrations that the drive contradicts, unless closed; return a notice."""
         if self.closed:
             return ""
         before = self._believed
@@ -163,7 +156,7 @@ class TrackLoop:
         return self._path.length < self._resumes
 
     def go_on(self, closes: bool, spent: float) -> tuple[Array | None, str]:
-        """Record the open lap, have it solved when it closes, and go on from the result when it is due.
+        """Record the lap, have it solved when it closes, and go on from the result when it is due.
 
         The cycle has taken the time `spent` (s) so far. Return the jump (3,) of the newest pose if the map
         was replaced, and a notice.
@@ -211,9 +204,9 @@ class TrackLoop:
             self.record.resume()
 
     def _end(self, batch: LapBatch, spent: float) -> tuple[Array | None, str]:
-        """Take the result of a batch that is due, wait for the next cycle, or give the batch up.
+        """Take the result of a batch that is due, leave it to the next cycle, or give it up.
 
-        The cycle as a whole lasts no longer than its period for that, the time since the one before it.
+        The wait ends with the cycle's period, the time since the one before it.
         """
         cycle, times = self._smoother.next_cycle - 1, self._smoother.times
         period = float(np.ptp(times[-2:]))
@@ -258,10 +251,7 @@ class TrackLoop:
         return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE, driven)
 
     def _hold_gauge(self) -> None:
-        """Hold the position and heading of the closed map as a whole, once enough laps were driven on it.
-
-        They are not held where the user has given factors, since these may tell them.
-        """
+        """Hold the gauge of the closed map after enough laps, unless factors of the user's may tell it."""
         smoother, boundaries = self._smoother, self._smoother.map.state.boundaries
         if not self.closed or self._search is not None or smoother.user_factors.given:
             return
@@ -276,10 +266,7 @@ class TrackLoop:
         self._smoother.settle()
 
     def _solve_lap(self) -> str:
-        """Send the lap to be solved as a batch in the cycle in which the loop has closed.
-
-        Return a notice that says why it cannot be solved, or an empty one.
-        """
+        """Send the lap that has just closed to its batch; return a notice if it cannot be solved."""
         smoother, record = self._smoother, self.record
         closed = record.closed_map(smoother)
         self.corrected_poses = closed.poses
@@ -295,8 +282,7 @@ class TrackLoop:
     def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
         """Send the lap to its batch, which begins at a map that has just been closed, or at odometry.
 
-        Where a drive is replayed, the batch ends in the cycle that was recorded. One that is under way is
-        given up, since its process would not begin this one.
+        In a replay the batch ends in the recorded cycle. One under way is given up: there is one process.
         """
         if self._lap_batch is not None:
             self._lap_batch.give_up()
@@ -311,10 +297,7 @@ class TrackLoop:
         self._lap_batch = LapBatch(lap, smoother.times[-1], due, last)
 
     def _try_loop(self) -> None:
-        """Send the lap to a batch from odometry where the drive says that it is over.
-
-        That happens where the registration keeps refusing to close the loop.
-        """
+        """Send the lap to a batch from odometry where it is over, but the registration closes no loop."""
         boundaries, length = self._smoother.map.state.boundaries, self._path.length
         if length < self._loop_tried or set(boundaries) != set(BOUNDARIES):
             return
@@ -332,22 +315,10 @@ class TrackLoop:
 
     # --- a vehicle that is lost --------------------------------------------------------------------------
 
-    def _begin_search(self) -> None:
-        """Take all detections of the window out of use, if the vehicle is lost on a map that is complete.
-
-        So the map stays as it was before. Nothing is done before the batch of the lap has replaced it.
-        """
-        ready = self._known_loop.is_whole and self._lap_batch is None
-        if self.health.condition == LOST and ready:
-            self._smoother.map.detections.release_all()
-            self._search, self._lost = Search(self._smoother), self.health
-            self.mending.contradictions.clear()
-            self.record.give_up("the vehicle was lost")
-
     def find_back(self, *, sees_road: bool) -> tuple[Array | None, str]:
         """Start the window anew where a lost vehicle is found; return its jump (3,) and a notice.
 
-        Where no place of the map agrees, but it `sees_road`, it has left the map, and is not lost.
+        Where no place of the map agrees, but it `sees_road`, it has left the map.
         """
         if self._search is None or self._rests:
             return None, ""

@@ -29,10 +29,8 @@ _LEAST_VARIANCE: Final = 1e-12
 class Transformed:
     """The moments of a function of a Gaussian, by the cubature rule."""
 
-    mean: Array
-    """(q,) Mean of the function."""
-    covariance: Array
-    """(q, q) Covariance of the function."""
+    mean: Array  # (q,) mean of the function
+    covariance: Array  # (q, q) covariance of the function
     slope: Array
     """(q, d) Statistical linearization `C_yx C_xx^-1`. The covariance of the function with a
     variable z that it does not depend on is `slope @ C_xz`, which is exact for Gaussians."""
@@ -73,39 +71,31 @@ def transform(function: Callable[[Array], Array], mean: Array, covariance: Array
 
 
 _ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
-HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE
-"""Number of entries of the state before its points."""
-SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)
-"""Entries of the sensor's calibration in the state."""
+HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE  # number of entries of the state before its points
+SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)  # entries of the sensor's calibration
 
 
 class Belief:
     """Gaussian over `x = [pose | calibration of odometry and sensor | points]`.
 
-    The pose (x, y, theta) and the points (x, y) are in the map frame, in m and rad. The calibration of the
-    odometry is the scale error of the speeds and the bias of the yaw rate (rad/s), that of the sensor is
-    `factors.sensor:SENSOR`.
-
-    A model depends on few entries of x, so only those get cubature points. All others follow by the joint
-    covariance, which is what the full rule would give for them, without its cubic cost.
+    Pose (x, y, theta) and points (x, y) are in the map frame, in m and rad. The calibration is the scale
+    error of the speeds, the bias of the yaw rate (rad/s), and `factors.sensor:SENSOR`. Only the entries of x
+    that a model depends on get cubature points. The others follow by the joint covariance, as by the full
+    rule but without its cubic cost.
     """
 
     def __init__(self, pose: Array, covariance: Array, calibration_sigma: Array | None = None) -> None:
         sigma, known = np.zeros(HEAD - POSE), () if calibration_sigma is None else calibration_sigma
         sigma[: len(known)] = known
-        self.mean: Array = np.concatenate([pose, np.zeros(HEAD - POSE)])
-        """(n,) Mean of x."""
-        self.covariance: Array = block_diag(covariance, np.diag(sigma**2))
-        """(n, n) Covariance of x."""
-        self.twist: Array = np.zeros(POSE)
-        """(3,) Twist of the vehicle, in m/s, m/s and rad/s."""
+        self.mean: Array = np.concatenate([pose, np.zeros(HEAD - POSE)])  # (n,) mean of x
+        self.covariance: Array = block_diag(covariance, np.diag(sigma**2))  # (n, n) covariance of x
+        self.twist: Array = np.zeros(POSE)  # (3,) twist of the vehicle, in m/s, m/s and rad/s
 
     @classmethod
     def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Self:
         """Return the belief at the first odometry stamp, with an empty map.
 
-        The priors of the sensor are the wide ones: a filter that has explained its errors by something else
-        cannot take that back, as a window can.
+        The priors of the sensor are wide: unlike a window, a filter cannot explain past errors anew.
         """
         calibration = np.array([settings.sigma_scale, settings.sigma_bias, *sensor.widened().sigmas])
         belief = cls(np.zeros(POSE), np.diag(np.square(settings.sigmas_start)), calibration)
@@ -171,10 +161,7 @@ class Belief:
     def update(
         self, columns: IntArray, function: Callable[[Array], Array], measured: Array, noise: Array
     ) -> None:
-        """Make one Kalman update: `measured` (q,) is `function(x[columns])` plus noise of covariance (q, q).
-
-        The function maps points (k, d) to (k, q), row by row.
-        """
+        """Update by `measured` (q,): `function(x[columns])`, row by row, plus noise of covariance (q, q)."""
         predicted = transform(function, self.mean[columns], self.covariance[np.ix_(columns, columns)])
         root = square_root(predicted.covariance + noise)
         cross = predicted.slope @ self.covariance[columns]
@@ -184,10 +171,7 @@ class Belief:
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
 
     def predict_detections(self, points: IntArray) -> Transformed:
-        """Predict the corrected detections of points (k,): mean (2 k,) and covariance (2 k, 2 k).
-
-        They are in the vehicle frame. An error of the sensor's calibration moves them, too.
-        """
+        """Predict the corrected detections of points (k,), vehicle frame, in order x0, y0, x1, and so on."""
         columns = self.measuring_columns(point_columns(points))
         covariance = self.covariance[np.ix_(columns, columns)]
         return transform(self.measuring(points), self.mean[columns], covariance)
@@ -222,8 +206,7 @@ class Belief:
     def transform_points(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
         """Replace the points [start, stop) by `matrix` (k, stop - start) times them, for both coordinates.
 
-        Independent noise with standard deviations sigma (k,) in m is added to them. The change is linear, so
-        this is what the cubature rule gives.
+        Independent noise of sigma (k,) in m is added. The change is linear, and exact by the cubature rule.
         """
         low, high = HEAD + POINT * start, HEAD + POINT * stop
         full = np.kron(matrix, np.eye(POINT))

@@ -1,27 +1,20 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import Spans
-from pathspace_graph.factors.footpoint import (
-    SEARCH_ITERATIONS,
-    TOLERANCES,
-    FootPoints,
-    refine_joint_foot_points,
-)
+from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, TOLERANCES, refine_joint_foot_points
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.residuals import ProjectionRows, detection_rows, pair_residuals, project
+from pathspace_graph.factors.residuals import detection_rows, pair_residuals
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.factors.sensor import SensorRows, corrected
+from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.graph.rows import Parts, Rows, among, stacked_rows
-from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys, pose_keys
+from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import Gauge
 
 from .detections import DetectionTable
 from .state import State, factor_numbers
@@ -32,19 +25,13 @@ class CurveMap:
 
     def __init__(self, settings: MapperSettings, state: State | None = None) -> None:
         self.settings = settings
-        self.state = state or State()
-        """Curves and all variables."""
+        self.state = state or State()  # curves and all variables
         self.variables = self.state.variables
-        self.detections = DetectionTable()
-        """Detections of the poses in the window."""
-        self.held_by_prior = False
-        """Whether the prior holds the spacing and shape of the curves, so that the window does not."""
-        self.scatter: dict[int, Array] = {}
-        """(m,) Standard deviation of cones about a boundary's curve at each control point (m), if known."""
-        self.cones: dict[int, Array] = {}
-        """(k,) Parameters of the cones of a closed boundary (m), where they are known."""
-        self.reached_inactive = False
-        """Whether a foot point of the latest `rows` has slid to an inactive part of a curve."""
+        self.detections = DetectionTable()  # detections of the poses in the window
+        self.held_by_prior = False  # whether the prior holds the curves' spacing and shape
+        self.scatter: dict[int, Array] = {}  # (m,) sigma of cones at each control point, if known (m)
+        self.cones: dict[int, Array] = {}  # (k,) parameters of the cones of a closed boundary (m), if known
+        self.reached_inactive = False  # whether the latest `rows` reach inactive control points
         self._refined: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
     # --- detections --------------------------------------------------------------------------------------
@@ -57,7 +44,7 @@ class CurveMap:
         """Return `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections in use of ascending cycles.
 
         The keys are [pose | control points of the span]; w is the root of the Huber weight, and zero if the
-        foot point is not interior. The refined parameters u are stored in the table only by `linearized`.
+        foot point is not interior. `linearized` stores the refined parameters u.
         """
         state, detections = self.state, self.detections
         if not state.boundaries or len(cycles) == 0:
@@ -77,27 +64,6 @@ class CurveMap:
         )
         self._refined = rows, u
         return [Rows(*parts)]
-
-    def measuring_keys(self, cycles: IntArray) -> IntArray:
-        """Return the keys (m, k) that the detections of cycles (m,) depend on beside the curves.
-
-        These are the pose, and the calibration of the sensor where it is estimated.
-        """
-        poses = pose_keys(cycles)[:, None]
-        if not len(self.variables.sensor):
-            return poses
-        return np.concatenate([poses, np.full_like(poses, SENSOR_KEY)], axis=1)
-
-    def project(self, rows: IntArray, points: Array, foot: FootPoints) -> tuple[ProjectionRows, SensorRows]:
-        """Return the distances of detections (m,) at points (m, 2) from their foot points, not whitened.
-
-        The second result says how they depend on the sensor's calibration.
-        """
-        detections, variables = self.detections, self.variables
-        poses, sigma_model = variables.poses_at(detections.cycle[rows]), self.settings.spline.sigma_model
-        projected = project(points, detections.covariance[rows], poses, foot, sigma_model)
-        residual, normals = projected.residual, foot.normal_unit
-        return projected, detections.sensor_rows(rows, normals, residual, poses, variables.sensor)
 
     def correct(self) -> None:
         """Do nothing: detections are corrected when their points are asked for."""
@@ -127,9 +93,9 @@ class CurveMap:
         self.state.drop_oldest_pose_u()
 
     def replaced_by(self, scatter: dict[int, Array], cones: dict[int, Array]) -> None:
-        """Note that curves of a batch have taken the place of the ones before, with the prior that has them.
+        """Note that curves and prior are those of a batch.
 
-        Cones scatter about them by sigmas (m,), and were detected at parameters (k,), by label.
+        By label, cones scatter about the curves by sigmas (m,), and were detected at parameters (k,).
         """
         self.held_by_prior, self.scatter, self.cones = True, scatter, cones
 
@@ -141,10 +107,7 @@ class CurveMap:
         return self.state.curves if self.state.boundaries else None
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """Return the spacing `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`.
-
-        The rows hold the active control points, or all of them if `whole`.
-        """
+        """Return `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`, on all points if `whole`."""
         if not self.state.boundaries or self.held_by_prior:
             return []
         pairs, nominal, keys, owner = (self.state.whole_curves if whole else self.state.curves).pairs
@@ -154,25 +117,21 @@ class CurveMap:
         return [Rows(keys, jacobian, off / sigma, owner)]
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Return the linear priors: smoothness `D c / (sigma_smoothness spacing)`, and anchors.
+        """Return smoothness `D c / (sigma_smoothness spacing)` and anchors, on all points if `whole`.
 
-        An anchor holds each control point where it is, so weakly that it only keeps the system regular. The
-        rows hold the active control points, or all of them if `whole`.
+        An anchor holds each control point where it is, so weakly that it only keeps the system regular.
         """
         smooth, anchors = [], []
-        for label, gauge in self._gauges(whole):
-            points, held = self.state.control_points(label), np.eye(2) / self.settings.gauge.sigma_anchor
-            bent = (gauge.bending[:, :, None] * points[gauge.triples]).sum(axis=1)
+        for label, boundary in self.state.boundaries.items():
+            gauge = boundary.gauge_on(boundary.everything if whole else self.state.active(label))
             if not self.held_by_prior:
+                points = self.state.control_points(label)[gauge.triples]
+                bent = (gauge.bending[:, :, None] * points).sum(axis=1)
                 smooth.append(self._rows(label, gauge.triples, _by_axis(gauge.bending), bent.ravel()))
             active = gauge.points[:, None]
-            held = np.tile(held, (len(active), 1))
+            held = np.tile(np.eye(2) / self.settings.gauge.sigma_anchor, (len(active), 1))
             anchors.append(self._rows(label, active, held, np.zeros(len(held))))
         return [stacked_rows(groups) for groups in (smooth, anchors) if groups]
-
-    def _gauges(self, whole: bool) -> Iterator[tuple[int, Gauge]]:
-        for label, boundary in self.state.boundaries.items():
-            yield label, boundary.gauge_on(boundary.everything if whole else self.state.active(label))
 
     def _rows(self, label: int, points: IntArray, jacobian: Array, residual: Array) -> Rows:
         """Return rows, equally many for each row of `points` (m, k); neighbouring points share an owner."""
@@ -194,11 +153,11 @@ def _curve_rows(
     names: tuple[int, int],
     tolerances: tuple[float, ...],
 ) -> tuple[IntArray, Array, bool, Parts]:
-    """Return the parts of `CurveMap.rows`, after the detections by row and their refined parameters (m,).
+    """Return detections by row, their refined parameters (m,), and the parts of `CurveMap.rows`.
 
-    The third result is whether one has slid to where a curve is inactive. Curves have control points (n, 2),
-    labels (k,), keys (n,), and parameters (k,) up to which and from which on they may be used. The table has
-    the columns of `DetectionTable.associated`.
+    The third result says whether one has slid to where a curve is inactive. Curves have control points
+    (n, 2), labels (k,), keys (n,), and parameters (k,) up to which and from which on they may be used. The
+    table has the columns of `DetectionTable.associated`.
     """
     control_points, labels, control_keys, trusted, active_from = curves
     room, iterations, _, sigma_model, huber = limits

@@ -10,7 +10,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import rotated, to_map
-from pathspace_graph.factors.sensor import SensorRows, corrected, sensor_rows
+from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
@@ -20,8 +20,7 @@ from pathspace_graph.labels import UNKNOWN
 class DetectionColumns:
     """What the sensor measured: columns of equal length, the oldest detection first.
 
-    A subclass adds the columns of its associations; only the table's own methods write to any column. Points
-    are corrected by the calibration of the sensor when they are asked for.
+    A subclass adds columns of its associations. Points are corrected by the sensor's calibration on demand.
     """
 
     cycle: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
@@ -32,21 +31,19 @@ class DetectionColumns:
     """(m, 3) Twists of the vehicle then, in m/s, m/s and rad/s."""
     covariance: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
     """(m, 2, 2) Covariances of the positions in m^2, vehicle frame."""
-    label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Colour by the sensor: LEFT, RIGHT or UNKNOWN."""
+    label: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # colour: LEFT, RIGHT or UNKNOWN
     changed: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
     """Whether the association has changed since the detection's cycle was last linearized."""
-    sensor: Array = field(default_factory=lambda: np.zeros(0))
-    """(5,) or (0,) Calibration of the sensor by which `point` is corrected; it is no column."""
+    sensor: Array = field(default_factory=lambda: np.zeros(0))  # by which `point` is corrected; no column
 
     def __len__(self) -> int:
         return len(self.cycle)
 
     @classmethod
     def of(cls, cycles: Sequence[Detections], first: int = 0, twists: Array | None = None) -> Self:
-        """Build the table of consecutive perception cycles, numbered from `first`; nothing is in use.
+        """Build the table of consecutive cycles, numbered from `first`, with no detection in use.
 
-        The vehicle moved with twists (k, 3) at the cycles, in m/s, m/s and rad/s; by default it stood still.
+        The vehicle has twists (k, 3) at the cycles (m/s, m/s, rad/s), by default zero.
         """
         counts = [len(one.labels) for one in cycles]
         moving = np.zeros((len(cycles), 3)) if twists is None else twists
@@ -71,9 +68,9 @@ class DetectionColumns:
         """Fill the subclass's columns as they are before any association."""
 
     def append(self, detections: Detections, cycle: int, twist: Array | None = None) -> slice:
-        """Add detections behind those of their cycle and before later ones, not in use; return their rows.
+        """Add unused detections at the end of their cycle's; return their rows.
 
-        The vehicle moved with this twist (3,), in m/s, m/s and rad/s; by default it stood still.
+        The twist (3,) of the vehicle (m/s, m/s, rad/s) is zero by default.
         """
         start, count = int(self.cycle.searchsorted(cycle, side="right")), len(detections.labels)
         twists = np.zeros((count, 3))
@@ -117,15 +114,6 @@ class DetectionColumns:
         """Return the covariances (m, 2, 2) in m^2 in the map frame, by the poses of their cycles."""
         return rotated(self.covariance[rows], variables.poses_at(self.cycle[rows])[:, 2])
 
-    def sensor_rows(
-        self, rows: IntArray, directions: Array, residual: Array, poses: Array, sensor: Array
-    ) -> SensorRows:
-        """Return `factors.sensor:sensor_rows` of residuals (m,) along unit vectors (m, 2), map frame.
-
-        The detections were made from poses (m, 3), and the sensor's calibration (5,) may be empty.
-        """
-        return sensor_rows(directions, residual, poses, self.measured[rows], self.twist[rows], sensor)
-
     def keep_from(self, cycle: int) -> None:
         """Remove the detections of all cycles before `cycle`."""
         first = int(self.cycle.searchsorted(cycle))
@@ -147,12 +135,9 @@ class DetectionColumns:
 class DetectionTable(DetectionColumns):
     """Detections with the boundary curve that each of them is associated with."""
 
-    boundary: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Label of that boundary; UNKNOWN until it is decided."""
-    u: Array = field(default_factory=lambda: np.zeros(0))
-    """Parameter of the foot point of each detection in use (m)."""
-    used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
-    """Whether the detection is a row of the factor graph."""
+    boundary: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # its label, or UNKNOWN
+    u: Array = field(default_factory=lambda: np.zeros(0))  # parameter of the foot point (m)
+    used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))  # whether a row of the graph
 
     def _clear_associations(self) -> None:
         self.boundary, self.u, self.used = self.label.copy(), np.zeros(len(self)), np.zeros(len(self), bool)
@@ -176,15 +161,8 @@ class DetectionTable(DetectionColumns):
     @property
     def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array]:
         """Return the columns that say what is in use, where, and as what it was measured."""
-        return (
-            self.cycle,
-            self.boundary,
-            self.used,
-            self.u,
-            self.measured,
-            self.twist,
-            self.covariance,
-        )
+        decided = self.cycle, self.boundary, self.used, self.u
+        return *decided, self.measured, self.twist, self.covariance
 
     def used_on(self, label: int) -> IntArray:
         """Return the rows in use on the boundary `label`."""
@@ -195,10 +173,10 @@ class DetectionTable(DetectionColumns):
         return np.flatnonzero(~self.used & (self.label == label))
 
     def open_to(self, labels: IntArray, since: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the rows (m,) that each of some boundaries (k,) is tested for, from its `since` (k,) on.
+        """Return the rows (m,) to test for boundaries (k,) from `since` (k,) on, and the boundary of each.
 
         These are the rows out of use, and those of unknown colour that the other boundary uses: if both
-        boundaries accept one, it is ambiguous. The second result (m,) is the index of the boundary.
+        boundaries accept one, it is ambiguous.
         """
         return _open_rows(labels, since, self.label, self.boundary, self.used, UNKNOWN)
 

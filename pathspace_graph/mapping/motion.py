@@ -19,8 +19,7 @@ from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
 from .path import DrivenPath
 
-DOUBT_CYCLES: Final = 10
-"""Cycles from one judgement of all calibrations to the next."""
+DOUBT_CYCLES: Final = 10  # cycles from one judgement of all calibrations to the next
 KEYFRAME_INTERVAL: Final = 12.0
 """Distance of the keyframes in whose frames the drive is kept until the loop closes (m along the path)."""
 
@@ -29,30 +28,21 @@ KEYFRAME_INTERVAL: Final = 12.0
 class BiasMeasurement:
     """A measured bias of the yaw rate: what a vehicle at rest measures."""
 
-    value: float
-    """Mean yaw rate (rad/s)."""
-    sigma: float
-    """Its standard deviation (rad/s)."""
+    value: float  # mean yaw rate (rad/s)
+    sigma: float  # its standard deviation (rad/s)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMotion:
     """The motion that leads to a cycle, and what was found out about the odometry."""
 
-    odometry: IntegratedOdometry
-    """Relative pose, with its covariance."""
-    twists: Array
-    """(k, 3) Twists since the last cycle, in m/s, m/s and rad/s."""
-    doubted: bool = False
-    """Whether the detections contradict the odometry, and their own motion replaces it."""
-    missing: bool = False
-    """Whether no twist was measured for long."""
-    stuck: bool = False
-    """Whether the twist stays the same to the last digit."""
-    bias: BiasMeasurement | None = None
-    """What the vehicle has measured at rest, where it has just done so."""
-    durations: Array | None = None
-    """(k,) Times for which the twists hold, s; None where the motion is not that of the odometry."""
+    odometry: IntegratedOdometry  # relative pose, with its covariance
+    twists: Array  # (k, 3) twists since the last cycle, in m/s, m/s and rad/s
+    doubted: bool = False  # whether the detections contradict the odometry, and their own motion replaces it
+    missing: bool = False  # whether no twist was measured for long
+    stuck: bool = False  # whether the twist stays the same to the last digit
+    bias: BiasMeasurement | None = None  # what the vehicle has measured at rest, where it has just done so
+    durations: Array | None = None  # (k,) times for which the twists hold (s); None if not the odometry's
     excess: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) or (k, 3) Standard deviation of a twist that is held for long, beside that of its noise."""
 
@@ -79,23 +69,18 @@ class MeasuredMotion:
 
 
 def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
-    """Return what is known of the noise before a drive.
+    """Return what is known of the noise before a drive, by default that of the simulator, not stated.
 
-    An array (3,) states the standard deviations of a twist (m/s, m/s, rad/s). Without any, those of the
-    simulator are assumed until others are measured. Anything but three positive numbers is a SettingsError.
+    An array (3,) states the standard deviations of a twist (m/s, m/s, rad/s). SettingsError is raised for
+    anything but three positive numbers.
     """
-    if isinstance(sigma, KnownNoise):
-        return replace(sigma, odometry=_checked(sigma.odometry))
-    if sigma is None:
-        return KnownNoise(np.array(ODOMETRY_SIGMA), odometry_stated=False)
-    return KnownNoise(_checked(sigma))
-
-
-def _checked(sigma: Array) -> Array:
-    noise = np.array(sigma, float)
+    if not isinstance(sigma, KnownNoise):
+        stated = sigma is not None
+        sigma = KnownNoise(np.array(sigma if stated else ODOMETRY_SIGMA), odometry_stated=stated)
+    noise = np.array(sigma.odometry, float)
     if noise.shape != (POSE,) or not ((noise > 0.0) & (noise < np.inf)).all():
         raise SettingsError(f"odometry_sigma: expected {POSE} positive numbers, found {noise.tolist()}")
-    return noise
+    return replace(sigma, odometry=noise)
 
 
 def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
@@ -124,9 +109,8 @@ def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSet
     """Return the settings, with wide priors of the calibrations if the drive contradicts one of them.
 
     mean m and variance v, (2,) or (7,), are those of the calibrations. If a prior with mean p and standard
-    deviation sigma is right, then m - p had the variance `sigma^2 - v` before the drive. The priors that are
-    contradicted most become wide, those of the odometry or those of the sensor. So a prior has a heavy tail,
-    as that of a mixture of two Gaussians.
+    deviation sigma is right, then m - p had the variance `sigma^2 - v` before the drive. Those contradicted
+    most become wide, of the odometry or of the sensor: a heavy tail, as of a mixture of two Gaussians.
     """
     sigma = np.array(settings.sigmas_calibrations)
     limits = np.full(len(sigma), settings.calibration.doubt)
@@ -151,31 +135,23 @@ def doubt_calibrations(
     sensor_doubted: bool,
     measured: MapperSettings | None = None,
 ) -> MapperSettings:
-    """Widen the priors of calibrations where the drive so far contradicts them.
+    """Widen the priors of calibrations that the drive contradicts, and return the settings with the new ones.
 
-    Where the front end says that the prior of the sensor is doubted, it becomes wide at once, before other
-    variables have taken the sensor's errors over. Where it has measured the sensor's errors, the priors are
-    those of the settings `measured`.
-    It returns the settings with the priors as they are then. It is for an open loop: the prior of a closed
-    one is linearized where the calibration was then, and is surer of it than it may be.
+    Where the front end doubts the prior of the sensor, it becomes wide at once, before other variables have
+    absorbed the sensor's errors. Where it has measured these, the priors are those of the settings
+    `measured`. It is for an open loop: the prior of a closed one is linearized where the calibration was
+    then, and is overconfident.
     """
     if measured is not None:
         settings = replace(settings, odometry=measured.odometry, calibration=measured.calibration)
-        _believe(smoother, settings)
     if sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
-        _believe(smoother, settings)
-    if smoother.last_step is None or smoother.next_cycle % DOUBT_CYCLES:
-        return settings
-    variables = smoother.variables
-    variance = np.diag(smoother.last_covariance(variables.calibration_keys))
-    found = doubted(variables.calibrations, variance, settings)
-    _believe(smoother, found)
-    return found
-
-
-def _believe(smoother: FixedLagSmoother[MapRows], settings: MapperSettings) -> None:
+    if smoother.last_step is not None and smoother.next_cycle % DOUBT_CYCLES == 0:
+        variables = smoother.variables
+        variance = np.diag(smoother.last_covariance(variables.calibration_keys))
+        settings = doubted(variables.calibrations, variance, settings)
     smoother.believe_calibrations(np.array(settings.calibrations), np.array(settings.sigmas_calibrations))
+    return settings
 
 
 def vehicle_state(smoother: FixedLagSmoother[MapRows]) -> VehicleState:

@@ -10,32 +10,22 @@ from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.labels import LEFT, RIGHT
 
-STEP: Final = 0.3
-"""Least distance of neighbouring positions of the stored path (m)."""
-MEMORY: Final = 60.0
-"""Length of the stored path behind the vehicle, and of the first stretch, which closing needs (m)."""
-BEGINNING_STEP: Final = 1.0
-"""Least distance of neighbouring poses of the stored first stretch (m)."""
-MAX_CURVATURE: Final = 0.3
-"""Largest curvature of the predicted path (1/m): that of a tight hairpin."""
-CURVATURE_GAIN: Final = 0.4
-"""Share of a cycle's measured curvature in the smoothed one."""
-MIN_SPEED: Final = 1.0
-"""Speed (m/s) below which yaw rate over speed is too uncertain to be a curvature."""
-SIDES: Final = {LEFT: 1.0, RIGHT: -1.0}
-"""Sign of the signed distance from the path (left positive) at which each boundary lies."""
+STEP: Final = 0.3  # least distance of neighbouring positions of the stored path (m)
+MEMORY: Final = 60.0  # length of the stored path behind the vehicle, and of the stored first stretch (m)
+BEGINNING_STEP: Final = 1.0  # least distance of neighbouring poses of the stored first stretch (m)
+MAX_CURVATURE: Final = 0.3  # largest curvature of the predicted path (1/m): that of a tight hairpin
+CURVATURE_GAIN: Final = 0.4  # share of a cycle's measured curvature in the smoothed one
+MIN_SPEED: Final = 1.0  # speed (m/s) below which yaw rate over speed is too uncertain to be a curvature
+SIDES: Final = {LEFT: 1.0, RIGHT: -1.0}  # sign of the distance from the path of each boundary
 
 
 @dataclass(frozen=True, eq=False)
 class PathAhead:
     """The driven path and an arc ahead of the vehicle as one polyline."""
 
-    points: Array
-    """(n, 2) Positions (x, y) in m, map frame."""
-    stations: Array
-    """(n,) Path length up to each position (m)."""
-    driven: float
-    """Station of the vehicle (m)."""
+    points: Array  # (n, 2) positions (x, y) in m, map frame
+    stations: Array  # (n,) path length up to each position (m)
+    driven: float  # station of the vehicle (m)
 
     def locate(self, points: Array) -> tuple[Array, Array]:
         """Return the stations (m,) and the signed distances (m,), left positive, of points (m, 2)."""
@@ -58,22 +48,18 @@ class DrivenPath:
     """A polyline that grows with the vehicle, and the curvature of its present turn."""
 
     def __init__(self) -> None:
-        self.points: Array = np.zeros((0, 2))
-        """(n, 2) Kept positions (x, y) in m, map frame, at least `STEP` apart."""
-        self.stations: Array = np.zeros(0)
-        """(n,) Path length up to each of them (m)."""
-        self.beginning: Array = np.zeros((0, 3))
-        """(k, 3) Poses (x, y, theta) on the first stretch, which is as long as the memory."""
-        self.length = 0.0
-        """Length of the driven path: the station of the vehicle (m)."""
-        self.curvature = 0.0
-        """Smoothed curvature of the present turn (1/m), left positive."""
+        self.points: Array = np.zeros((0, 2))  # (n, 2) kept positions in m, map frame, at least `STEP` apart
+        self.stations: Array = np.zeros(0)  # (n,) path length up to each of them (m)
+        self.beginning: Array = np.zeros((0, 3))  # (k, 3) poses (x, y, theta) on the first stretch
+        self.length = 0.0  # length of the driven path: the station of the vehicle (m)
+        self.curvature = 0.0  # smoothed curvature of the present turn (1/m), left positive
         self._last: Array = np.zeros(2)
 
     def update(self, pose: Array) -> None:
         """Extend the path to `pose` (3,), map frame."""
-        self._keep_beginning(pose)
-        position = pose[:2]
+        position, known = pose[:2], self.beginning[-1:, :2]
+        if self.length <= MEMORY and (np.hypot(*(position - known).T) >= BEGINNING_STEP).all():
+            self.beginning = np.concatenate([self.beginning, pose[None]])
         if len(self.points) == 0:
             self.points, self.stations = position[None].copy(), np.zeros(1)
             self._last = position.copy()
@@ -103,13 +89,6 @@ class DrivenPath:
             if ahead @ heading <= 0.0 or np.hypot(*ahead) > reach:
                 return
             self.points, self.stations = self.points[:-1], self.stations[:-1]
-
-    def _keep_beginning(self, pose: Array) -> None:
-        if self.length > MEMORY:
-            return
-        first = len(self.beginning) == 0
-        if first or np.hypot(*(pose[:2] - self.beginning[-1, :2])) >= BEGINNING_STEP:
-            self.beginning = np.concatenate([self.beginning, pose[None]])
 
     def steer(self, twists: Array) -> None:
         """Update the curvature by `w / v` of body twists (k, 3), if the vehicle is fast enough."""
@@ -167,41 +146,28 @@ def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
 
 # --- cones that come next --------------------------------------------------------------------------------
 
-LATERAL_CHANGE: Final = 1.5
-"""How much farther from the path the next cone may be than the newest ones of the curve (m)."""
-LATERAL_RATE: Final = 0.2
-"""Growth of `LATERAL_CHANGE` with the distance along the path (m/m)."""
-BESIDE: Final = 2.0
-"""Distance along the path below which cones stand beside each other (m)."""
-LATERAL_GAP: Final = 0.8
-"""Distance beyond which a cone is behind the row if one beside it is nearer to the path by more (m)."""
-STATION_MARGIN: Final = 0.3
-"""Least distance past the end of a curve of what extends it (m along the path)."""
+LATERAL_CHANGE: Final = 1.5  # how much farther from the path the next cone may be than the newest ones (m)
+LATERAL_RATE: Final = 0.2  # growth of `LATERAL_CHANGE` with the distance along the path (m/m)
+BESIDE: Final = 2.0  # distance along the path below which cones stand beside each other (m)
+LATERAL_GAP: Final = 0.8  # how much nearer to the path a cone beside another one hides it (m)
+STATION_MARGIN: Final = 0.3  # least distance past the end of a curve of what extends it (m along the path)
 END_BEHIND: Final = 5.0
-"""Farthest that the end of a curve is behind the vehicle (m along the path): a stranded end is carried on,
-and an older stretch of the path across the infield may be nearer to it, which means nothing."""
-STRANDED: Final = 2.0
-"""Distance behind the vehicle beyond which an end that nothing extends is carried on (m)."""
-CARRIED_TO: Final = 1.0
-"""Distance behind the vehicle to which a stranded end is carried on (m)."""
-MIN_LATERAL: Final = 0.5
-"""Least distance from the path of an end that is carried on (m)."""
-MIN_CARRY: Final = 0.5
-"""Least length by which an end is carried on (m)."""
+"""Farthest that the end of a curve is behind the vehicle (m along the path), since a stranded end is carried
+on. An older stretch of the path across the infield may be nearer to it."""
+STRANDED: Final = 2.0  # distance behind the vehicle beyond which an end without candidates is carried on (m)
+CARRIED_TO: Final = 1.0  # distance behind the vehicle to which a stranded end is carried on (m)
+MIN_LATERAL: Final = 0.5  # least distance from the path of an end that is carried on (m)
+MIN_CARRY: Final = 0.5  # least length by which an end is carried on (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
     """Points that a boundary may be extended through."""
 
-    points: Array
-    """(n, 2) Positions (x, y) in m, map frame."""
-    indices: IntArray
-    """(n,) Index of each among the tentative tracks, or among a cycle's detections."""
-    stations: Array
-    """(n,) Station of each along the path (m)."""
-    sides: Array
-    """(n,) Distance of each from the path (m), positive on the boundary's own side."""
+    points: Array  # (n, 2) positions (x, y) in m, map frame
+    indices: IntArray  # (n,) index of each among the tentative tracks, or among a cycle's detections
+    stations: Array  # (n,) station of each along the path (m)
+    sides: Array  # (n,) distance of each from the path (m), positive on the boundary's own side
 
     def where(self, chosen: IntArray | BoolArray) -> Self:
         """Return the chosen candidates, in the given order if they are chosen by index."""
@@ -214,22 +180,18 @@ class Candidates:
 class End:
     """End of the confirmed part of a curve."""
 
-    position: Array
-    """(2,) Position (x, y) in m, map frame."""
-    station: float
-    """Station along the path (m)."""
-    side: float
-    """Distance from the path (m), positive on the boundary's own side."""
+    position: Array  # (2,) position (x, y) in m, map frame
+    station: float  # station along the path (m)
+    side: float  # distance from the path (m), positive on the boundary's own side
 
 
 def chain(candidates: Candidates, end: End | None) -> IntArray:
     """Return the indices of the candidates, sorted by station, that may follow one another.
 
     A candidate i may follow the end of the curve if `side_i <= side_end + LATERAL_CHANGE + LATERAL_RATE
-    (s_i - s_end)`; without a curve the first candidate takes the place of the end. No candidate allows the
-    next one more than that, or a row would be left for the next lane's, step by step. Of candidates at about
-    the same station only those nearest to the path remain: a second row behind the first belongs to another
-    stretch of the track.
+    (s_i - s_end)`; without a curve the first candidate takes the place of the end. All are held against the
+    end, or a row would drift to the next lane's, step by step. Of candidates at about the same station only
+    those nearest to the path remain: a second row is of another stretch of the track.
     """
     stations, sides = candidates.stations, candidates.sides
     in_front = np.flatnonzero(in_front_row(stations, sides, BESIDE, LATERAL_GAP))
@@ -244,8 +206,7 @@ def chain(candidates: Candidates, end: End | None) -> IntArray:
 def in_front_row(stations: Array, sides: Array, beside: float, gap: float) -> BoolArray:
     """Return which points are in the row nearest to the path, from their stations and sides (n,), in m.
 
-    A point is behind that row if another one is less than `beside` (m) from it along the path, and nearer to
-    the path by more than `gap` (m).
+    A point is behind it if another one within `beside` (m) along the path is nearer by more than `gap` (m).
     """
     near = np.abs(stations - stations[:, None]) < beside
     return np.asarray(~(near & (sides < sides[:, None] - gap)).any(axis=1))

@@ -15,40 +15,27 @@ from .curve_map import CurveMap
 from .path import DrivenPath
 from .state import Curves, State
 
-HEADING: Final = 0.8
-"""Largest angle between the heading and that of the beginning where the loop may close (rad)."""
-START_LATERAL: Final = 5.0
-"""Largest distance from the start at which the vehicle crosses its line, without which no loop closes (m)."""
-START_HEADING: Final = 0.5
-"""Largest angle between the directions of the start and of that crossing (rad)."""
-WINDOW: Final = 2.0
-"""Age of the oldest detections that are registered (s)."""
-BEGINNING: Final = 60.0
-"""Length of the curves that counts as their beginning (m)."""
-BEGINNING_SHARE: Final = 0.6
-"""Largest share of a short curve that counts as its beginning."""
-REACH: Final = 3.0
-"""Largest distance from the curves of detections that the first iteration uses (m)."""
-SHRINK: Final = 0.7
-"""Factor on `REACH` for each further iteration, down to `closing.inlier_distance`."""
+HEADING: Final = 0.8  # largest angle between the headings now and at the beginning for closing (rad)
+START_LATERAL: Final = 5.0  # largest distance from the start at which its line is crossed to close a loop (m)
+START_HEADING: Final = 0.5  # largest angle between the directions of the start and of that crossing (rad)
+WINDOW: Final = 2.0  # age of the oldest detections that are registered (s)
+BEGINNING: Final = 60.0  # length of the curves that counts as their beginning (m)
+BEGINNING_SHARE: Final = 0.6  # largest share of a short curve that counts as its beginning
+REACH: Final = 3.0  # largest distance from the curves of detections that the first iteration uses (m)
+SHRINK: Final = 0.7  # factor on `REACH` for each further iteration, down to `closing.inlier_distance`
 ITERATIONS: Final = 7
-START_STEP: Final = 2.0
-"""Distance of the poses of the beginning from which the registration starts where the vehicle is lost (m)."""
-START_CHI2: Final = 16.3
-"""Their largest squared Mahalanobis distance under its uncertainty: 99.9 % of chi-square with 3 degrees."""
+START_STEP: Final = 2.0  # distance of the poses of the beginning where a lost vehicle is tried (m)
+START_CHI2: Final = 16.3  # their squared Mahalanobis distance at most: 99.9 % of chi-square, 3 degrees
 MIN_DETECTIONS: Final = 25
-MIN_INLIERS: Final = 5
-"""Least number of inliers on each boundary."""
+MIN_INLIERS: Final = 5  # least number of inliers on each boundary
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A rigid correction of the newest poses and their detections."""
 
-    centre: Array
-    """(2,) Centre of the rotation, the newest position, in m, map frame."""
-    vector: Array
-    """(3,) Translation (x, y) in m after the rotation by the third entry (rad)."""
+    centre: Array  # (2,) centre of the rotation, the newest position, in m, map frame
+    vector: Array  # (3,) translation (x, y) in m after the rotation by the third entry (rad)
 
     def apply(self, points: Array) -> Array:
         """Return the moved points (m, 2)."""
@@ -66,15 +53,11 @@ class Motion:
 class Sightings:
     """Coloured detections, where the vehicle believes that they are."""
 
-    rows: IntArray
-    """(m,) Rows of the detections in their table."""
+    rows: IntArray  # (m,) rows of the detections in their table
     labels: IntArray
-    points: Array
-    """(m, 2) Positions in m, map frame."""
-    covariances: Array
-    """(m, 2, 2) Covariances in m^2, map frame."""
-    explained: BoolArray
-    """(m,) Whether the newest curves explain the detection: only these can contradict a place."""
+    points: Array  # (m, 2) positions in m, map frame
+    covariances: Array  # (m, 2, 2) covariances in m^2, map frame
+    explained: BoolArray  # (m,) whether the newest curves explain it, so that it can contradict a place
 
     @classmethod
     def of_points(cls, rows: IntArray, labels: IntArray, points: Array) -> Self:
@@ -86,19 +69,13 @@ class Sightings:
 class Matches:
     """The detections whose foot points are inside a stretch of their curve, for one motion."""
 
-    rows: IntArray
-    """(m,) Rows of the detections in their table."""
+    rows: IntArray  # (m,) rows of the detections in their table
     labels: IntArray
-    u: Array
-    """(m,) Parameters of the foot points (m)."""
-    inlier: BoolArray
-    """(m,) Whether the detection is within `inlier_distance` of the curve."""
-    explained: BoolArray
-    """(m,) Whether the newest curves explain the detection."""
-    hessian: Array
-    """(3, 3) Information about the motion, from the detections within reach."""
-    negative_gradient: Array
-    """(3,) Negative gradient of the cost by the motion, from the same detections."""
+    u: Array  # (m,) parameters of the foot points (m)
+    inlier: BoolArray  # (m,) whether the detection is within `inlier_distance` of the curve
+    explained: BoolArray  # (m,) whether the newest curves explain the detection
+    hessian: Array  # (3, 3) information about the motion, from the detections within reach
+    negative_gradient: Array  # (3,) negative gradient of the cost by the motion, from the same detections
 
     def inliers(self, label: int) -> tuple[IntArray, Array]:
         """Return the rows (k,) and the parameters (k,) of one boundary's inliers."""
@@ -110,11 +87,9 @@ class Matches:
 class RefinedMotion:
     """Motion at the end of the registration."""
 
-    motion: Motion
-    """Motion of the detections onto their curves."""
+    motion: Motion  # motion of the detections onto their curves
     matches: Matches
-    covariance: Array
-    """(3, 3) Covariance of the motion (m, m, rad)."""
+    covariance: Array  # (3, 3) covariance of the motion (m, m, rad)
 
 
 def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool:
@@ -130,8 +105,7 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
 def passes_start(state: State, path: DrivenPath, motion: Motion) -> bool:
     """Return whether the newest path, moved, crosses the line at which the drive began, on its road.
 
-    A vehicle that comes back to a later place of its beginning has not closed a lap: on a skidpad it does so
-    in each round.
+    In each round of a skidpad the vehicle is on its beginning again, but has not closed a lap.
     """
     start, turn = path.beginning[0, :2], rotation(path.beginning[0, 2])
     newest = motion.apply(path.points[path.stations > path.length - BEGINNING])
@@ -154,31 +128,31 @@ def register(
 
     Iterated closest points on the curves minimize `sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The
     `covariance` P (3, 3) of the newest pose is the prior, because detections along a straight or an arc leave
-    the motion free. If P is larger than what the iteration can bridge, the iteration starts from the best
-    pose of the `beginning` (k, 3), the first stretch of the drive. `times` are the stamps of the poses (s).
+    the motion free. If P is larger than the iteration can bridge, it starts from the best pose of the
+    `beginning` (k, 3) of the drive. `times` are the stamps of the poses (s).
     """
     recent, state = _recent(track, times), track.state
     prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
     stretches, centre, vector = _beginning(state), state.poses[-1, :2].copy(), np.zeros(3)
     lost = is_lost(covariance, settings)
     if lost:
-        starts = [v for v in _motions(state.poses[-1], beginning) if v @ prior @ v < START_CHI2]
-        curves = state.whole_curves
+        along = np.hypot(*np.diff(beginning[:, :2], axis=0, prepend=beginning[:1, :2]).T).cumsum()
+        _, first = np.unique(along // START_STEP, return_index=True)
+        motions = beginning[first] - state.poses[-1]
+        motions[:, 2] = wrap_angle(motions[:, 2])
+        starts, curves = [vector, *(v for v in motions if v @ prior @ v < START_CHI2)], state.whole_curves
         inliers = [
             _match(state, curves, settings, recent, Motion(centre, v), stretches, REACH).inlier.sum()
-            for v in [vector, *starts]
+            for v in starts
         ]
-        vector = [vector, *starts][int(np.argmax(inliers))]
+        vector = starts[int(np.argmax(inliers))]
     found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
     agree = agrees(found.matches, list(state.boundaries), settings)
     return found if agree and is_certain(found.matches, found.covariance, settings, lost) else None
 
 
 def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
-    """Return whether the newest detections reach the beginning of the curves from where they are believed.
-
-    Where they do not, `register` can only agree if the vehicle is lost.
-    """
+    """Return whether `register` can agree without the vehicle being lost: detections reach the beginning."""
     recent, state = _recent(track, times), track.state
     unmoved = Motion(state.poses[-1, :2], np.zeros(3))
     found = _match(state, state.whole_curves, settings, recent, unmoved, _beginning(state), REACH)
@@ -219,15 +193,6 @@ def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
     """Return whether a pose with this covariance (3, 3) is less certain than the registration can bridge."""
     prior = np.linalg.inv(covariance * settings.prior_scale**2)
     return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < REACH**-2)
-
-
-def _motions(pose: Array, beginning: Array) -> list[Array]:
-    """Return motions (3,) from a pose (3,) to poses of the beginning (k, 3) that are `START_STEP` apart."""
-    along = np.hypot(*np.diff(beginning[:, :2], axis=0, prepend=beginning[:1, :2]).T).cumsum()
-    _, first = np.unique(along // START_STEP, return_index=True)
-    motions = beginning[first] - pose
-    motions[:, 2] = wrap_angle(motions[:, 2])
-    return list(motions)
 
 
 def _recent(track: CurveMap, times: Sequence[float]) -> Sightings:
@@ -295,8 +260,7 @@ def sigma_of_information(information: Array) -> float:
 def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:
     """Return whether nearly all of enough detections are inliers, on a long stretch of every boundary.
 
-    Detections that the newest curves do not explain are clutter, of another stretch of the road, or ahead of
-    all that was mapped yet: where they are no inliers, they say nothing.
+    Outliers count only if the newest curves explain them: others are clutter, or of road not mapped yet.
     """
     asked = matches.explained
     count, inliers = int(asked.sum()), int(matches.inlier[asked].sum())
@@ -309,9 +273,8 @@ def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bo
 def is_certain(matches: Matches, posterior: Array, settings: ClosingSettings, lost: bool = False) -> bool:
     """Return whether the motion is certain in every direction.
 
-    The limit is wider after a long stretch of the beginning has been driven again, because more detections
-    would add little. It is not wider if the vehicle is `lost`: then one place along a straight agrees as well
-    as the next.
+    The limit is wider once a long stretch of the beginning was driven again, as more detections would add
+    little, unless the vehicle is `lost`: then one place along a straight agrees as well as the next.
     """
     sigma = worst_sigma(posterior)
     driven_again = float(np.median(matches.u[matches.inlier]))

@@ -1,8 +1,7 @@
 """A revisit: the pose of the vehicle as seen from an earlier one, by the cones that were seen from both.
 
-A drive may come back to a road without having driven a lap: the rounds of a skidpad, a lane that leads into a
-circuit. No loop closes there, and both boundaries are arcs along which a pose may slide. The cones themselves
-hold it in every direction.
+Where a drive meets its road again without a lap, as on a skidpad, a pose may slide along both boundaries. The
+cones themselves hold it in every direction.
 """
 
 from dataclasses import dataclass
@@ -20,13 +19,10 @@ from pathspace_graph.graph.variables import POSE, Layout, pose_keys
 class Revisit:
     """The pose of one cycle in the frame of an earlier one's, as it was measured: `A (y(x) - y0)`."""
 
-    earlier: int
-    """Cycle in whose frame the pose is."""
+    earlier: int  # cycle in whose frame the pose is
     later: int
-    local: Array
-    """(3,) The measured pose y0 (m, m, rad)."""
-    root: Array
-    """(3, 3) A, a square root of its information."""
+    local: Array  # (3,) the measured pose y0 (m, m, rad)
+    root: Array  # (3, 3) A, a square root of its information
 
     def factor(self) -> RelativeFactor:
         """Return the measurement as a factor of the engine."""

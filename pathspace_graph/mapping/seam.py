@@ -14,30 +14,21 @@ from pathspace_graph.spline.knots import curvature_weighted_breaks, refit, thin
 
 from .registration import BEGINNING
 
-EXTRAPOLATED: Final = 2
-"""Knot intervals past the confirmed end whose parameters are mapped to the closed curve."""
-JOIN_MARGIN: Final = 10.0
-"""Length before the end of a curve, beside `BEGINNING`, within which the seam lies (m)."""
-JOIN_SHARE: Final = 0.5
-"""Share of a short curve past which the seam lies."""
-OVERLAP_STEP: Final = 1.0
-"""Step at which points of the overlap are placed on the beginning (m)."""
-OVERLAP_ROOM: Final = 4.0
-"""Room about its expected place in which a point of the overlap is searched for (m along the curve)."""
-SEAM_MARGIN: Final = 0.5
-"""Distance from the seam below which a cone was also detected at the beginning, and counts once (m)."""
+EXTRAPOLATED: Final = 2  # knot intervals past the confirmed end that are mapped to the closed curve
+JOIN_MARGIN: Final = 10.0  # length before the end of a curve, and `BEGINNING`, in which the seam lies (m)
+JOIN_SHARE: Final = 0.5  # share of a short curve past which the seam lies
+OVERLAP_STEP: Final = 1.0  # step at which points of the overlap are placed on the beginning (m)
+OVERLAP_ROOM: Final = 4.0  # room about its expected place in which a point of the overlap is searched (m)
+SEAM_MARGIN: Final = 0.5  # distance from the seam below which a cone is one of the beginning (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
     """The correspondence between a curve's end and its beginning."""
 
-    period: float
-    """Length of the closed curve in the open curve's parameter (m)."""
-    u: Array
-    """(k,) Increasing parameters of the open curve's end, from the seam on."""
-    w: Array
-    """(k,) Parameters of the same places on the beginning, from 0 on."""
+    period: float  # length of the closed curve in the open curve's parameter (m)
+    u: Array  # (k,) increasing parameters of the open curve's end, from the seam on
+    w: Array  # (k,) parameters of the same places on the beginning, from 0 on
 
     def new_parameter(self, u: Array) -> Array:
         """Map parameters of the open curve to those of the closed one, which are not wrapped."""
@@ -49,42 +40,31 @@ class PeriodicCurve:
     """The periodic curve that replaces an open one."""
 
     overlap: Overlap
-    knots: Array
-    """(m + 2 p + 1,) Periodic knots."""
-    points: Array
-    """(m, 2) Control points in m, map frame."""
-    old_from_new: Array
-    """(n, m) Matrix E of the change of variables: `C_old = E C_new`."""
+    knots: Array  # (m + 2 p + 1,) periodic knots
+    points: Array  # (m, 2) control points in m, map frame
+    old_from_new: Array  # (n, m) matrix E of the change of variables: `C_old = E C_new`
 
 
 def make_periodic(
     boundary: Boundary, control_points: Array, settings: MapperSettings, knots: Knots
 ) -> PeriodicCurve:
-    """Return the periodic curve that is nearest to an open one with control points (n, 2)."""
-    spline = boundary.spline(control_points)
-    overlap = find_overlap(boundary, control_points)
-    breaks = _breaks(boundary, control_points, overlap.period, settings, knots)
-    frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
-    change = refit(spline, frame, overlap.new_parameter)
-    return PeriodicCurve(overlap, frame.knots, change.new_from_old @ control_points, change.old_from_new)
+    """Return the periodic curve that is nearest to an open one with control points (n, 2).
 
-
-def _breaks(
-    boundary: Boundary, control_points: Array, period: float, settings: MapperSettings, knots: Knots
-) -> Array:
-    """Return the closed curve's breaks (m + 1,), where m is a share of the number of its cones.
-
-    The place of a cone is its parameter on the present curve.
+    Its number of control points is a share of that of its cones, which lie at their parameters on the curve.
     """
-    u = boundary.cone_parameters
+    spline, overlap = boundary.spline(control_points), find_overlap(boundary, control_points)
+    period, u = overlap.period, boundary.cone_parameters
     u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
     if knots == "curvature" or size >= len(u):
-        spline, baseline = boundary.spline(control_points), settings.spline.linear_baseline
-        return curvature_weighted_breaks(spline, size, baseline, 0.0, period)
-    points = boundary.evaluate(control_points, u)
-    *_, thinned = thin(points, u, period, True, boundary.degree, size)
-    return thinned.breaks
+        breaks = curvature_weighted_breaks(spline, size, settings.spline.linear_baseline, 0.0, period)
+    else:
+        cones = boundary.evaluate(control_points, u)
+        *_, thinned = thin(cones, u, period, True, boundary.degree, size)
+        breaks = thinned.breaks
+    frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
+    change = refit(spline, frame, overlap.new_parameter)
+    return PeriodicCurve(overlap, frame.knots, change.new_from_old @ control_points, change.old_from_new)
 
 
 def _apart(values: Array, distance: float) -> Array:
@@ -110,16 +90,8 @@ def find_overlap(boundary: Boundary, control_points: Array) -> Overlap:
         return Overlap(period, np.array([period, period + 1.0]), np.array([0.0, 1.0]))
     seam = float(foot.u[0])
     u = np.linspace(seam, confirmed_end, max(int((confirmed_end - seam) / OVERLAP_STEP), 1) + 1)
-    w = _on_beginning(boundary, control_points, u)
-    beyond = EXTRAPOLATED * boundary.nominal[0]
-    return Overlap(seam, np.append(u, u[-1] + beyond), np.append(w, w[-1] + beyond))
-
-
-def _on_beginning(boundary: Boundary, control_points: Array, u: Array) -> Array:
-    """Return parameters (k,) on the beginning of the end's points at u (k,), from 0 and never decreasing."""
-    guess = u - u[0]
-    points = boundary.evaluate(control_points, u)
-    w = boundary.find(control_points, points, np.maximum(guess - OVERLAP_ROOM, 0.0), guess + OVERLAP_ROOM).u
+    low, high = np.maximum(u - seam - OVERLAP_ROOM, 0.0), u - seam + OVERLAP_ROOM
+    w = boundary.find(control_points, boundary.evaluate(control_points, u), low, high).u
     w = np.maximum.accumulate(w)
-    w[0] = 0.0
-    return w
+    w[0], beyond = 0.0, EXTRAPOLATED * boundary.nominal[0]
+    return Overlap(seam, np.append(u, u[-1] + beyond), np.append(w, w[-1] + beyond))

@@ -9,11 +9,12 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import Spans
 from pathspace_graph.factors.footpoint import TOLERANCES, FootPoints, joint_foot_points
 from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.factors.residuals import sigma_across
+from pathspace_graph.factors.residuals import project, sigma_across
+from pathspace_graph.factors.sensor import sensor_rows
 from pathspace_graph.graph.inactive import Follower
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.variables import pose_keys
+from pathspace_graph.graph.variables import SENSOR_KEY, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import relocate
@@ -26,12 +27,9 @@ from .motion import smoother_settings
 class Gating:
     """The coloured detections of the newest pose, as they were tested."""
 
-    rows: IntArray
-    """(k,) Detections, by row of the table."""
-    in_view: BoolArray
-    """(k,) Whether the detection lies beside the part of its curve that the pose sees."""
-    innovation: Array
-    """(k,) Distance of each from its curve before the update, in standard deviations of it."""
+    rows: IntArray  # (k,) detections, by row of the table
+    in_view: BoolArray  # (k,) whether the detection lies beside the part of its curve that the pose sees
+    innovation: Array  # (k,) distance of each from its curve before the update, in standard deviations of it
 
 
 class CurveSmoother(FixedLagSmoother[CurveMap]):
@@ -60,10 +58,10 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         """Put detections into use that lie on a curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
         d is the signed distance, sigma its own standard deviation, and g its gradient by pose and control
-        points, whose joint covariance is Sigma. The newest pose's detections are tested, and for the labels
-        in `retest`, whose curves have grown, all of the window that are not in use. A detection of unknown
-        colour is used only if exactly one curve accepts it. The newest pose's parameter on each curve is
-        found in the same search. Without `use`, no detection is tested, and only that parameter is found.
+        points, whose joint covariance is Sigma. The newest pose's detections are tested, and all unused ones
+        of the window for the labels in `retest`, whose curves have grown. A detection of unknown colour is
+        used if exactly one curve accepts it. The same search finds the newest pose's parameter on each curve;
+        without `use`, nothing else is done.
         """
         detections = self.map.detections
         rows, curve = self._untested(retest)
@@ -85,10 +83,9 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         self._associate(rows[rows < new.stop], curve[rows < new.stop])
 
     def reassociate(self) -> None:
-        """Associate all detections of the window anew, after the curves were replaced.
+        """Associate all detections of the window with new curves, on which the poses have been located.
 
-        The poses must have their parameters on the new curves. The uncertainty is that of the prior and the
-        odometry alone, since no detection is in use.
+        The uncertainty is that of the prior and the odometry alone, since no detection is in use.
         """
         self.map.detections.release_all()
         self.factorize()
@@ -96,25 +93,15 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
     def _associate(self, rows: IntArray, curve: IntArray) -> None:
         """Put those detections (m,) into use that pass the gate of their curve (m,), by all poses' places."""
-        state, points = self.map.state, self.map.detections.points_map(rows, self.variables)
-        low, high = self._view(rows, curve, np.array([state.pose_u[label] for label in state.boundaries]))
-        foot = state.curves.find(state.map_points, points, curve, low, high)
-        self._accept(rows, curve, points, foot)
-
-    def _view(self, rows: IntArray, curve: IntArray, pose_u: Array) -> tuple[Array, Array]:
-        """Return the stretch [low, high] of its curve (m,) that each detection may belong to.
-
-        `pose_u` (k, P) are the parameters of the window's poses on every curve.
-        """
-        gate = self.map.settings.gate
-        seen_from = pose_u[curve, self.map.detections.cycle[rows] - self.first_cycle]
-        return seen_from - gate.view_behind, seen_from + gate.view_ahead
+        state, detections, gate = self.map.state, self.map.detections, self.map.settings.gate
+        points = detections.points_map(rows, self.variables)
+        pose_u = np.array([state.pose_u[label] for label in state.boundaries])
+        seen_from = pose_u[curve, detections.cycle[rows] - self.first_cycle]
+        stretch = seen_from - gate.view_behind, seen_from + gate.view_ahead
+        self._accept(rows, curve, points, state.curves.find(state.map_points, points, curve, *stretch))
 
     def _accept(self, rows: IntArray, curve: IntArray, points: Array, foot: FootPoints) -> Array:
-        """Put those detections (m,) into use that pass the gate of their curve (m,).
-
-        Return the distance of each from its curve, in standard deviations (m,).
-        """
+        """Put detections (m,) into use that pass the gate of their curve (m,); return the innovations."""
         detections, state, gate = self.map.detections, self.map.state, self.map.settings.gate
         sigma_model = self.map.settings.spline.sigma_model
         limits = (sigma_model, gate.sigma_floor, gate.rough, gate.chi, gate.chi_unknown, UNKNOWN)
@@ -139,29 +126,31 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         return detections.open_to(labels, since)
 
     def joint_variance(self, rows: IntArray, points: Array, foot: FootPoints) -> Array:
-        """Return `g_i' Sigma g_i` (m,) in m^2: the variance of each residual of detections (m,).
+        """Return `g_i' Sigma g_i` (m,) in m^2 of detections (m,) at points (m, 2), map frame.
 
-        It comes from the uncertainty of the pose, of the control points and of the sensor's calibration. The
-        detections are at points (m, 2), map frame.
+        It is the variance of each residual by pose, control points and calibration of the sensor.
         """
-        cycles = self.map.detections.cycle[rows]
-        keys = np.concatenate(
-            [self.map.measuring_keys(cycles), self.map.state.curves.keys[foot.columns]], axis=1
-        )
-        projected, by = self.map.project(rows, points, foot)
+        detections, sensor = self.map.detections, self.variables.sensor
+        cycles, measured, twists = detections.cycle[rows], detections.measured[rows], detections.twist[rows]
+        poses, sigma_model = self.variables.poses_at(cycles), self.map.settings.spline.sigma_model
+        projected = project(points, detections.covariance[rows], poses, foot, sigma_model)
+        residual = projected.residual
+        by_sensor = sensor_rows(foot.normal_unit, residual, poses, measured, twists, sensor).by_sensor
         by_control = projected.by_control.reshape(len(rows), 2 * foot.basis.shape[1])
-        jacobian = np.concatenate([projected.by_pose, by.by_sensor, by_control], axis=1)
-        return self.predicted_covariance(Rows(keys, jacobian, projected.residual, cycles))[:, 0, 0]
+        jacobian = np.concatenate([projected.by_pose, by_sensor, by_control], axis=1)
+        seen_from = np.stack([pose_keys(cycles), np.full(len(rows), SENSOR_KEY)], axis=1)
+        seen_from = seen_from[:, : 2 if len(sensor) else 1]
+        keys = np.concatenate([seen_from, self.map.state.curves.keys[foot.columns]], axis=1)
+        return self.predicted_covariance(Rows(keys, jacobian, residual, cycles))[:, 0, 0]
 
     # --- the newest pose beside the curves ---------------------------------------------------------------
 
     def _find(self, rows: IntArray, curve: IntArray, points: Array) -> FootPoints:
-        """Find the foot points of detections at points (m, 2), each on its own curve (m,) and in its view.
-
-        The newest pose's foot point on every curve is found in the same search and noted in the state.
-        """
-        state, gate = self.map.state, self.map.settings.gate
-        curves, s = state.curves, self.map.settings.spline
+        """Find the foot points of detections (m,), each on its curve (m,), and locate the newest pose."""
+        state, gate, s = self.map.state, self.map.settings.gate, self.map.settings.spline
+        curves, room = state.curves, (gate.station_behind, gate.station_ahead)
+        if float(np.hypot(*(state.poses[-1, :2] - state.poses[-2, :2]))) < gate.station_step:
+            room = s.refine_room, s.refine_room
         foot, beside = _in_view(
             curves.spans,
             state.map_points,
@@ -171,7 +160,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             self.map.detections.cycle[rows] - self.first_cycle,
             [state.pose_u[label] for label in state.boundaries],
             state.poses[-1],
-            (gate.view_behind, gate.view_ahead, *self._search_room()),
+            (gate.view_behind, gate.view_ahead, *room),
             s.search_step,
             s.search_iterations,
             TOLERANCES,
@@ -180,13 +169,6 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             lost = along < 0.0 or abs(distance) > gate.station_lateral
             state.locate_newest(label, self._relocated(label) if lost else u)
         return FootPoints(*foot)
-
-    def _search_room(self) -> tuple[float, float]:
-        """Return how far behind and ahead (m) of its last parameter the vehicle's foot point is searched."""
-        settings, poses = self.map.settings, self.variables.poses
-        if float(np.hypot(*(poses[-1, :2] - poses[-2, :2]))) < settings.gate.station_step:
-            return settings.spline.refine_room, settings.spline.refine_room
-        return settings.gate.station_behind, settings.gate.station_ahead
 
     def _relocated(self, label: int) -> float:
         """Return the parameter of a vehicle that was not found beside the curve in the ordinary search."""
@@ -202,8 +184,9 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
     def deactivate_distant(self) -> None:
         """Restrict each step to what the window can touch, and some room for the next cycles.
 
-        This changes no result, see `graph.inactive`. An open curve's inactive part grows as the vehicle
-        drives on. A closed curve's active part is chosen again when it no longer holds what the window needs.
+        This changes no result of a closed map (`graph.inactive`), whose active part is chosen again when it
+        no longer holds what the window needs. The inactive part of an open one grows as the vehicle drives
+        on, and the map may differ by decimetres from one that is solved whole.
         """
         state = self.map.state
         needed = {label: self._needed(label) for label in state.boundaries}

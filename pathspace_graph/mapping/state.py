@@ -15,33 +15,24 @@ from pathspace_graph.graph.variables import CONTROL_LETTERS, Variables, control_
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
-POINTS_PER_FACTOR: Final = 6
-"""Consecutive control points whose weak priors are one factor: there are few factors, and each is small."""
-SAMPLE: Final = 0.25
-"""Step at which curves are sampled where they are compared with each other and with cones (m)."""
+POINTS_PER_FACTOR: Final = 6  # consecutive control points whose weak priors are one factor
+SAMPLE: Final = 0.25  # step at which curves are sampled for comparison with curves and cones (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """The active part of every curve: curves 0 to k - 1 in the order of their labels.
+    """The active parts of all curves, side by side by label, so that one pass projects all detections.
 
-    So detections of both boundaries are projected in one pass. The control points of all curves are rows of
-    one array, as `State.map_points` has them.
+    The control points of all curves are rows of one array, `State.map_points`.
     """
 
     boundaries: tuple[Boundary, ...]
-    labels: IntArray
-    """(k,) Labels of the curves, ascending."""
-    active: tuple[IntArray, ...]
-    """Active control points of each curve, by index."""
-    tables: tuple[SpanPolynomials, ...]
-    """Tables of each whole curve."""
-    spans: Spans
-    """All spans of closed curves; an open curve begins at its first active control point."""
-    active_from: Array
-    """(k,) Parameter before which an open curve is inactive; minus infinity if all is active."""
-    keys: IntArray
-    """(m,) Keys of all control points."""
+    labels: IntArray  # (k,) labels of the curves, ascending
+    active: tuple[IntArray, ...]  # active control points of each curve, by index
+    tables: tuple[SpanPolynomials, ...]  # tables of each whole curve
+    spans: Spans  # all spans of closed curves; an open curve begins at its first active control point
+    active_from: Array  # (k,) parameter before which an open curve is inactive; -inf if all is active
+    keys: IntArray  # (m,) keys of all control points
 
     @classmethod
     def of(cls, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> Self:
@@ -63,7 +54,7 @@ class Curves:
         )
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
-        """Return whether boundaries, whose active control points are all unless given, are these curves."""
+        """Return whether these are the curves of boundaries with these active control points, or with all."""
         tables = [boundary.tables for boundary in boundaries.values()]
         stretches = [active.get(label, boundary.everything) for label, boundary in boundaries.items()]
         known = *self.tables, *self.active
@@ -71,10 +62,9 @@ class Curves:
 
     @cached_property
     def pairs(self) -> tuple[IntArray, Array, IntArray, IntArray]:
-        """Return the pairs of neighbouring active control points.
+        """Return the pairs of neighbouring active control points, by rows (r, 2) of `State.map_points`.
 
-        The result has the rows (r, 2) of both in `State.map_points`, their nominal distances (r,) in m, their
-        keys (r, 2), and the numbers (r,) of the factors that hold the spacing.
+        Their nominal distances (r,) in m, keys (r, 2), and the numbers (r,) of their factors follow.
         """
         before, rows, owners, nominal = 0, [], [], []
         for label, boundary, active in zip(self.labels.tolist(), self.boundaries, self.active, strict=True):
@@ -104,15 +94,12 @@ class State:
     """The boundaries and the variables: control points (m) and poses (m, m, rad), map frame."""
 
     def __init__(self, variables: Variables | None = None) -> None:
-        self.variables = variables or Variables()
-        """Control points, calibration and poses by key."""
-        self.boundaries: dict[int, Boundary] = {}
-        """Curves, sorted by label as their control points are."""
+        self.variables = variables or Variables()  # control points, calibration and poses by key
+        self.boundaries: dict[int, Boundary] = {}  # curves, sorted by label as their control points are
         self.active_stretch: dict[int, IntArray] = {}
         """Active control points (k,) of a boundary that is partly inactive: one stretch in driving order, by
         index from the boundary's first control point."""
-        self.pose_u: dict[int, Array] = {}
-        """(P,) Parameter of each pose's foot point on each boundary, which increases from lap to lap."""
+        self.pose_u: dict[int, Array] = {}  # (P,) parameters of the poses, increasing from lap to lap
         self._curves: Curves | None = None
 
     def copy(self) -> Self:
@@ -225,7 +212,7 @@ class State:
             self.active_stretch[label] = np.append(back, indices)
 
     def activate_only(self, active: dict[int, IntArray]) -> None:
-        """Make the given control points active and no others; by default, or where it is empty, all are."""
+        """Make the given control points active, by label, and no others; all of a label that is missing."""
         self.active_stretch = active
 
     # --- poses beside the curves -------------------------------------------------------------------------

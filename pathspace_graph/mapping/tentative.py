@@ -16,14 +16,10 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.settings.online import GrowthSettings
 
-MERGE_CHI: Final = 2.5
-"""Gate of a smeared detection about a track, in sigmas of both together."""
-MERGE_MOST: Final = 2.0
-"""Its limit in merge radii: the next cone of the row is farther away."""
-RESTORED: Final = 0.3
-"""Standard deviation of a cone that is taken back from a curve (m)."""
-MAX_TRACKS: Final = 1000
-"""Tracks of each label that are kept, the ones that were seen last."""
+MERGE_CHI: Final = 2.5  # gate of a smeared detection about a track, in sigmas of both together
+MERGE_MOST: Final = 2.0  # its limit in merge radii: the next cone of the row is farther away
+RESTORED: Final = 0.3  # standard deviation of a cone that is taken back from a curve (m)
+MAX_TRACKS: Final = 1000  # tracks of each label that are kept, the ones that were seen last
 
 
 class TentativeTracks:
@@ -31,21 +27,16 @@ class TentativeTracks:
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
-        self.points: Array = np.zeros((0, 2))
-        """(n, 2) Weighted mean of each track's detections in m, map frame."""
-        self.information: Array = np.zeros((0, 2, 2))
-        """(n, 2, 2) Information of each track (1/m^2): the sum of its detections' inverse covariances."""
-        self.counts: IntArray = np.zeros(0, np.intp)
-        """(n,) Number of detections."""
-        self.last_t: Array = np.zeros(0)
-        """(n,) Stamp of the newest detection (s)."""
+        self.points: Array = np.zeros((0, 2))  # (n, 2) weighted mean of a track's detections in m, map frame
+        self.information: Array = np.zeros((0, 2, 2))  # (n, 2, 2) sum of its inverse covariances (1/m^2)
+        self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
+        self.last_t: Array = np.zeros(0)  # (n,) stamp of the newest detection (s)
 
     def add(self, points: Array, covariances: Array, t: float) -> None:
         """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
 
         A detection is of the track to which it is nearest, in `merge_radius` or in sigmas, whichever says
-        less: far sightings of one cone are smeared along their rays. Tracks that were not seen for
-        `forget_after` seconds are removed first.
+        less: far sightings of one cone are smeared along their rays. Tracks older than `forget_after` go.
         """
         self._keep(self.last_t > t - self.settings.forget_after)
         if len(points) == 0:
@@ -155,10 +146,7 @@ def newest_of(stamps: Array, most: int) -> BoolArray:
 
 
 def nearest_within(points: Array, known: Array, radius: float) -> tuple[IntArray, BoolArray]:
-    """Return the nearest of the known points (n, 2) to each point (m, 2), and whether it is within a radius.
-
-    The first result (m,) is an index, which means nothing where no point is known.
-    """
+    """Return the index (m,) of the known point nearest to each point (m, 2), and whether within a radius."""
     if len(known) == 0:
         return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
     offset = points[:, None, :] - known[None, :, :]
@@ -175,23 +163,19 @@ class Sighting:
     """Orange cones as they were detected in one cycle."""
 
     cycle: int
-    pose: Array
-    """(3,) Pose of the vehicle, map frame."""
-    twist: Array
-    """(3,) Twist of the vehicle (m/s, m/s, rad/s)."""
-    detections: Detections
-    """Detections of orange cones only."""
+    pose: Array  # (3,) pose of the vehicle, map frame
+    twist: Array  # (3,) twist of the vehicle (m/s, m/s, rad/s)
+    detections: Detections  # detections of orange cones only
 
 
 class OrangeCones:
-    """Orange cones as points of the map: gates, and lanes that lead to a track.
+    """Orange cones as points of the map, at gates and along lanes that lead to a track.
 
-    They bound no road, so no curve goes through them, and they don't hold the vehicle. Each is the mean of
-    its detections, as the poses of their cycles place them.
+    Each is the mean of its detections, placed by the poses of their cycles. They bound no road and don't hold
+    the vehicle.
     """
 
-    MOST: Final = 500
-    """Newest cycles that are remembered, to be placed again when poses are corrected."""
+    MOST: Final = 500  # newest cycles that are remembered, to be placed again when poses are corrected
 
     def __init__(self, settings: GrowthSettings, sigma: float) -> None:
         """Keep how detections are merged, and a standard deviation (m) that none of them averages out."""
@@ -207,10 +191,7 @@ class OrangeCones:
             self._place(sighting, sensor)
 
     def place_again(self, sensor: Array, *known: tuple[int, Array]) -> None:
-        """Place all detections anew by better known poses: a first cycle, and poses (P, 3) from it on.
-
-        Where several have a cycle, the last one counts.
-        """
+        """Place all detections by better poses (P, 3) from a first cycle on, of which the last ones count."""
         self._tracks = {}
         for k, one in enumerate(self._sightings):
             for first, poses in known:

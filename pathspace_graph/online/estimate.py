@@ -81,10 +81,7 @@ class MapperEstimate:
         return Map(False, boundaries, joint)
 
     def _closed_map(self, joint: Array) -> Map:
-        """Return the closed map, whose control points have a covariance (2m, 2m) from the graph.
-
-        What a curve with few control points cannot follow is added: no number of detections averages it out.
-        """
+        """Return the closed map: the graph's covariance (2m, 2m), and what few control points can't show."""
         shape, scatter = self.settings.spline.sigma_shape, self.smoother.map.scatter
         boundaries, at = {}, 0
         for label, boundary in self.boundaries.items():
@@ -98,25 +95,22 @@ class MapperEstimate:
     def outline(self) -> Map:
         """Return a copy of the present map without covariances, which takes a hundredth of the time.
 
-        An open curve is confirmed up to `confirmed_until`. From there on it is tentative: it leads through
-        cones that were seen less often, and is fitted anew in each call. A curve that has not begun may
-        consist of a tentative stretch alone.
+        Past `confirmed_until` an open curve is tentative: fitted in each call through cones that were seen
+        less often. A curve that has not begun may consist of a tentative stretch alone.
         """
-        boundaries = {}
         with self.smoother.variables.looked_at():
-            for label, outlook in self._outlooks().items():
-                spline = outlook.spline
-                until = spline.domain[1] if self.closed else outlook.confirmed_until
-                boundaries[label] = SplineBoundary(spline, NO_COVARIANCE, until)
+            boundaries = {
+                label: SplineBoundary(outlook.spline, NO_COVARIANCE, outlook.confirmed_until)
+                for label, outlook in self._outlooks().items()
+            }
         return Map(self.closed, boundaries, points=self.orange.points())
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
         """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
 
-        This is what a controller asks for in each cycle, so it is fast, and nothing of the estimate changes.
-        While the loop is open, it goes on beyond the confirmed ends through the cones of `outline`, and says
-        where. While the vehicle is lost on a closed map, it is the road as it has been mapped since then.
-        SettingsError is raised where a length is out of its range.
+        It is fast, for a controller in each cycle. While the loop is open, it goes on beyond the confirmed
+        ends through the cones of `outline`, and says where. While the vehicle is lost on a closed map, it is
+        the road as mapped since then. SettingsError is raised where a length is out of its range.
         """
         if not self.smoother.times:
             return track_ahead({}, np.zeros(POSE), distance, step)
@@ -136,8 +130,8 @@ class MapperEstimate:
     def looked_at(self) -> AbstractContextManager[None]:
         """Return a context in which the mapper may be asked for anything, and its estimate stays as it is.
 
-        Without it, `control_points` leaves the inactive part of an open map up to date, which may move later
-        estimates by millimetres.
+        Without it, `control_points` refreshes the inactive part of an open map, and may move later estimates
+        by millimetres.
         """
         return self.smoother.variables.looked_at()
 
@@ -173,10 +167,30 @@ class MapperEstimate:
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
 
-        The factors hold the active variables, which `values` returns. The graph shares nothing with the
-        mapper: optimize it, print its errors, or compute its marginals with GTSAM's own classes.
+        The factors hold the active variables, which `values` returns. Linearized at the estimate, they are
+        the mapper's own system in GTSAM's tangents of the poses. The graph shares nothing with the mapper:
+        optimize it, print its errors, or compute its marginals with GTSAM's own classes.
         """
-        return window_graph(self.smoother)
+        smoother, track, settings = self.smoother, self.smoother.map, self.settings
+        factors: list[gtsam.NonlinearFactor] = []
+        anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
+        for label, boundary in self.boundaries.items():
+            active = track.state.active(label)
+            factors += _detection_factors(track, label, active)
+            if not track.held_by_prior:
+                factors += _gauge_factors(label, boundary, active, settings.gauge)
+            keys = control_keys(label, boundary.first + active).tolist()
+            points = track.state.control_points(label)[active]
+            factors += [gtsam.PriorFactorPoint2(*pair, anchor) for pair in zip(keys, points, strict=True)]
+        intervals = enumerate(smoother.window.odometry.intervals, start=smoother.first_cycle)
+        factors += [odometry_factor(cycle, interval) for cycle, interval in intervals]
+        factors += smoother.user_factors.factors
+        prior = factors_of(smoother.absolute_prior())
+        factors += [as_nonlinear(factor, smoother.variables) for factor in prior]
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in factors:
+            graph.add(factor)
+        return graph
 
     def values(self) -> gtsam.Values:
         """Return the active variables: poses as `Pose2`, control points and the calibration as points."""
@@ -186,8 +200,7 @@ class MapperEstimate:
         """Return the joint covariance (q, q) of any variables (k,), in the order of their keys.
 
         Control points are in m, poses (x, y, theta) in m and rad, both in the map frame; the calibration is
-        (-, rad/s). SettingsError is raised for a key that is not a variable: its pose has left the window, or
-        its curve has new knots.
+        (-, rad/s). SettingsError is raised for a key of a pose outside the window or of former knots.
         """
         wanted = np.array(keys, np.intp)
         unknown = wanted[self.smoother.variables.layout.positions(wanted) == UNKNOWN_PLACE]
@@ -247,8 +260,7 @@ class MapperEstimate:
     def wait(self) -> None:
         """Wait for the batch whose result the next update may take, however long that takes.
 
-        A replay calls this before each update, so that the same log always gives the same map. A vehicle does
-        not: there an update waits for no batch longer than the time since the cycle before.
+        A replay calls this before each update, so that the same log always gives the same map.
         """
         self.loop.wait()
 
@@ -268,10 +280,6 @@ class MapperEstimate:
         self.smoother.refresh()
         return self.smoother.map.state.control_points(label)
 
-    def pose_parameter(self, label: int) -> float:
-        """Return the parameter (m) of the newest pose's foot point; it increases from lap to lap."""
-        return float(self.smoother.map.state.pose_u[label][-1])
-
     @property
     def poses(self) -> Array:
         """Return a view of the poses (P, 3) in the window, the oldest first, map frame."""
@@ -290,38 +298,10 @@ class MapperEstimate:
 # --- the window as nonlinear factors ---------------------------------------------------------------------
 
 
-def window_graph(smoother: CurveSmoother) -> gtsam.NonlinearFactorGraph:
-    """Return projection, spacing, smoothness, odometry, user and prior factors on the active variables.
-
-    Linearized at the estimate, the graph is the mapper's own system in GTSAM's tangents of the poses.
-    """
-    track, state, settings = smoother.map, smoother.map.state, smoother.map.settings
-    factors: list[gtsam.NonlinearFactor] = []
-    anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
-    for label, boundary in state.boundaries.items():
-        active = state.active(label)
-        factors += _detection_factors(track, label, active)
-        if not track.held_by_prior:
-            factors += _gauge_factors(label, boundary, active, settings.gauge)
-        keys = control_keys(label, boundary.first + active).tolist()
-        points = state.control_points(label)[active]
-        factors += [gtsam.PriorFactorPoint2(*pair, anchor) for pair in zip(keys, points, strict=True)]
-    intervals = enumerate(smoother.window.odometry.intervals, start=smoother.first_cycle)
-    factors += [odometry_factor(cycle, interval) for cycle, interval in intervals]
-    factors += smoother.user_factors.factors
-    prior = factors_of(smoother.absolute_prior())
-    factors += [as_nonlinear(factor, smoother.variables) for factor in prior]
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph
-
-
 def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gtsam.CustomFactor]:
     """Return a spline-projection factor for each cycle of the detections in use on a boundary.
 
-    Their foot points may move as far as a step refines them, where the curve is active. They are corrected
-    by the sensor's calibration where it is estimated.
+    Foot points may move as far as a step refines them, where the curve is active.
     """
     detections, settings = track.detections, track.settings
     boundary, rows = track.state.boundaries[label], detections.used_on(label)

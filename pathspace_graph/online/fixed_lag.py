@@ -34,11 +34,9 @@ from pathspace_graph.snapshot import restore, save
 from .estimate import MapperEstimate
 from .growth import Growth
 
-ROAD: Final = 10.0
-"""Length of both boundaries beside a lost vehicle from which on they are a road (m)."""
+ROAD: Final = 10.0  # length of both boundaries beside a lost vehicle that make a road (m)
 
-PLACED: Final = 20.0
-"""Path (m) for which a vehicle stays certain enough of its place that only detections can close the loop."""
+PLACED: Final = 20.0  # path for which a vehicle stays so certain that only detections can close the loop (m)
 
 
 def careful(process: partial[CycleResult]) -> partial[CycleResult]:
@@ -56,9 +54,7 @@ class FixedLagMapper(MapperEstimate):
     """
 
     def __init__(
-        self,
-        settings: MapperSettings | None = None,
-        odometry_sigma: Array | KnownNoise | None = None,
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = settings or MapperSettings()
         noise = known_noise(odometry_sigma)
@@ -76,25 +72,20 @@ class FixedLagMapper(MapperEstimate):
         if self.settings.open_lap.prior == "window":
             self.loop.record.give_up("no batch of the lap was asked for")
         self.recovery = Recovery()
-        self.new_road: FixedLagMapper | None = None
-        """The road beside a lost vehicle, mapped anew in the frame of the pose in which the search began."""
+        self.new_road: FixedLagMapper | None = None  # road beside a lost vehicle, from where the search began
         self._unused: Odometry | None = None  # twists of a cycle that was left out
         self._grown: frozenset[int] = frozenset()
         self._placed_until = 0.0  # path driven (m) up to which the vehicle is not lost (`is_lost`)
 
     def update(
-        self,
-        odometry: Odometry,
-        detections: Detections,
-        factors: Sequence[gtsam.NonlinearFactor] = (),
+        self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor] = ()
     ) -> CycleResult:
         """Process one perception cycle: the twists since the last cycle, and its detections.
 
-        The call is refused as a ReadingError, and nothing has changed, where it holds anything that cannot be
-        used (`front_end.gate`, `settings.online`). Impossible detections are dropped and counted in the
-        result. The next call goes on from the newest cycle that was used. The twists are a stream: each is
-        held until the next one, and those in force before the newest cycle are left out. So a caller hands
-        over the twists since the last call in order, and where some are lost, the last one is held.
+        A cycle that cannot be used (`front_end.gate`, `settings.online`) raises a ReadingError and changes
+        nothing; impossible detections are dropped and counted in the result. The twists are a stream: each is
+        held until the next one, those in force before the newest cycle are left out, and where some are lost,
+        the last one is held.
 
         A late cycle, with a stamp before the newest one's, is used at its time if that is inside the window,
         and is refused otherwise. It brings no twists that are newer than the newest cycle, and no factors.
@@ -103,18 +94,17 @@ class FixedLagMapper(MapperEstimate):
 
         Where another process solves the lap as a batch, the call waits for it no longer than the time since
         the cycle before, and the map is replaced in a later cycle if need be. A replay of a log calls `wait`
-        before, so that it does not depend on how fast the machine is.
+        before, so that it does not depend on the speed of the machine.
 
-        `factors` are GTSAM factors of your own on poses in the window (`pose_key`, `next_pose_key`: `Pose2`),
-        on control points (`control_keys`: `Point2`) and on the calibration. Each is relinearized at every
-        step until one of its poses leaves the window; then it is part of the prior. A factor on control
-        points alone is kept until the loop closes, which replaces the control points. If a key is not a
-        variable of the graph, or a number not finite, SettingsError is raised and nothing is changed. Its
-        lengths are those at scale 1.
+        `factors` are GTSAM factors of your own, at scale 1, on poses in the window (`pose_key`,
+        `next_pose_key`: `Pose2`), on control points (`control_keys`: `Point2`) and on the calibration. Each
+        is relinearized at every step until one of its poses leaves the window; then it is part of the prior.
+        One on control points alone is kept until the loop closes. SettingsError is raised, and nothing is
+        changed, if a key is not a variable of the graph or a number not finite.
 
-        Nothing else is raised. Where a step fails, the mapper goes back to what it was before the cycle.
-        Then it takes the cycle again and leaves the loop alone, or uses no detections, or leaves the cycle
-        out. The notice says which, and `recovery.failures` counts.
+        Nothing else is raised. Where a step fails, the mapper goes back to before the cycle and takes it
+        again with the loop left alone, or without detections, or not at all. The notice says which, and
+        `recovery.failures` counts.
         """
         factors = tuple(factors)
         self.recovery.before(self, self.front_end.gate)
@@ -167,7 +157,8 @@ class FixedLagMapper(MapperEstimate):
         watch.lap("simplify")
         jump, notice = self.loop.go_on(closes, watch.spent)
         if jump is not None:
-            self._place_orange_again()
+            window = self.smoother.first_cycle, self.poses
+            self.orange.place_again(self.smoother.variables.sensor, (0, self.corrected_poses), window)
         watch.lap("swap")
         if self.loop.is_searching:
             jump, notice = self._find(reading)
@@ -176,7 +167,7 @@ class FixedLagMapper(MapperEstimate):
             self.growth.clear()
         self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
-        notice = "; ".join(text for text in (notice, self.growth.notice, reading.notice, learned) if text)
+        notice = "; ".join(filter(None, (notice, self.growth.notice, reading.notice, learned)))
         return self._result(cycle.detections.t, watch.laps, jump, notice)
 
     def _without(
@@ -187,7 +178,9 @@ class FixedLagMapper(MapperEstimate):
         The mapper is as it was before the cycle each time. The notice says what has failed.
         """
         self.recovery.failures += 1
-        unused, seen = self._unused, cycle.detections
+        number, unused, seen = self.recovery.failures, self._unused, cycle.detections
+        why = f": {type(error).__name__}: {error}" if number == 1 else f" (failure {number})"
+        failed = " ".join(f"an update failed{why}".split())
         nothing = Detections(seen.t, seen.points_vehicle[:0], seen.covariances[:0], seen.labels[:0])
         blind = replace(cycle, detections=nothing)
         attempts = {
@@ -202,18 +195,10 @@ class FixedLagMapper(MapperEstimate):
                 continue
             self.recovery.called(again)
             self._unused = unused if cycle.late else None
-            return replace(result, notice=self._failed(error, consequence, result.notice))
+            return replace(result, notice="; ".join(filter(None, (failed, consequence, result.notice))))
         self.recovery.take_back(self, self.front_end.gate)
         self._unused = unused if cycle.late else cycle.odometry
-        result = self._result(cycle.detections.t, {}, None, "")
-        return replace(result, notice=self._failed(error, "the cycle is not used"))
-
-    def _failed(self, error: Exception, consequence: str, notice: str = "") -> str:
-        number = self.recovery.failures
-        why = f": {type(error).__name__}: {error}" if number == 1 else f" (failure {number})"
-        return "; ".join(
-            text for text in (" ".join(f"an update failed{why}".split()), consequence, notice) if text
-        )
+        return self._result(cycle.detections.t, {}, None, f"{failed}; the cycle is not used")
 
     def _admit(
         self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor]
@@ -253,16 +238,9 @@ class FixedLagMapper(MapperEstimate):
         motion, t = reading.motion, reading.detections.t
         predict(self.smoother, self.path, motion, t, self.settings)
         cycle, twist = self.smoother.next_cycle - 1, motion.odometry.twist
-        self.orange.add(Sighting(cycle, self.poses[-1].copy(), twist, reading.orange), self._sensor)
+        orange = Sighting(cycle, self.poses[-1].copy(), twist, reading.orange)
+        self.orange.add(orange, self.smoother.variables.sensor)
         self.loop.record.measured(reading)
-
-    @property
-    def _sensor(self) -> Array:
-        return self.smoother.variables.sensor
-
-    def _place_orange_again(self) -> None:
-        window = self.smoother.first_cycle, self.poses
-        self.orange.place_again(self._sensor, (0, self.corrected_poses), window)
 
     def _classify(self, reading: Reading) -> None:
         detections, motion, cycle = reading.detections, reading.motion, self.smoother.next_cycle - 1

@@ -23,19 +23,14 @@ from pathspace_graph.mapping.path import (
     crosses,
 )
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
+from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
-NEWEST: Final = 3
-"""Newest cones that, with the end of a curve, say how far it runs beside the path."""
-RECALL: Final = 25.0
-"""Length of the newest stretches of path and curves (m): in a second round, the first one tells nothing."""
-NEARER: Final = 0.5
-"""A cone that was passed is passed again only where the path comes nearer to it by more than this (m)."""
-LENGTH_FREE: Final = 50.0
-"""Length of an open curve that is allowed whatever the path driven (m)."""
-LENGTH_DRIVEN: Final = 2.0
-"""Further length allowed for each metre driven (m/m): a curve that zigzags between false cones exceeds it."""
+NEWEST: Final = 3  # newest cones that, with the end of a curve, say how far it runs beside the path
+RECALL: Final = 25.0  # newest stretch of path and curves (m): in a second round, the first tells nothing
+NEARER: Final = 0.5  # how much nearer the path must come to pass a passed cone again (m)
+LENGTH_FREE: Final = 50.0  # length of an open curve that is allowed whatever the path driven (m)
+LENGTH_DRIVEN: Final = 2.0  # further length for each metre driven, exceeded by zigzags between false cones
 
 
 class Growth:
@@ -43,10 +38,8 @@ class Growth:
 
     def __init__(self, smoother: CurveSmoother) -> None:
         self.settings = smoother.map.settings.growth
-        self.tentative = {label: TentativeTracks(self.settings) for label in BOUNDARIES}
-        """Detections that no curve explains, by label."""
-        self.notice = ""
-        """What is said in the cycle in which a boundary stops growing."""
+        self.tentative = {label: TentativeTracks(self.settings) for label in BOUNDARIES}  # unexplained cones
+        self.notice = ""  # what is said in the cycle in which a boundary stops growing
         self._smoother, self._map, self._state = smoother, smoother.map, smoother.map.state
         self._full: set[int] = set()
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
@@ -108,9 +101,9 @@ class Growth:
         return True
 
     def _extend(self, label: int, path_ahead: PathAhead, behind: float) -> bool:
-        """Extend a curve through all candidates, or extrapolate a stranded end; True if it has grown.
+        """Extend a curve through all candidates, or carry on a stranded end; True if it has grown.
 
-        The end's station is searched on the path from `behind` (m) behind the vehicle on.
+        The end is located on the path from `behind` (m) behind the vehicle on.
         """
         end = self.end(label, path_ahead, behind)
         found = self._candidates(label, path_ahead, end)
@@ -159,10 +152,8 @@ class Growth:
         boundary.add_cones(found.points, u)
         self.tentative[label].remove(found.indices)
         rows = detections.pending(label)
-        points = detections.points_map(rows, self._map.variables)
-        offset = points[:, None, :] - found.points[None]
-        radius = self.settings.merge_radius
-        near = np.hypot(offset[:, :, 0], offset[:, :, 1]).min(axis=1) < radius
+        points, radius = detections.points_map(rows, self._map.variables), self.settings.merge_radius
+        _, near = nearest_within(points, found.points, radius)
         rows, points = rows[near], points[near]
         low = np.full(len(rows), u[0] - radius)
         high = boundary.believed(np.full(len(rows), np.inf))
@@ -186,7 +177,7 @@ class Growth:
         points = tracks.points[indices]
         if len(points) == 0:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
-        path = path_ahead if end is None else _newest(path_ahead, end)
+        path = path_ahead if end is None else newest(path_ahead, end.station)
         stations, lateral = path.locate(points)
         sides = SIDES[label] * lateral
         possible = (stations <= path_ahead.stations[-1]) & (sides > 0.0)
@@ -207,8 +198,8 @@ class Growth:
     def _certain(self, label: int, path_ahead: PathAhead, found: Candidates) -> IntArray:
         """Return the candidates, by index, up to the first one ahead that is not known well enough.
 
-        It waits until it was seen near, and so do all behind it: in a hairpin, the row of the way back may be
-        known before the next cone of the way there. One that was passed is left out.
+        In a hairpin, the row of the way back may be known before the next cone of the way there. A candidate
+        that was passed is left out.
         """
         known = self.tentative[label].sigmas(found.indices) < self.settings.sigma
         waiting = np.flatnonzero(~known & (found.stations > path_ahead.driven))
@@ -218,10 +209,10 @@ class Growth:
     def _uncrossed(self, label: int, path_ahead: PathAhead, end: End, found: Candidates) -> IntArray:
         """Return the candidates, by index, up to the first that is reached only across a line.
 
-        No boundary crosses the path driven, the other boundary or itself, on their newest stretches: in a
-        second lap of an open loop it runs along its own first one.
+        Lines are the newest stretches of the path driven and of both boundaries, which in a second lap of an
+        open loop run along their first ones.
         """
-        path = _newest(path_ahead, end)
+        path = newest(path_ahead, end.station)
         lines = [path.points[path.stations <= path.driven]]
         for other, boundary in self._state.boundaries.items():
             begin = boundary.confirmed_end - RECALL
@@ -237,8 +228,7 @@ class Growth:
     def end(self, label: int, path_ahead: PathAhead, behind: float) -> End:
         """Return the confirmed end of a curve, located on the path from `behind` (m) behind the vehicle on.
 
-        Its distance from the path is the median of the newest cones', so that one wrong cone leads no
-        further.
+        Its distance from the path is the median with the newest cones', so that one wrong cone leads nowhere.
         """
         boundary = self._state.boundaries[label]
         u = np.array([boundary.confirmed_end])
@@ -269,10 +259,10 @@ class Growth:
 
 
 def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> BoolArray:
-    """Return whether places (n, 2) have at least as many detections of `label` around them as of the other.
+    """Return whether places (n, 2) have at least as many detections of `label` within `radius` (m) as others.
 
-    A sensor that now and then takes a cone for one of the other boundary sees its true colour more often. All
-    coloured detections of the window within `radius` (m) count, in use or not.
+    A sensor that now and then confuses colours sees the true one more often. All coloured detections of the
+    window count, in use or not.
     """
     detections = track.detections
     rows = np.flatnonzero(detections.label != UNKNOWN)
@@ -286,17 +276,14 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
     """Return how many of a curve's cones, from its first on, are in the order in which they were passed.
 
     The order of cones ahead is predicted with an arc. In a hairpin, the row of the way back may be nearer
-    than the row of the way there, and only after the vehicle has passed the cones is their order certain.
-    Only the last `RECALL` metres of the curve are checked, and the first cone there counts as in order.
-
-    `known` (n, 2) are the station and the distance of the first n cones beside the path, as they were in the
-    cycle before, and the second result (m, 2) as they are now.
+    than that of the way there, so the order is certain only once they were passed. The last `RECALL` metres
+    of the curve are checked, whose first cone counts as in order. `known` (n, 2) are station and distance
+    beside the path of the first n cones in the cycle before, and the second result (m, 2) those of now.
     """
     first = int(boundary.cone_parameters.searchsorted(boundary.confirmed_end - RECALL))
     beside = np.full((len(boundary.observed), 2), np.nan)  # nothing is known of others
     beside[: len(known)] = known[: len(beside)]
-    newest = path_ahead.since(path_ahead.driven - RECALL).locate(boundary.observed[first:])
-    now = np.stack(newest, axis=1)
+    now = np.stack(newest(path_ahead).locate(boundary.observed[first:]), axis=1)
     before, passed = beside[first:], beside[first:, 0] <= path_ahead.driven
     stays = passed & (np.abs(now[:, 1]) > np.abs(before[:, 1]) - NEARER)
     now[stays] = before[stays]
@@ -308,9 +295,9 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
     return kept, beside[:kept]
 
 
-def _newest(path_ahead: PathAhead, end: End) -> PathAhead:
-    """Return the path along which the end of a curve may grow: not that of an earlier round."""
-    return path_ahead.since(min(end.station, path_ahead.driven) - RECALL)
+def newest(path_ahead: PathAhead, station: float = np.inf) -> PathAhead:
+    """Return the path without earlier rounds: from `RECALL` before the vehicle, or before a station (m)."""
+    return path_ahead.since(min(station, path_ahead.driven) - RECALL)
 
 
 def _distances(points: Array) -> Array:

@@ -1,7 +1,6 @@
 """The outlook: the open curves as they lead on, through tentative tracks beyond their confirmed ends.
 
-The tentative stretch is no part of the graph. It is fitted to the tracks whenever the map is asked for, so it
-can't harm the estimate, and it is taken back as soon as the tracks contradict it.
+The tentative stretch is no part of the graph: it is fitted anew whenever the map is asked for.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,45 +16,31 @@ from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import SIDES, DrivenPath, along_and_across, crosses
-from pathspace_graph.mapping.tentative import TentativeTracks
+from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
 
-from .growth import RECALL, undisputed
+from .growth import newest, undisputed
 
-REACH: Final = 12.5
-"""Farthest track from the vehicle that the stretch leads through (m)."""
-MEMORY: Final = 0.35
-"""Time for which a track that is not confirmed counts (s): a detection of nothing is not repeated."""
-GAP: Final = 11.0
-"""Largest distance of neighbouring tracks of a row (m): two regular gaps, as a cone may never be detected."""
-TURN: Final = 2.0
-"""Largest turn of a row from one track to the next where both coincide (rad)."""
-TURN_RATE: Final = 0.1
-"""Decrease of `TURN` with the distance to the next track (rad/m)."""
-TURN_COST: Final = 1.0
-"""The next track of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)."""
-MIN_WIDTH: Final = 1.5
-"""Least distance of a row from the other boundary (m)."""
-WIDTH_RATIO: Final = 1.8
-"""Largest ratio of successive tracks' distances from the other boundary."""
-WIDTH_SLACK: Final = 1.0
-"""Further growth allowed of that distance (m)."""
-TAIL: Final = 20.0
-"""Length at the end of the confirmed curves that tells where the track leads and how wide it is (m)."""
-TAIL_STEP: Final = 1.0
-"""Step of the points along that length (m)."""
-BEGIN_LATERAL: Final = 1.5
-"""Distance beside the vehicle from which the row of a boundary that has not begun is searched (m)."""
-SIGMA_CONE: Final = 0.1
-"""Standard deviation of a cone's distance from a smooth curve (m), added to a track's own."""
+REACH: Final = 12.5  # farthest track from the vehicle that the stretch leads through (m)
+MEMORY: Final = 0.35  # time for which an unconfirmed track counts (s): a detection of nothing is not repeated
+GAP: Final = 11.0  # largest distance of neighbours in a row (m): two regular gaps, as one may be missed
+TURN: Final = 2.0  # largest turn of a row from one track to the next where both coincide (rad)
+TURN_RATE: Final = 0.1  # decrease of `TURN` with the distance to the next track (rad/m)
+TURN_COST: Final = 1.0  # the next track of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)
+MIN_WIDTH: Final = 1.5  # least distance of a row from the other boundary (m)
+WIDTH_RATIO: Final = 1.8  # largest ratio of successive tracks' distances from the other boundary
+WIDTH_SLACK: Final = 1.0  # further growth allowed of that distance (m)
+TAIL: Final = 20.0  # length of the confirmed curves that tells where the track leads and how wide it is (m)
+TAIL_STEP: Final = 1.0  # step of the points along that length (m)
+BEGIN_LATERAL: Final = 1.5  # distance beside the vehicle at which a row without a curve is searched (m)
+SIGMA_CONE: Final = 0.1  # of a cone's distance from a smooth curve (m), added to a track's own
 SIGMA_BEND: Final = 1.0
 """Standard deviation of the second difference of control points about that of a straight line (m). It widens
 the band between tracks that are far apart, and beyond the last one."""
-MIN_TRACKS: Final = 2
-"""Least number of tracks for a tentative curve of a boundary that has not begun."""
+MIN_TRACKS: Final = 2  # least number of tracks for a tentative curve of a boundary that has not begun
 
 
 # --- rows of tracks --------------------------------------------------------------------------------------
@@ -65,18 +50,12 @@ MIN_TRACKS: Final = 2
 class Row:
     """One boundary as far as it is known, and the tracks that may continue it."""
 
-    side: float
-    """Sign of the signed distance from the other row (left positive)."""
-    line: Array
-    """(n, 2) At least two points of the row in driving order (m, map frame)."""
-    direction: Array
-    """(2,) Unit vector in which the row leads on from its last point."""
-    candidates: Array
-    """(k, 2) Tracks that may continue the row (m, map frame)."""
-    chosen: list[int] = field(default_factory=list)
-    """Candidates that the row continues through, by index in driving order."""
-    ended: bool = False
-    """Whether no candidate continues the row, wherever the other one leads."""
+    side: float  # sign of the signed distance from the other row (left positive)
+    line: Array  # (n, 2) at least two points of the row in driving order (m, map frame)
+    direction: Array  # (2,) unit vector in which the row leads on from its last point
+    candidates: Array  # (k, 2) tracks that may continue the row (m, map frame)
+    chosen: list[int] = field(default_factory=list)  # candidates taken, in order
+    ended: bool = False  # whether no candidate continues the row, wherever the other one leads
 
     @property
     def end(self) -> Array:
@@ -104,8 +83,8 @@ class Row:
 def extend_rows(left: Row, right: Row, driven: Array, threshold: float) -> None:
     """Continue both rows through their candidates, each time the one that lags behind.
 
-    Each row bounds where the other may lead: it stays on its own side, at about the width that the track has.
-    No row crosses the driven path (n, 2). A track nearer to a row's end than `threshold` (m) is passed over.
+    A row stays on its side of the other, at about the width of the track, and does not cross the driven path
+    (n, 2). A track nearer to a row's end than `threshold` (m) is passed over.
     """
     waiting = [left, right]
     while waiting:
@@ -156,18 +135,12 @@ def _has_width(row: Row, other: Row, points: Array) -> BoolArray:
 class Outlook:
     """A boundary with its tentative stretch."""
 
-    boundary: Boundary
-    """Knots, those of the tentative stretch too."""
-    known: Array
-    """(n, 2) Control points of the confirmed curve (m, map frame)."""
-    confirmed_until: float
-    """Parameter up to which the curve is confirmed (m)."""
-    tracks: Array
-    """(k, 2) Tracks that the tentative stretch leads through (m, map frame)."""
-    variances: Array
-    """(k,) Variance of each in any direction (m^2), seen from the vehicle."""
-    placement: Placement | None
-    """How control points were placed for the tentative stretch; None where there is none."""
+    boundary: Boundary  # knots, those of the tentative stretch too
+    known: Array  # (n, 2) control points of the confirmed curve (m, map frame)
+    confirmed_until: float  # parameter up to which the curve is confirmed (m)
+    tracks: Array  # (k, 2) tracks that the tentative stretch leads through (m, map frame)
+    variances: Array  # (k,) variance of each in any direction (m^2), seen from the vehicle
+    placement: Placement | None  # of control points for the tentative stretch, if there is one
 
     @property
     def control_points(self) -> Array:
@@ -187,9 +160,8 @@ def joint_covariance_of(
 ) -> tuple[Array, list[slice]]:
     """Return the joint covariance of the control points of all curves, and the block of each curve.
 
-    `joint` is the covariance of the known control points of all curves and, last, of the pose `vehicle` (3,),
-    from which the tracks were seen. The placement is linear in both, in the tracks' own errors, and in the
-    second differences, which have the standard deviation `SIGMA_BEND`.
+    `joint` is that of the known control points and, last, of the pose `vehicle` (3,) from which the tracks
+    were seen. The placement is linear in both, in the tracks' errors, and in the second differences.
     """
     changes, noises, blocks, begin, end, eye = [], [], [], 0, 0, np.eye(POINT)
     for outlook in outlooks:
@@ -278,27 +250,24 @@ def extended_rows(
     """Return the row of each boundary, extended through its tentative tracks, and the indices of these."""
     tracks = {label: _tracks(track, label, tentative[label], t) for label in BOUNDARIES}
     rows = {label: _row(track, label, tentative[label].points[tracks[label]]) for label in BOUNDARIES}
-    newest = path.points[path.stations >= path.length - RECALL]
-    extend_rows(rows[LEFT], rows[RIGHT], newest, track.settings.growth.threshold)
+    driven = newest(path.ahead(track.state.poses[-1], 0.0)).points
+    extend_rows(rows[LEFT], rows[RIGHT], driven, track.settings.growth.threshold)
     return {label: (row, tracks[label][row.chosen]) for label, row in rows.items()}
 
 
 def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> IntArray:
     """Return the indices of the tracks near the vehicle that are confirmed or were seen just now.
 
-    A track at a cone that the curve has already is left out: across an infield, the sensor sees the row of an
-    earlier stretch again.
+    Tracks at cones of the curve are left out: across an infield the sensor sees an earlier stretch again.
     """
     settings, state = track.settings.growth, track.state
-    offset = tracks.points - state.poses[-1, :2]
-    near = np.hypot(offset[:, 0], offset[:, 1]) < REACH
+    near = np.hypot(*(tracks.points - state.poses[-1, :2]).T) < REACH
     believed = (tracks.counts >= settings.sightings) | (tracks.last_t > t - MEMORY)
     indices = np.flatnonzero(near & believed)
     if label in state.boundaries:
         mapped = state.boundaries[label].observed
-        offset = tracks.points[indices, None] - mapped
-        distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
-        indices = indices[(distance > settings.threshold).all(axis=1)]
+        _, is_mapped = nearest_within(tracks.points[indices], mapped, settings.threshold)
+        indices = indices[~is_mapped]
     return indices[undisputed(track, label, tracks.points[indices], settings.merge_radius)]
 
 

@@ -5,10 +5,7 @@ from typing import Literal
 
 from pathspace_graph.settings.checked import Positive
 
-Knots = Literal["cones", "curvature"]
-"""What the knots of a closed boundary follow: its cones or its curvature."""
-
-
+Knots = Literal["cones", "curvature"]  # what the knots of a closed boundary follow
 Start = Literal["auto", "online", "odometry"]
 
 

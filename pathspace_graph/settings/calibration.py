@@ -1,8 +1,4 @@
-"""Settings of the constant errors of odometry and sensor, which are estimated along with the map.
-
-The priors are those of a calibrated vehicle. Where the drive contradicts one of them, they become wide. What
-a drive does not show stays at its prior.
-"""
+"""Priors of the constant errors of odometry and sensor, which become wide where a drive contradicts them."""
 
 from dataclasses import dataclass, replace
 from math import inf
@@ -101,8 +97,7 @@ class CalibrationSettings(Positive):
     def widened(self) -> Self:
         """Return the settings of wide priors, which are not doubted again.
 
-        The scale of the ranges stays as it is known: it cannot be told from the scale of the speeds, and the
-        size of the map would rest on the wheels alone.
+        The scale of the ranges keeps its own, or the size of the map would rest on the wheels alone.
         """
         names = (f"sigma_{name}" for name in self.SIGNED if name != "range_scale")
         return replace(self, doubt=inf, **{name: WIDE_SENSOR * getattr(self, name) for name in names})

@@ -18,13 +18,9 @@ _NUMBERS: Final[dict[Any, tuple[type[Any], str]]] = {
 class Positive:
     """Settings whose numbers are all positive and, unless they are listed as unlimited, finite."""
 
-    UNLIMITED: ClassVar[tuple[str, ...]] = ()
-    """Numbers that may be infinite, which means that there is no limit."""
-
+    UNLIMITED: ClassVar[tuple[str, ...]] = ()  # numbers that may be infinite: there is no limit then
     SIGNED: ClassVar[tuple[str, ...]] = ()  # numbers that may have either sign
-
-    prefix: ClassVar[str]
-    """What stands before the names of the settings on the command line."""
+    prefix: ClassVar[str]  # what stands before the names of the settings on the command line
 
     def __init_subclass__(cls, group: str | None = None) -> None:
         """Set the prefix from the name of the group, which is by default that of the class."""
@@ -41,15 +37,14 @@ class Positive:
                 raise SettingsError(f"{self.prefix}{entry.name}: {expected:.200}")
             if isinstance(value, bool) or not isinstance(value, int | float):
                 continue
-            wrong = ""
             if entry.name in self.SIGNED:
-                wrong = "" if isfinite(value) else "a number"
-            elif not value > 0:
-                wrong = "a positive number"
-            elif value == inf and entry.name not in self.UNLIMITED:
-                wrong = "a finite number"
-            if wrong:
-                raise SettingsError(f"{self.prefix}{entry.name}: expected {wrong}, found {value}")
+                expected = "" if isfinite(value) else "a number"
+            elif value > 0:
+                expected = "a finite number" if value == inf and entry.name not in self.UNLIMITED else ""
+            else:
+                expected = "a positive number"
+            if expected:
+                raise SettingsError(f"{self.prefix}{entry.name}: expected {expected}, found {value}")
 
 
 @cache

@@ -1,8 +1,4 @@
-"""Settings of the estimators: those that a user or a study changes, each a frozen dataclass.
-
-A number that nobody changes is a constant: beside its use, or a class variable here where several rooms
-share it.
-"""
+"""Settings of the estimators; a number that nobody changes is a constant, here or beside its use."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
@@ -95,9 +91,8 @@ class GateSettings(Positive):
     sigma_floor: ClassVar[float] = 0.1  # m, of errors that the model does not know, added in the gate
     rough: ClassVar[float] = 3.0  # distance from a curve beyond which no detection is associated with it, m
     station_step: ClassVar[float] = 1.5  # m in a cycle, beyond which the pose's foot point is searched for
-    station_ahead: ClassVar[float] = 8.0
-    station_behind: ClassVar[float] = 3.0
-    """How far that search goes ahead of the last foot point, and back, m along the curve."""
+    station_ahead: ClassVar[float] = 8.0  # how far that search goes ahead of the last foot point, m
+    station_behind: ClassVar[float] = 3.0  # how far it goes back, m along the curve
     station_lateral: ClassVar[float] = 10.0
     """Distance from a curve at which the vehicle has lost its place, m, as where it leads the other way:
     the whole of a closed curve is searched then, or the end of an open one."""
@@ -106,7 +101,10 @@ class GateSettings(Positive):
 
 @dataclass(frozen=True)
 class FarSettings(Positive):
-    """The inactive part of the map, which is not solved for in every cycle: it changes speed, not results."""
+    """The inactive part of the map, which is not solved for in every cycle.
+
+    On a closed map it changes the speed only; an open one may move by decimetres with `far.stretch`.
+    """
 
     stretch: float = 12.0
     """Least length behind the vehicle of which an open curve's control points become inactive, m."""

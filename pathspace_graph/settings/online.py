@@ -70,11 +70,10 @@ class ClosingSettings(Positive):
 
 @dataclass(frozen=True)
 class HealthSettings(Positive):
-    """Limits of a good, a degraded and a lost estimate.
+    """Limits of a good, a degraded and a lost estimate, by the share of detections that the map explains.
 
-    The share of detections that the map explains is taken over the newest `window`. A coloured detection in
-    the view of the curves is explained if it is in use, or if it lies on a closed curve of its colour farther
-    along: in a hairpin the sensor sees the next stretch across the infield.
+    A coloured detection in the view of the curves is explained if it is in use, or lies on a closed curve of
+    its colour farther along: in a hairpin the sensor sees the next stretch across the infield.
     """
 
     window: float = 1.0
@@ -121,10 +120,7 @@ class LimitSettings(Positive, group="limits"):
 
 @dataclass(frozen=True)
 class MotionSettings(Positive):
-    """The check of the odometry against the detections of the newest cycles.
-
-    Where they contradict it, the wheels slip or the readings fail, and their motion takes its place.
-    """
+    """The check of the odometry against the detections; where they contradict it, their motion is used."""
 
     UNLIMITED = ("doubt",)
 

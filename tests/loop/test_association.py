@@ -204,9 +204,10 @@ def test_the_other_leg_of_a_hairpin_accepts_nothing(hairpin: FixedLagMapper) -> 
 
 def test_a_vehicle_that_has_lost_its_place_is_relocated(hairpin: FixedLagMapper) -> None:
     """Its parameters are put on the other leg, where both curves lead against its heading."""
-    before = {label: hairpin.pose_parameter(label) for label in (LEFT, RIGHT)}
-    for u in hairpin.smoother.map.state.pose_u.values():
+    pose_u = hairpin.smoother.map.state.pose_u
+    before = {label: pose_u[label][-1] for label in (LEFT, RIGHT)}
+    for u in pose_u.values():
         np.subtract(u, 30.0, out=u)
     used_of(hairpin, at([]), [])
     for label, u in before.items():
-        assert hairpin.pose_parameter(label) == pytest.approx(u + SPEED * CYCLE * DT, abs=0.1)
+        assert hairpin.smoother.map.state.pose_u[label][-1] == pytest.approx(u + SPEED * CYCLE * DT, abs=0.1)
