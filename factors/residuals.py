@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import gammaincinv
+import scipy  # which imports its modules when they are used
 
 from .arrays import Array
 from .bspline import SpanPolynomials, scatter
@@ -26,7 +26,7 @@ class ProjectionRows:
 
 def chi2_quantile(probability: float, degrees: int) -> float:
     """Return the chi-square quantile; importing `scipy.stats` for it would dominate the start-up time."""
-    return 2.0 * float(gammaincinv(0.5 * degrees, probability))
+    return 2.0 * float(scipy.special.gammaincinv(0.5 * degrees, probability))
 
 
 def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: float) -> Array:

@@ -6,13 +6,10 @@ An installed package adds an estimator by an entry point in the group `pathspace
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final, Literal
 
-from pathspace_graph.baselines import centerline
-from pathspace_graph.baselines.filters import CkfMapper, LandmarkCkf
-from pathspace_graph.baselines.landmark_batch import LandmarkBatch
-from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Log
@@ -29,6 +26,8 @@ MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or
 
 DEFAULT: Final = "fixed-lag"  # online estimator where none is named
 DEFAULT_BATCH: Final = "spline"  # batch estimator where none is named
+CENTERLINE: Final = "centerline-fixed-lag"
+CENTERLINE_BATCH: Final = "centerline"  # estimators of one centre line, online and as a batch
 ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add online estimators
 BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
 
@@ -42,21 +41,27 @@ def _load(point: EntryPoint, settings: MapperSettings, noise: KnownNoise) -> Any
     return point.load()(settings, noise.odometry)
 
 
+def _baseline(home: str, settings: MapperSettings, noise: KnownNoise, **others: Any) -> Any:
+    """Return the estimator of a class `module:name` of the baselines, which is imported by then."""
+    module, name = home.split(":")
+    return getattr(import_module(f".baselines.{module}", __package__), name)(settings, noise, **others)
+
+
 ONLINE: Final[dict[str, MakeOnline]] = {
     **_installed(ONLINE_GROUP),
     DEFAULT: FixedLagMapper,
-    "landmark-fixed-lag": LandmarkFixedLag,
-    "ckf": CkfMapper,
-    "landmark-ckf": LandmarkCkf,
-    centerline.ONLINE_NAME: centerline.CenterlineMapper,
+    "landmark-fixed-lag": partial(_baseline, "landmark_fixed_lag:LandmarkFixedLag"),
+    "ckf": partial(_baseline, "filters:CkfMapper"),
+    "landmark-ckf": partial(_baseline, "filters:LandmarkCkf"),
+    CENTERLINE: partial(_baseline, "centerline:CenterlineMapper"),
 }
 """Makers of online estimators, from settings and known noise; see `_load` for other packages."""
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
     DEFAULT_BATCH: lambda settings, noise: BatchMapper(settings, noise, FixedLagMapper),
-    "landmark-batch": LandmarkBatch,
-    centerline.NAME: partial(centerline.CenterlineBatch, online=FixedLagMapper),
+    "landmark-batch": partial(_baseline, "landmark_batch:LandmarkBatch"),
+    CENTERLINE_BATCH: partial(_baseline, "centerline:CenterlineBatch", online=FixedLagMapper),
 }
 """Makers of batch estimators, in the same way."""
 
@@ -79,7 +84,7 @@ def _check(name: str, known: Mapping[str, Any], kind: str) -> None:
 
 def for_map(name: str, kind: MapKind) -> str:
     """Return the estimator with this kind of map in place of a default one; SettingsError for others."""
-    lines = {DEFAULT: centerline.ONLINE_NAME, DEFAULT_BATCH: centerline.NAME}
+    lines = {DEFAULT: CENTERLINE, DEFAULT_BATCH: CENTERLINE_BATCH}
     if kind == "boundaries" or name in lines.values():
         return name
     if name not in lines:

@@ -1,9 +1,10 @@
 """The interface of estimators, and the loop that feeds a log to an online one cycle by cycle."""
 
+import gc
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import cached_property
 from math import nan
@@ -222,6 +223,19 @@ def timed_update(
     return estimate, time.perf_counter() - begin, time.thread_time() - worked
 
 
+@contextmanager
+def spared_by_collector() -> Iterator[None]:
+    """Keep what exists already out of garbage collections, of which a full one would take a cycle 0.1 s."""
+    begins = gc.get_freeze_count() == 0  # else a caller has done it, and goes on with it
+    if begins:
+        gc.freeze()
+    try:
+        yield
+    finally:
+        if begins:
+            gc.unfreeze()
+
+
 def run_online(
     log: Log,
     estimator: OnlineEstimator,
@@ -233,12 +247,13 @@ def run_online(
     """Feed a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
 
     Maps are kept as they stood at the `snapshot_times` (s, ascending). The `observers` are shown each cycle,
-    outside of its time. BLAS has one thread, and results of another process are waited for between cycles.
+    outside of its time. BLAS has one thread, results of another process are waited for between cycles, and
+    Python's collector leaves alone what there was before the run.
     """
     check_type("log", log, Log)
     check_type("estimator", estimator, OnlineEstimator)
     run = _Run(estimator, [float(t) for t in snapshot_times], observers)
-    with threadpool_limits(limits=1):
+    with threadpool_limits(limits=1), spared_by_collector():
         for odometry, detections in split_odometry(log):
             run.cycle(odometry, detections)
         return run.result(name)

@@ -1,13 +1,17 @@
 """Sampled curves in the plane, and the middle of a track: a smooth curve between two rows of cones."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
+import scipy  # which imports its modules when they are used
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]
@@ -157,10 +161,10 @@ def resample(points: FloatArray, step: float, closed: bool) -> tuple[FloatArray,
 def _smooth(curve: FloatArray, closed: bool) -> FloatArray:
     sigma = SMOOTHING / STEP
     if closed:
-        return np.asarray(gaussian_filter1d(curve, sigma, axis=0, mode="wrap"))
+        return np.asarray(scipy.ndimage.gaussian_filter1d(curve, sigma, axis=0, mode="wrap"))
     pad = min(int(4 * sigma), len(curve) - 1)
     padded = np.pad(curve, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
-    return np.asarray(gaussian_filter1d(padded, sigma, axis=0)[pad:-pad])
+    return np.asarray(scipy.ndimage.gaussian_filter1d(padded, sigma, axis=0)[pad:-pad])
 
 
 def _normals(curve: FloatArray, closed: bool) -> FloatArray:
@@ -185,5 +189,5 @@ def _as_spline(curve: FloatArray, clearance: FloatArray, closed: bool) -> Centre
     if closed:
         knots, at_knots = ring(knots), np.append(at_knots, at_knots[0])
     s = arc_lengths(knots)
-    spline = CubicSpline(s, knots, bc_type="periodic" if closed else "not-a-knot")
+    spline = scipy.interpolate.CubicSpline(s, knots, bc_type="periodic" if closed else "not-a-knot")
     return CentreLine(spline, float(s[-1]), closed, at_knots)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -246,6 +247,22 @@ def test_an_outline_is_preferred_to_a_map() -> None:
 def test_blas_has_one_thread_while_it_runs() -> None:
     _, estimator = run(2)
     assert estimator.threads == {1}
+
+
+def test_the_collector_leaves_alone_what_there_was_before() -> None:
+    """A full collection of all that is imported would take some cycle 0.1 s."""
+    frozen: list[int] = []
+    run(2, observers=[lambda _: frozen.append(gc.get_freeze_count())])
+    assert min(frozen) > 0 == gc.get_freeze_count()
+
+
+def test_what_a_caller_froze_stays_frozen() -> None:
+    gc.freeze()
+    try:
+        run(2)
+        assert gc.get_freeze_count() > 0
+    finally:
+        gc.unfreeze()
 
 
 class Forbidden:

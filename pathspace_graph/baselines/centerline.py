@@ -31,7 +31,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.centre_line import SIDE, CentreCurve, Ribbon, find_line
 
 NAME: Final = "centerline"
-ONLINE_NAME: Final = "centerline-fixed-lag"  # names of the estimators on the command line
 ROOM: Final = 4.0  # distance along the line within which a foot point is searched for (m)
 RIBBON_LETTER: Final = "a"  # of the keys of a ribbon's control points, which hold `Point3` (x, y, h)
 ROUNDS: Final = 2  # optimizations; before each, the control points are held beside the poses anew

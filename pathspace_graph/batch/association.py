@@ -157,9 +157,14 @@ def _nearest_in_view(
     boundary, gate, step = state.boundaries[label], settings.gate, settings.batch.association.step
     ahead = np.arange(-gate.view_behind, gate.view_ahead + step, step)
     u = state.pose_u[label][:, None] + ahead
-    seen = boundary.evaluate(state.control_points(label), u.ravel()).reshape(*u.shape, 2)[cycles]
-    square = (seen[:, :, 0] - points[:, :1]) ** 2 + (seen[:, :, 1] - points[:, 1:]) ** 2
-    return np.asarray(u[cycles, square.argmin(axis=1)])
+    x, y = boundary.evaluate(state.control_points(label), u.ravel()).T.reshape(2, *u.shape)
+    dx, dy = x[cycles], y[cycles]
+    dx -= points[:, :1]
+    dy -= points[:, 1:]
+    dx *= dx
+    dy *= dy
+    dx += dy
+    return np.asarray(u[cycles, dx.argmin(axis=1)])
 
 
 # --- cones of a curve ------------------------------------------------------------------------------------
@@ -199,19 +204,19 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     points = to_map(detections.point[rows], state.variables.poses_at(cycles))
     used = detections.used[rows] & (detections.boundary[rows] == label)
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
-    others = points[~used], cycles[~used]
-    beside[~used], on_curve[~used], u[~used] = _beside(state, *others, label, settings)
+    beside[~used], on_curve[~used], u[~used] = _beside(state, points[~used], cycles[~used], label, settings)
     u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
 
-    def clustered(chosen: BoolArray) -> Cones:
+    def clustered(chosen: BoolArray | IntArray) -> Cones:
         along = points[chosen], u[chosen], covariances[chosen]
         return cluster(*along, boundary.length, boundary.periodic, settings)
 
     cones = clustered(on_curve)
     if len(cones.u) == 0:
         return cones
-    near = nearest_within(points, cones.points, settings.growth.merge_radius)[1]
-    off_curve = clustered(beside & ~on_curve & ~near)
+    others = np.flatnonzero(beside & ~on_curve)
+    near = nearest_within(points[others], cones.points, settings.growth.merge_radius)[1]
+    off_curve = clustered(others[~near])
     cones = cones.merged(off_curve.where(off_curve.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
         pose_u = state.pose_u[label]
@@ -295,12 +300,13 @@ def cluster(
     peaks = _peaks(u, weight, length, periodic, SEPARATION * radius)
     if len(peaks) == 0:
         return Cones(np.zeros((0, 2)), peaks, np.zeros(0, np.intp))
-    distance = np.abs(u[:, None] - peaks)
+    after = peaks.searchsorted(u)
+    beside = np.sort([(after - 1) % len(peaks), after % len(peaks)], axis=0)  # the first of two as near
+    distance = np.abs(u - peaks[beside])
     if periodic:
         distance = np.minimum(distance, length - distance)
-    nearest = distance.argmin(axis=1)
-    inside = distance[np.arange(len(u)), nearest] < radius
-    member = nearest[inside]
+    inside = distance.min(axis=0) < radius
+    member = beside[distance.argmin(axis=0), np.arange(len(u))][inside]
     count = np.bincount(member, minlength=len(peaks))
     enough = count >= max(settings.growth.sightings, MIN_SHARE * float(np.median(count)))
     information, vector = np.zeros((len(peaks), 2, 2)), np.zeros((len(peaks), 2))

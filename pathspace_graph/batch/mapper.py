@@ -278,10 +278,9 @@ class BatchMapper:
             system.revisits, system.kernel = mapper.revisits, Biweight(LOOSE_GATE)
             watch.lap("start")
             found = optimizer.find(state)
-        at, convergence = found
-        at, convergence = _with_doubt(optimizer, at, convergence)
+        at, convergence, known = _with_doubt(optimizer, *found)
         watch.lap("optimum")
-        joint, vehicle = system.eliminated(at).joint(at.state.map_keys), _vehicle(system, at)
+        joint, vehicle = known.covariance(at.state.map_keys), _vehicle(at.state, known)
         watch.lap("covariance")
         detections = deepcopy(detections)  # the result's problem keeps its own associations
         state, change = simplified(at.state, detections, settings)
@@ -329,14 +328,18 @@ def unmapped(detections: DetectionTable, poses: Array) -> str:
     return f"the boundaries lack the cones of {100.0 * poor.mean():.0f} % of the drive"
 
 
-def _vehicle(system: BatchSystem, at: Evaluation) -> VehicleState:
+def _known(system: BatchSystem, at: Evaluation) -> FactoredSystem:
+    """Return the system of the map, the calibrations and the last pose, with all other poses eliminated."""
+    keys = at.state.variables.layout.keys
+    kept = Layout(keys[~are_poses(keys) | (keys == pose_key(len(at.state.poses) - 1))])
+    return FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
+
+
+def _vehicle(state: State, known: FactoredSystem) -> VehicleState:
     """Return the last pose and the calibration, with their joint covariance."""
-    variables, last = at.state.variables, pose_key(len(at.state.poses) - 1)
-    keys = variables.layout.keys
-    kept = Layout(keys[~are_poses(keys) | (keys == last)])
-    factored = FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
-    covariance = factored.covariance(np.append(last, variables.calibration_keys))
-    return VehicleState.split(at.state.poses[-1], variables.calibrations, covariance)
+    variables, last = state.variables, pose_key(len(state.poses) - 1)
+    covariance = known.covariance(np.append(last, variables.calibration_keys))
+    return VehicleState.split(state.poses[-1], variables.calibrations, covariance)
 
 
 def find_optimum_from_odometry(
@@ -367,13 +370,14 @@ def find_optimum_from_odometry(
 
 def _with_doubt(
     optimizer: Optimizer, at: Evaluation, convergence: Convergence
-) -> tuple[Evaluation, Convergence]:
-    """Return the optimum, searched again while it contradicts the prior of a calibration."""
+) -> tuple[Evaluation, Convergence, FactoredSystem]:
+    """Return the optimum, searched again while it contradicts the prior of a calibration, and `_known`."""
     system, variables = optimizer.system, at.state.variables
-    variance = np.diag(system.eliminated(at).joint(variables.calibration_keys))
+    known = _known(system, at)
+    variance = np.diag(known.covariance(variables.calibration_keys))
     believed = doubted(variables.calibrations, variance, system.settings)
     if believed == system.settings:
-        return at, convergence
+        return at, convergence, known
     system.settings = believed
     system.chain = replace(system.chain, calibration_sigma=np.array(believed.odometry.sigmas_calibration))
     return _with_doubt(optimizer, *optimizer.find(at.state))

@@ -14,7 +14,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights
 from pathspace_graph.factors.se2 import left_of, rotations, to_map
-from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
+from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, in_vehicle
 
 from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, Follower, SeenCycle, Sightings, TwistRecord
 
@@ -47,6 +47,9 @@ FIRST_SHARE: Final = 0.5  # share of a cone's error that stays with it, unless c
 FIRST_CONES: Final = 8.0  # number of cones that `FIRST_SHARE` counts as much as
 LEAST: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
 
+Lagged = tuple[IntArray, IntArray, Array]
+"""Pairs of sightings of one cone, by index, and their lags (s)."""
+
 
 @dataclass(eq=False)
 class _Cones:
@@ -67,7 +70,7 @@ class _Cones:
 
         With the noise in them weights would prefer short sightings, and errors come out too small.
         """
-        seen = self.table.point - np.einsum("nij,nj->ni", rotations(-self.table.pose[:, 2]), off)
+        seen = self.table.point - in_vehicle(off, self.table.pose)
         ranges = np.maximum(np.hypot(*seen.T), np.finfo(float).tiny)
         return replace(
             self, ranges=ranges, columns=_columns(self.table, np.repeat(self.begins, self.counts), seen)
@@ -107,12 +110,14 @@ def _columns(table: Sightings, first: IntArray, seen: Array) -> Array:
     The bias of the yaw rate counts from each cone's first sighting, at rows (n,): before, it turns all of the
     cone's alike.
     """
-    turn, by_bias, then = rotations(table.pose[:, 2]), table.by_bias, table.by_bias[first]
-    moved = table.pose[:, :2] - table.pose[first, :2]
-    at_pose = by_bias[:, :2] - then[:, :2] - then[:, 2:] * left_of(moved)
-    turning = at_pose + (by_bias - then)[:, 2:] * left_of(np.einsum("nij,nj->ni", turn, seen))
-    sensor = np.einsum("nij,njk->nik", turn, by_sensor(seen, table.twist))
-    return np.concatenate([sensor, turning[:, :, None]], axis=2)
+    by_bias, then, moved = table.by_bias, table.by_bias[first], table.pose[:, :2] - table.pose[first, :2]
+    c, s = np.cos(table.pose[:, 2:]), np.sin(table.pose[:, 2:])
+    (x, y), (ahead, left) = by_sensor(seen, table.twist).transpose(1, 0, 2), np.hsplit(seen, 2)
+    columns, turned = np.empty((len(seen), 2, SENSOR_SIZE + 1)), by_bias - then
+    columns[:, 0, :SENSOR_SIZE], columns[:, 1, :SENSOR_SIZE] = c * x - s * y, s * x + c * y
+    in_map = np.concatenate([c * ahead - s * left, s * ahead + c * left], axis=1)
+    columns[:, :, -1] = turned[:, :2] - then[:, 2:] * left_of(moved) + turned[:, 2:] * left_of(in_map)
+    return columns
 
 
 def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Array) -> Array:
@@ -132,11 +137,13 @@ def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Arra
     mean_points = (total @ cones.sums(information @ cones.points[:, :, None]))[:, :, 0]
     columns = cones.columns - cones.spread(mean_columns)
     points = cones.points - cones.spread(mean_points)
-    weighted = information @ columns
-    covariance = np.linalg.inv(np.einsum("nik,nil->kl", columns, weighted) + np.diag(PRIOR**-2))
-    errors = -covariance @ np.einsum("nik,ni->k", weighted, points)
+    weighted = information[:, :, :1] * columns[:, :1] + information[:, :, 1:] * columns[:, 1:]
+    stacked = weighted.reshape(-1, len(PRIOR)).T
+    own = stacked @ columns.reshape(-1, len(PRIOR))
+    covariance = np.asarray(np.linalg.inv(own + np.diag(PRIOR**-2)), np.float64)
+    errors = -covariance @ (stacked @ points.ravel())
     left = points + columns @ errors
-    scores = cones.sums(np.einsum("nik,ni->nk", weighted, left))
+    scores = cones.sums(weighted[:, 0] * left[:, :1] + weighted[:, 1] * left[:, 1:])
     return errors, covariance, _clustered(cones, scores, covariance), left
 
 
@@ -165,25 +172,27 @@ def _residuals(
     (i, j), t, ranges = cones.pairs, cones.table.t, cones.ranges
     near = ranges[j] < NEAR * ranges[i]
     i, j = i[near], j[near]
-    rows, begins, counts = np.unique(i, return_index=True, return_counts=True)
+    begins = np.flatnonzero(np.diff(i, prepend=-1))
+    rows, counts = i[begins], np.diff(np.append(begins, len(i)))
     enough = counts >= 2
     if not enough.any():
         return np.zeros(0, np.intp), np.zeros((2, 0)), np.zeros((2, 0))
     points = cones.points + cones.columns @ errors
-    isotropic = 0.5 * (noise[0].sigmas(ranges) ** 2 + noise[1].sigmas(ranges) ** 2)
+    sigmas = [one.sigmas(ranges) for one in noise]
+    weight = (1.0 / (0.5 * (sigmas[0] ** 2 + sigmas[1] ** 2)))[j]
+    total = np.add.reduceat(weight, begins)
 
     def mean(values: Array) -> Array:
-        """Return the weighted mean of values (p, ...) of the pairs over the references of each row."""
-        weight = (1.0 / isotropic[j]).reshape(-1, *[1] * (values.ndim - 1))
-        return np.asarray(np.add.reduceat(weight * values, begins) / np.add.reduceat(weight, begins))
+        """Return the weighted mean of values (p,) of the pairs over the references of each row."""
+        return np.asarray(np.add.reduceat(weight * values, begins) / total)
 
     lag = mean(np.abs(t[j] - t[i]))
-    off = points[rows] - mean(points[j])
+    off = points[rows] - np.stack([mean(of[j]) for of in points.T], axis=1)
     offsets = np.array([(off * axis[rows]).sum(axis=1) for axis in (cones.ray, cones.side)])
     across = odometry[1] ** 2 + (odometry[2] * ranges[rows]) ** 2
     known = np.array([odometry[0] ** 2 * lag, across * lag])
     for axis, one in enumerate(noise):
-        known[axis] += mean(one.sigmas(ranges[j])) ** 2 * np.maximum(1.0 / counts, one.share)
+        known[axis] += mean(sigmas[axis][j]) ** 2 * np.maximum(1.0 / counts, one.share)
     return rows[enough], offsets[:, enough], known[:, enough]
 
 
@@ -198,7 +207,7 @@ def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _ray_noise(
-    cones: _Cones, rows: IntArray, off: Array, reference: Array, least: tuple[float, float]
+    cones: _Cones, rows: IntArray, lagged: Lagged, off: Array, reference: Array, least: tuple[float, float]
 ) -> RayNoise:
     """Return the noise along or across the ray by range, and how long it stays, from `_residuals` (k,)."""
     ranges = cones.ranges[rows]
@@ -211,9 +220,8 @@ def _ray_noise(
     scatter = (MAD * medians) ** 2
     sigma = np.sqrt(np.clip(scatter - known, 0.25 * scatter, 4.0 * scatter))
     found = RayNoise(np.maximum(_line(middle, sigma), least))
-    cone = cones.table.cone[rows]
-    share, time = _staying(cone, cones.table.t[rows], off, reference, found.sigmas(ranges))
-    count = len(np.unique(cone))
+    share, time = _staying(lagged, off, reference, found.sigmas(ranges))
+    count = len(np.unique(cones.table.cone[rows]))
     share = (count * share + FIRST_CONES * FIRST_SHARE) / (count + FIRST_CONES)
     return replace(found, share=share, time=time)
 
@@ -229,17 +237,23 @@ def _line(ranges: Array, sigma: Array) -> Array:
     return np.asarray(share * (np.arange(2) == best))
 
 
-def _staying(cone: IntArray, t: Array, off: Array, reference: Array, sigma: Array) -> tuple[float, float]:
-    """Return share and correlation time (s) of the errors (k,) of a cone that stay with it."""
-    whitened, own = np.clip(off / sigma, -3.0, 3.0), reference / sigma**2
+def _lagged(cone: IntArray, t: Array) -> Lagged:
+    """Return the pairs of one cone's sightings (k,) whose lag is inside of `LAGS`, and the lags (s)."""
     i, j = pairs(cone)
     lag = t[j] - t[i]
+    inside = (lag >= LAGS[0]) & (lag < LAGS[-1])
+    return i[inside], j[inside], lag[inside]
+
+
+def _staying(lagged: Lagged, off: Array, reference: Array, sigma: Array) -> tuple[float, float]:
+    """Return share and correlation time (s) of the errors (k,) of a cone that stay with it."""
+    whitened, own = np.clip(off / sigma, -3.0, 3.0), reference / sigma**2
+    i, j, lag = lagged
     product = whitened[i] * whitened[j] - 0.5 * (own[i] + own[j])
     scale = max(float((whitened**2 - own).mean()), 0.25)
     place = np.digitize(lag, LAGS)
-    counts = np.bincount(place, minlength=len(LAGS) + 1)
-    enough = np.flatnonzero(counts[:-1] >= MIN_ROWS // 2)
-    enough = enough[enough > 0]
+    counts = np.bincount(place, minlength=len(LAGS))
+    enough = np.flatnonzero(counts >= MIN_ROWS // 2)
     if len(enough) == 0:
         return 0.0, 1.0
     lags, correlations = (
@@ -308,9 +322,10 @@ class Measurement:
         rows, (along, across), (by_along, by_across) = _residuals(cones, errors, noise, walk)
         if len(rows) < MIN_ROWS:
             return self._passed(self._found)
+        lagged = _lagged(cones.table.cone[rows], cones.table.t[rows])
         self._noise = (
-            _ray_noise(cones, rows, along, by_along, (LEAST[0], 0.0)),
-            _ray_noise(cones, rows, across, by_across, (0.0, LEAST[1])),
+            _ray_noise(cones, rows, lagged, along, by_along, (LEAST[0], 0.0)),
+            _ray_noise(cones, rows, lagged, across, by_across, (0.0, LEAST[1])),
         )
         self._rounds -= 1
         return None if self._rounds else self._passed(self._result(cones, errors, *covariances))

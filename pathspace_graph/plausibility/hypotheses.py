@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import Final, Literal, Self
 
 import numpy as np
-from scipy.special import bdtrc
+import scipy  # which imports its modules when they are used
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.odometry import integrate_poses
@@ -241,7 +241,7 @@ def far_better(trial: Trial, reference: Trial) -> dict[str, float] | None:
     if not telling.any():
         return None
     share, as_written = (float(one.explained[telling].mean()) for one in (trial, reference))
-    chance = float(bdtrc(int((gain[telling] > 0.0).sum()) - 1, int(telling.sum()), 0.5))
+    chance = float(scipy.special.bdtrc(int((gain[telling] > 0.0).sum()) - 1, int(telling.sum()), 0.5))
     clear = chance < CHANCE and share > FAR_BETTER * as_written and share > LEAST_SHARE
     return {"as_written": as_written, "share": share} if clear else None
 
