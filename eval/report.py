@@ -163,13 +163,13 @@ class Plan:
         return {"camera": views.camera_table(self._shipped("camera", folder, seeds=(0,))[1])}
 
     def hard(self, folder: Path) -> Views:
-        """Drive the study `hard` with one seed."""
-        study, frame = self._shipped("hard", folder, seeds=(0,))
+        """Drive the study `hard`."""
+        study, frame = self._shipped("hard", folder)
         return {"hard": views.lap_columns(frame, tuple(dict.fromkeys([1, 2, study.laps])), CLOSING)}
 
     def endurance(self, folder: Path) -> Views:
-        """Drive a hundred laps on two tracks."""
-        study, frame = self._shipped("endurance", folder, tracks=GENERATED[:2])
+        """Drive a hundred laps on each track."""
+        study, frame = self._shipped("endurance", folder)
         shown = [lap for lap in (3, 10, 30, 100) if lap <= study.laps] or [study.laps]
         return {"endurance": views.lap_columns(frame, shown, ENDURANCE)}
 
@@ -188,8 +188,8 @@ class Plan:
         return {name: views.study_table(study, frame)}
 
     def faults(self, folder: Path) -> Views:
-        """Drive the suite of faults at the middle strengths with one seed."""
-        study = replace(of_middle_strength(suite()), seeds=(0,))
+        """Drive the suite of faults at the middle strengths."""
+        study = of_middle_strength(suite())
         if self.quick:
             study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
         frame = self._run(study, folder)

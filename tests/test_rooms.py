@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -71,9 +72,15 @@ ARROWS: dict[str, set[str]] = {
 """What each room may import, beside itself and the leaves: arrows point down only."""
 
 
+@cache
+def nodes(file: Path) -> list[ast.AST]:
+    """Every node of a module's source, which most tests walk over."""
+    return [*ast.walk(ast.parse(file.read_text()))]
+
+
 def imports(module: str, file: Path) -> Iterator[tuple[str, ast.ImportFrom]]:
     """Modules of the package that one imports, by name without the package's own, and the statements."""
-    for node in ast.walk(ast.parse(file.read_text())):
+    for node in nodes(file):
         if not isinstance(node, ast.ImportFrom):
             continue
         if node.level:
@@ -114,7 +121,7 @@ def test_the_imports_have_no_circle() -> None:
 
 def test_no_import_hides_inside_a_function() -> None:
     for module, file in modules().items():
-        for function in ast.walk(ast.parse(file.read_text())):
+        for function in nodes(file):
             if isinstance(function, ast.FunctionDef):
                 hidden = {name for node in ast.walk(function) for name in imported_by(node)}
                 assert hidden <= EXTRAS, f"{module}: {function.name}"
@@ -130,7 +137,7 @@ def test_imports_by_name_are_declared_and_follow_the_arrows() -> None:
 
 def imports_by_name(file: Path) -> Iterator[str]:
     """Modules of the package that `import_module` gets as a literal, without the package's own name."""
-    for node in ast.walk(ast.parse(file.read_text())):
+    for node in nodes(file):
         if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
             name = node.args[0].value if isinstance(node.args[0], ast.Constant) else ""
             if str(name).startswith(f"{PACKAGE}."):
@@ -180,7 +187,7 @@ ASSIGNED = {
 def test_what_changes_is_changed_by_its_owner() -> None:
     found: dict[str, set[str]] = {}
     for module, file in modules().items():
-        for function in ast.walk(ast.parse(file.read_text())):
+        for function in nodes(file):
             if isinstance(function, ast.FunctionDef):
                 found.setdefault(module, set()).update(assigned_to_others(function))
     others = {

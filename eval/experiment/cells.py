@@ -46,6 +46,10 @@ CELLS: Final = "cells"
 FORMAT: Final = "pathspace-cell/3"
 DIGEST: Final = "digest"
 """Key of a record's digest in its file."""
+RESOLUTION: Final = 1e-3
+"""Length (m) and angle (rad) to which the geometry of a track identifies it."""
+ROUNDING: Final = 1.0 / np.pi
+"""Shift by which no coordinate with few decimals lies on the edge between two whole millimetres."""
 Record = dict[str, Any]
 """What is kept of a cell, in the types of JSON only."""
 _latest: dict[str, Log] = {}
@@ -53,9 +57,13 @@ _latest: dict[str, Log] = {}
 
 
 def track_digest(track: Track) -> str:
-    """Return the identity of a track's geometry, wherever it came from."""
+    """Return the identity of a track's geometry to the millimetre, wherever it came from.
+
+    The last digits of a generated track depend on the processor; the seeds of its drives do not.
+    """
     parts = (track.left, track.right, track.other, track.start, track.cone_labels)
-    cones = b"|".join(np.ascontiguousarray(part, dtype=float).tobytes() for part in parts)
+    rounded = (np.floor(np.asarray(part) / RESOLUTION + ROUNDING).astype("<i8") for part in parts)
+    cones = b"|".join(part.tobytes() for part in rounded)
     return hashlib.sha256(cones + str(track.closed).encode()).hexdigest()[:20]
 
 

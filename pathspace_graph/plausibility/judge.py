@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -54,16 +55,26 @@ FRAMES: Final = {  # what a turn of the sensor (degrees), mirrored or not, means
     (180.0, True): "the sensor's frame has x to the rear",
     (-90.0, True): "the sensor's frame has x to the right and y to the rear",
 }
+MOST: Final = 1e20  # largest number of a log of which anything is said
 MIRRORED: Final = 0.0, True  # frame in which y points to the right and x ahead
 
 
 def hints(log: Log) -> list[Hint]:
-    """Return the likely mistakes in a log by its readings; there are none where evidence is weak."""
+    """Return the likely mistakes in a log by its readings; there are none where evidence is weak.
+
+    There are none either where a number is not finite, as such a log's files cannot be parsed.
+    """
     check_type("log", log, Log)
-    if len(log.odometry.t) < LEAST_TWISTS:
+    if len(log.odometry.t) < LEAST_TWISTS or not _has_numbers(log):
         return []
     scale = scale_of(log)
     return [scaled(hint, scale) for hint in _hints(scaled(log, 1.0 / scale))]
+
+
+def _has_numbers(log: Log) -> bool:
+    arrays = ((cycle.points_vehicle, cycle.covariances) for cycle in log.cycles)
+    parts = (*_stamps(log).values(), log.odometry.twist, *chain.from_iterable(arrays))
+    return all((np.abs(part) <= MOST).all() for part in parts)
 
 
 def _hints(log: Log) -> list[Hint]:
@@ -316,7 +327,6 @@ def camera(pairs: Pairs) -> list[Hint]:
     return [told("camera", thin="xy"[int(spread.argmin())], least=spread.min(), most=spread.max())]
 
 
-MOST: Final = 1e20  # largest number that is read, to say what it means
 NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
 SHOWN_WORDS: Final = 3  # most foreign labels that are shown
 

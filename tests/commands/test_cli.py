@@ -62,6 +62,13 @@ def test_a_batch_that_is_late_in_a_vehicle_is_told(
         assert (line in capsys.readouterr().out) == told
 
 
+def beginning_of(log_folder: Path, out: Path, cycles: int = 20) -> Path:
+    """A folder with the first cycles of a log; it knows no truth."""
+    log = read_log(log_folder)
+    write_log(replace(log, cycles=log.cycles[:cycles], truth=None), out)
+    return out
+
+
 def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
@@ -206,9 +213,9 @@ def test_an_estimate_that_cannot_be_computed_is_one_line_and_exit_code_3(
 def test_a_saved_mapper_goes_on_with_the_rest_of_a_log(
     log_folder: Path, map_folder: Path, tmp_path: Path
 ) -> None:
-    log, file = replace(read_log(log_folder), truth=None), tmp_path / "half.snap"
-    write_log(replace(log, cycles=log.cycles[: len(log.cycles) // 2]), tmp_path / "half")
-    assert main(["online", str(tmp_path / "half"), "--out", str(tmp_path / "map"), "--save", str(file)]) == 0
+    log, file = read_log(log_folder), tmp_path / "half.snap"
+    half = beginning_of(log_folder, tmp_path / "half", len(log.cycles) // 2)
+    assert main(["online", str(half), "--out", str(tmp_path / "map"), "--save", str(file)]) == 0
     resume = ["online", str(log_folder), "--out", str(tmp_path / "rest"), "--resume", str(file)]
     assert main(resume) == 0
     assert (tmp_path / "rest" / MAP_FILE).read_bytes() == (map_folder / MAP_FILE).read_bytes()
@@ -218,9 +225,9 @@ def test_a_saved_mapper_goes_on_with_the_rest_of_a_log(
 def test_a_log_that_does_not_go_on_is_refused(
     log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = tmp_path / "end.snap"
-    assert main(["online", str(log_folder), "--out", str(tmp_path / "map"), "--save", str(file)]) == 0
-    assert main(["online", str(log_folder), "--out", str(tmp_path / "more"), "--resume", str(file)]) == 2
+    log, file = beginning_of(log_folder, tmp_path / "log"), tmp_path / "end.snap"
+    assert main(["online", str(log), "--out", str(tmp_path / "map"), "--save", str(file)]) == 0
+    assert main(["online", str(log), "--out", str(tmp_path / "more"), "--resume", str(file)]) == 2
     assert "expected cycles after" in capsys.readouterr().err
     assert not (tmp_path / "more").exists()
 
@@ -357,10 +364,11 @@ def test_an_interrupt_leaves_nothing_half_written(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
+    log = beginning_of(log_folder, tmp_path / "log")
     monkeypatch.setattr("pathspace_graph.io.results.write_table", interrupt)
-    assert main(["online", str(log_folder), "--out", str(tmp_path / "deep" / "map")]) == 130
+    assert main(["online", str(log), "--out", str(tmp_path / "deep" / "map")]) == 130
     assert capsys.readouterr().err == "pathspace-graph: interrupted\n"
-    assert names(tmp_path) == set()
+    assert names(tmp_path) == {"log"}
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from ..scenes.drives import (
     exact_log,
     lap_log,
     map_log,
+    replay,
     true_poses,
 )
 
@@ -49,20 +51,32 @@ def run(log: Log) -> tuple[FixedLagMapper, list[CycleResult]]:
     return map_log(log)
 
 
-@pytest.fixture
-def before(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> FixedLagMapper:
-    """The mapper a cycle before it closed; each test has its own."""
+@pytest.fixture(scope="module")
+def snapshot(
+    log: Log, run: tuple[FixedLagMapper, list[CycleResult]], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """The mapper a cycle before it closed, as a file."""
     cycle = next(k for k, result in enumerate(run[1]) if result.closed)
     mapper, results = map_log(replace(log, cycles=log.cycles[:cycle]))
     assert not results[-1].closed
-    return mapper
+    file = tmp_path_factory.mktemp("before") / "mapper.snap"
+    mapper.save(file)
+    return file
+
+
+@pytest.fixture
+def before(snapshot: Path) -> FixedLagMapper:
+    """The mapper a cycle before it closed; each test has its own."""
+    return FixedLagMapper.restore(snapshot)
 
 
 @pytest.fixture(scope="module")
-def just_closed(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> FixedLagMapper:
+def just_closed(log: Log, snapshot: Path) -> FixedLagMapper:
     """The mapper after the cycle that closed it."""
-    cycle = next(k for k, result in enumerate(run[1]) if result.closed)
-    return map_log(replace(log, cycles=log.cycles[: cycle + 1]))[0]
+    mapper = FixedLagMapper.restore(snapshot)
+    cycles = [*split_odometry(log)]
+    assert replay(mapper, *cycles[mapper.smoother.next_cycle]).closed
+    return mapper
 
 
 def test_the_loop_closes_once_the_beginning_is_driven_again(

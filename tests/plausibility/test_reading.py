@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pathspace_graph import hints
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.log import Log, write_log
@@ -63,6 +65,22 @@ def test_a_refusal_without_a_likely_cause_is_as_it_was(tmp_path: Path) -> None:
     expected = "row 6: expected a number in column 'vx', found 'fast'"
     assert str(error.value) == f"{folder / 'odometry.csv'}, {expected}"
     assert refused_hints(folder) == []
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
+def test_a_log_in_memory_with_what_no_file_may_have_is_judged_as_its_files_are(
+    wrong: float, tmp_path: Path
+) -> None:
+    log = short_drive()
+    points = np.full_like(log.cycles[9].points_vehicle, wrong)
+    cycles = (*log.cycles[:9], replace(log.cycles[9], points_vehicle=points), *log.cycles[10:])
+    twists = log.odometry.twist.copy()
+    twists[7, 2] = wrong
+    for bad in (replace(log, cycles=cycles), replace(log, odometry=replace(log.odometry, twist=twists))):
+        folder = written(bad, tmp_path / "log")
+        with pytest.raises(InputError, match=r"expected a (finite number|number of at most)"):
+            read_plausible_log(folder, LimitSettings())
+        assert hints(bad) == refused_hints(folder) == []
 
 
 @pytest.mark.parametrize("command", ["online", "batch"])

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.experiment.cells import Drive, load_tracks
+from pathspace_graph.eval.experiment.cells import Drive, load_tracks, track_digest
 from pathspace_graph.sim.simulate import SimulationSettings
 
 from ...scenes.pretenders import write_round_track
@@ -54,3 +55,22 @@ def test_a_drive_is_the_same_by_geometry_seed_and_simulation_whatever_its_names(
     assert replace(drive, track=renamed, noise="quiet").id == drive.id
     assert replace(drive, seed=1).id != drive.id
     assert replace(drive, simulation=SimulationSettings(laps=3)).id != drive.id
+
+
+def test_the_last_digits_of_a_track_do_not_matter_to_its_drives_and_a_centimetre_does() -> None:
+    (track,) = load_tracks([0])
+    simple = replace(track, other=np.array([[-0.0, 0.0005], [1.0, 2.5 / 3.0]]))
+    for one in (track, simple):
+        for shift in (-1e-12, 1e-12):
+            moved = {name: getattr(one, name) + shift for name in ("left", "right", "other", "start")}
+            assert track_digest(replace(one, **moved)) == track_digest(one)
+        for name in ("left", "right", "start"):
+            cone_moved = getattr(one, name).copy()
+            cone_moved.flat[-1] += 0.01
+            assert track_digest(replace(one, **{name: cone_moved})) != track_digest(one)
+    assert track_digest(replace(simple, other=np.abs(simple.other))) == track_digest(simple)
+
+
+def test_the_drives_of_a_generated_track_are_those_of_every_machine() -> None:
+    """Another number makes other drives on all generated tracks, and all figures of the pages old."""
+    assert Drive(load_tracks([0])[0], 0, "nominal", SimulationSettings()).own_seed == 3921578876

@@ -235,7 +235,7 @@ def test_every_shipped_study_is_sound_and_listed(name: str) -> None:
     read = read_study(find_study(Path(name)))
     assert len(read.tracks) * len(read.seeds) >= {
         "acceleration": 10,
-        "hard": 8,
+        "hard": 16,
         "faults": 4,
         "endurance": 4,
         "sizes": 4,
