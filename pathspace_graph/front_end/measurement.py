@@ -13,8 +13,8 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights
-from pathspace_graph.factors.se2 import left_of, rotations, to_map
-from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, in_vehicle
+from pathspace_graph.factors.se2 import in_vehicle, left_of, rotations, to_map
+from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
 
 from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, Follower, SeenCycle, Sightings, TwistRecord
 
