@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import csv
 import re
+import runpy
 import shlex
-import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.cli import main
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory
 
@@ -30,31 +32,35 @@ def size_left(file: Path) -> NDArray[np.float64]:
         return np.array([float(row["size_left"]) for row in csv.DictReader(rows)])
 
 
-def commands() -> list[list[str]]:
-    """Every line of the page's shell blocks, and each Python block, as what the interpreter is to run."""
-    found: list[list[str]] = []
+def lines() -> Iterator[str]:
+    """Every line of the page's shell blocks, and each Python block."""
     for language, text in BLOCK.findall((ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")):
-        if language == "python":
-            found.append(["-c", text])
-            continue
-        for line in text.strip().splitlines():
-            program, *arguments = shlex.split(line)
-            if program == "python":
-                found.append([str(ROOT / arguments[0]), *arguments[1:]])
-            else:
-                assert program == "pathspace-graph"
-                found.append(["-m", "pathspace_graph", *arguments])
-    return found
+        yield from [text] if language == "python" else text.strip().splitlines()
 
 
-def test_the_tutorial(tmp_path: Path) -> None:
+def run(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Does in this process what a line of the page does in one of its own."""
+    if "\n" in line:
+        exec(compile(line, "tutorial.md", "exec"), {"__name__": "__main__"})
+        return
+    program, *arguments = shlex.split(line)
+    if program == "python":
+        script = str(ROOT / arguments[0])
+        monkeypatch.setattr(sys, "argv", [script, *arguments[1:]])
+        runpy.run_path(script, run_name="__main__")
+    else:
+        assert program == "pathspace-graph"
+        assert main(arguments) == 0, line
+
+
+def test_the_tutorial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     said = []
-    for command in commands():
-        run = subprocess.run(
-            [sys.executable, *command], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
-        assert run.returncode == 0, f"{command}: {run.stderr}"
-        said.append(run.stdout)
+    for line in lines():
+        run(line, monkeypatch)
+        said.append(capsys.readouterr().out)
     online, reference = (read_map(tmp_path / name) for name in ("map", "reference"))
     assert online.closed
     assert reference.closed
