@@ -8,6 +8,8 @@ import inspect
 import json
 import os
 import re
+import runpy
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -23,12 +25,13 @@ import numpy as np
 import pytest
 
 from pathspace_graph import FixedLagMapper, Log
-from pathspace_graph.cli import COMMANDS, parse_command
+from pathspace_graph.cli import COMMANDS, main, parse_command
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import write_log
+from pathspace_graph.io.map import read_map
 from pathspace_graph.io.overrides import leaves
-from pathspace_graph.io.results import write_result
+from pathspace_graph.io.results import read_trajectory, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.run import run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -43,6 +46,7 @@ from .test_prose import texts
 from .test_rooms import ARROWS, LEAVES
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+TUTORIAL = ROOT / "docs" / "tutorial.md"
 PACKAGE = "pathspace_graph"
 
 every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -434,3 +438,58 @@ def sections(page: Path) -> Iterator[str]:
 
 def test_the_page_has_what_it_promises() -> None:
     assert list(sections(EXTENDING)) == ["A new estimator", "A new factor", "A new track format"]
+
+
+# --- the tutorial ----------------------------------------------------------------------------------------
+
+
+def tutorial() -> Iterator[str]:
+    """Every line of the page's shell blocks, and each Python block."""
+    found = re.findall(r"^```(sh|python)\n(.*?)^```$", text_of(TUTORIAL), flags=re.DOTALL | re.MULTILINE)
+    for language, text in found:
+        yield from [text] if language == "python" else text.strip().splitlines()
+
+
+def run_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Does in this process what a line of the page does in one of its own."""
+    if "\n" in line:
+        exec(compile(line, "tutorial.md", "exec"), {"__name__": "__main__"})
+        return
+    program, *arguments = shlex.split(line)
+    if program == "python":
+        script = str(ROOT / arguments[0])
+        monkeypatch.setattr(sys, "argv", [script, *arguments[1:]])
+        runpy.run_path(script, run_name="__main__")
+    else:
+        assert program == "pathspace-graph"
+        assert main(arguments) == 0, line
+
+
+def test_the_tutorial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a new user types it."""
+    pytest.importorskip("rosbags")
+    pytest.importorskip("rerun")
+    monkeypatch.chdir(tmp_path)
+    said = []
+    for line in tutorial():
+        run_line(line, monkeypatch)
+        said.append(capsys.readouterr().out)
+    online, reference = (read_map(tmp_path / name) for name in ("map", "reference"))
+    assert online.closed
+    assert reference.closed
+    with_truth = tmp_path / "comparison" / "fixed-lag"
+    truth = read_map(with_truth)
+    assert abs(online.size - truth.size) < 10  # the bag lost nothing that matters
+    poses = [read_trajectory(at / "trajectory.tum")[1] for at in (tmp_path / "map", with_truth)]
+    cycles = [csv_rows(at / "cycles.csv") for at in (tmp_path / "map", with_truth)]
+    left = [np.array([float(row["size_left"]) for row in rows]) for rows in cycles]
+    alike = np.abs(left[0] - left[1]) < 0.25 * online.size  # a curve becomes smaller where the loop closes
+    assert (~alike).sum() <= 2
+    assert np.hypot(*(poses[0] - poses[1])[alike, :2].T).max() < 1.5
+    assert (tmp_path / "drive.rrd").stat().st_size > 0
+    assert (tmp_path / "comparison" / "table.md").exists()
+    widths = np.loadtxt(tmp_path / "centerline.csv", delimiter=",")[:, 2:]
+    assert 1.0 < widths.mean() < 3.0
+    assert "a lap of" in said[-2]

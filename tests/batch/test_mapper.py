@@ -99,7 +99,10 @@ def test_the_batch_begins_online_where_odometry_leads_to_no_loop(
     result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log)
     assert result.online is not None
     assert len(searches) == (1 if why == "no lap recurs" else 2)
-    online = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "online")
+    monkeypatch.undo()
+    online = solved("online")
+    if why == "no lap recurs":
+        online = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "online")
     np.testing.assert_allclose(result.trajectory, online.trajectory, atol=1e-9)
 
 

@@ -12,6 +12,7 @@ from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
@@ -30,18 +31,25 @@ def driven(name: str = "", value: float = 0.0) -> Log:
     return simulate(generate_track(np.random.default_rng(3)), settings, 3)
 
 
-def rmse_of(log: Log, settings: MapperSettings, estimator: str = "fixed-lag") -> float:
-    run = run_online(log, make_online(estimator, settings, log))
-    assert log.truth is not None
-    return lap_metrics(run.map, log.truth, 1).rmse
+@cache
+def mapped(
+    name: str, value: float, settings: MapperSettings, estimator: str
+) -> tuple[RunResult, VehicleState]:
+    """Returns what an estimator made of a drive, and what it knows of the vehicle at its end."""
+    log = driven(name, value)
+    mapper = make_online(estimator, settings, log)
+    return run_online(log, mapper), mapper.vehicle_state()  # type: ignore[attr-defined]
+
+
+def rmse_of(name: str = "", value: float = 0.0, settings: MapperSettings = SETTINGS) -> float:
+    truth = driven(name, value).truth
+    assert truth is not None
+    return lap_metrics(mapped(name, value, settings, "fixed-lag")[0].map, truth, 1).rmse
 
 
 @pytest.mark.parametrize(("name", "value"), [("yaw", 0.035), ("latency", 0.05), ("range_bias", 0.4)])
 def test_the_error_of_a_sensor_is_found_within_its_claimed_uncertainty(name: str, value: float) -> None:
-    log = driven(name, value)
-    mapper = make_online("fixed-lag", SETTINGS, log)
-    run_online(log, mapper)
-    state = mapper.vehicle_state()  # type: ignore[attr-defined]
+    _, state = mapped(name, value, SETTINGS, "fixed-lag")
     entry = SENSOR.index(name)
     sigma = float(np.sqrt(state.sensor_covariance[entry, entry]))
     assert abs(state.sensor[entry] - value) < 3.0 * sigma + 0.01 * value
@@ -50,28 +58,22 @@ def test_the_error_of_a_sensor_is_found_within_its_claimed_uncertainty(name: str
 
 @pytest.mark.parametrize("estimator", ["fixed-lag", "landmark-fixed-lag", "ckf", "landmark-ckf"])
 def test_every_estimator_finds_a_sensor_that_is_turned(estimator: str) -> None:
-    log = driven("yaw", 0.035)
-    mapper = make_online(estimator, SETTINGS, log)
-    run_online(log, mapper)
-    assert mapper.vehicle_state().sensor[0] == pytest.approx(0.035, abs=0.012)  # type: ignore[attr-defined]
+    _, state = mapped("yaw", 0.035, SETTINGS, estimator)
+    assert state.sensor[0] == pytest.approx(0.035, abs=0.012)
 
 
 def test_a_calibration_that_is_learned_is_a_notice_and_no_reason_for_doubt() -> None:
-    log = driven("yaw", 0.035)
-    cycles = run_online(log, make_online("fixed-lag", SETTINGS, log)).cycles
+    cycles = mapped("yaw", 0.035, SETTINGS, "fixed-lag")[0].cycles
     noticed = [cycle for cycle in cycles if "calibration" in cycle.notice]
     assert len(noticed) == 1 and not noticed[0].closed
     assert not any("calibration" in cycle.reason for cycle in cycles)
 
 
 def test_a_sensor_that_is_what_it_was_said_to_be_is_not_doubted() -> None:
-    mapper = make_online("fixed-lag", SETTINGS, driven())
-    run_online(driven(), mapper)
-    state = mapper.vehicle_state()  # type: ignore[attr-defined]
+    _, state = mapped("", 0.0, SETTINGS, "fixed-lag")
     assert (np.abs(state.sensor) < 3.0 * np.array(SETTINGS.calibration.sigmas)).all()
-    assert rmse_of(driven(), SETTINGS) < 1.1 * rmse_of(driven(), KNOWN)
+    assert rmse_of() < 1.1 * rmse_of(settings=KNOWN)
 
 
 def test_the_map_of_a_late_sensor_is_better_if_its_latency_is_estimated() -> None:
-    log = driven("latency", 0.05)
-    assert rmse_of(log, SETTINGS) < 0.8 * rmse_of(log, KNOWN)
+    assert rmse_of("latency", 0.05) < 0.8 * rmse_of("latency", 0.05, KNOWN)

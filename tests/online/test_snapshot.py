@@ -49,7 +49,7 @@ class Drive:
 def laps() -> Drive:
     settings = MapperSettings()
     return Drive(
-        simulate(bean_track(), SimulationSettings(laps=4), seed=2),
+        simulate(bean_track(), SimulationSettings(laps=3), seed=2),
         {
             "first cycle": lambda mapper, _: True,
             "second cycle": lambda mapper, _: mapper.smoother.next_cycle == 2,
@@ -70,7 +70,7 @@ def laps() -> Drive:
             "after the swap": lambda mapper, result: mapper.loop.lap_seconds > 0.0 and result.jump is None,
             "gauge": lambda mapper, _: mapper.smoother.held is not None,
         },
-        replace(settings, closing=replace(settings.closing, gauge_laps=1.0)),
+        replace(settings, closing=replace(settings.closing, gauge_laps=0.4)),
     )
 
 

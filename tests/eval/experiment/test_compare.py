@@ -44,6 +44,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_logs(tmp_path_factory.mktemp("drives") / "round")
 
 
+@pytest.fixture(scope="module")
+def logs(folder: Path) -> list[NamedLog]:
+    """Both logs, as they are read and judged."""
+    return read_logs(folder)
+
+
 # --- choice ----------------------------------------------------------------------------------------------
 
 
@@ -70,8 +76,8 @@ def test_logs_of_a_folder(folder: Path, tmp_path: Path) -> None:
 # --- results ---------------------------------------------------------------------------------------------
 
 
-def test_rows_are_of_each_lap_and_of_the_log(folder: Path) -> None:
-    frame = compare(read_logs(folder / "a"), ["rings", "rings-batch"]).frame
+def test_rows_are_of_each_lap_and_of_the_log(logs: list[NamedLog]) -> None:
+    frame = compare(logs[:1], ["rings", "rings-batch"]).frame
     own = frame[frame["estimator"] == "rings"]
     assert own["scope"].tolist() == ["lap", "lap", "log"]
     assert own["lap"].tolist()[:2] == [1, 2]
@@ -86,9 +92,9 @@ def test_rows_are_of_each_lap_and_of_the_log(folder: Path) -> None:
     assert own["ate"].iloc[-1] ** 2 == pytest.approx((own["along"] ** 2 + own["across"] ** 2).iloc[-1])
 
 
-def test_a_failure_is_told_and_the_rest_goes_on(folder: Path) -> None:
+def test_a_failure_is_told_and_the_rest_goes_on(logs: list[NamedLog]) -> None:
     told: list[int] = []
-    found = compare(read_logs(folder), ["broken", "rings"], on_run=lambda done, _: told.append(done))
+    found = compare(logs, ["broken", "rings"], on_run=lambda done, _: told.append(done))
     assert [tuple(o.names.values()) for o in found.failures] == [("a", "broken"), ("b", "broken")]
     assert found.failures[0].failure == "ValueError: lost the way"
     assert told == [0, 1, 2, 3, 4] and len(found.frame) == 6
@@ -97,8 +103,8 @@ def test_a_failure_is_told_and_the_rest_goes_on(folder: Path) -> None:
     assert table.rows[0][:2] == ("broken", "failed")
 
 
-def test_the_paper_s_table_is_the_mean_over_logs(folder: Path) -> None:
-    found = compare(read_logs(folder), ["rings", "gaps"])
+def test_the_paper_s_table_is_the_mean_over_logs(logs: list[NamedLog]) -> None:
+    found = compare(logs, ["rings", "gaps"])
     frame = paper_frame(found)
     assert frame[["estimator", "lap", "logs"]].values.tolist() == [
         ["rings", 1, 2],
@@ -113,18 +119,19 @@ def test_the_paper_s_table_is_the_mean_over_logs(folder: Path) -> None:
     assert paper_table(found).groups == (2,)
 
 
-def test_differences_are_paired_over_logs(folder: Path) -> None:
-    found = paired_frame(compare(read_logs(folder), ["rings", "gaps"], reference="gaps"))
+def test_differences_are_paired_over_logs(logs: list[NamedLog]) -> None:
+    found = paired_frame(compare(logs, ["rings", "gaps"], reference="gaps"))
     size = found[found["metric"] == "size"].iloc[0]
     assert (size["estimator"], size["reference"], size["pairs"]) == ("rings", "gaps", 2)
     assert (size["mean"], size["low"], size["high"]) == (-4.0, -4.0, -4.0)
 
 
-def test_the_gap_to_the_batch_is_told_where_it_ran(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_gap_to_the_batch_is_told_where_it_ran(
+    logs: list[NamedLog], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The batch's rings, 0.1 m wider than those of `rings`, and its poses 1 m from theirs."""
     monkeypatch.setattr(registry, "DEFAULT_BATCH", "far")
     monkeypatch.setattr(registry, "BATCH", {"far": WiderBatch})
-    logs = read_logs(folder)
     assert "gap_curves" not in compare(logs, ["rings", "gaps"]).frame
     frame = compare(logs, ["rings", "gaps", "broken", "far"]).frame.set_index("estimator")
     final = frame[frame["scope"] == "log"]
