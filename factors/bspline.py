@@ -286,9 +286,11 @@ def _shifts(curves: Sequence[SpanPolynomials], periods: Array) -> list[float]:
 
 
 def _span_coefficients(knots: Array, degree: int) -> Array:
-    """Return the coefficients (p + 1 powers, n - p spans, p + 1) by Cox-de Boor (de Boor 1972) in s:
+    """Return the coefficients (p + 1 powers, n - p spans, p + 1) in s, by the recurrence of de Boor (1972).
 
-    N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}
+        N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}
+
+    A term over an empty width is zero.
     """
     spans = np.arange(degree, len(knots) - degree - 1)
     start = knots[spans]
