@@ -219,10 +219,7 @@ class LapBatch:
 
 
 def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Hand work to the process that solves laps; a new process takes the place of one that has died.
-
-    Where none can be begun, the work has failed.
-    """
+    """Hand work to the process that solves laps, a new one if it has died; without any, it has failed."""
     failed = cast("Future[Any]", loky.Future())
     for _ in range(2):
         try:

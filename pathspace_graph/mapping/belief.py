@@ -204,10 +204,7 @@ class Belief:
         self.covariance = np.block([[self.covariance, cross.T], [cross, placed.covariance]])
 
     def transform_points(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
-        """Replace the points [start, stop) by `matrix` (k, stop - start) times them, for both coordinates.
-
-        Independent noise of sigma (k,) in m is added. The change is linear, and exact by the cubature rule.
-        """
+        """Replace the points [start, stop) by `matrix` (k, stop - start) times them, with noise (k,)."""
         low, high = HEAD + POINT * start, HEAD + POINT * stop
         full = np.kron(matrix, np.eye(POINT))
         mean, covariance = self.mean, self.covariance

@@ -62,10 +62,7 @@ class DetectionColumns:
         """Fill the subclass's columns as they are before any association."""
 
     def append(self, detections: Detections, cycle: int, twist: Array | None = None) -> slice:
-        """Add unused detections at the end of their cycle's; return their rows.
-
-        The twist (3,) of the vehicle (m/s, m/s, rad/s) is zero by default.
-        """
+        """Add unused detections at the end of their cycle's, with a twist (3,) or none; return their rows."""
         start, columns = int(self.cycle.searchsorted(cycle, side="right")), vars(self)
         new = vars(type(self).of([detections], cycle, None if twist is None else twist[None]))
         for column in self._columns():

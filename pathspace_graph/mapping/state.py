@@ -20,10 +20,7 @@ SAMPLE: Final = 0.25  # step at which curves are sampled for comparison with cur
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """The active parts of all curves, side by side by label, so that one pass projects all detections.
-
-    The control points of all curves are rows of one array, `State.map_points`.
-    """
+    """The active parts of all curves by label, whose control points are the rows of `State.map_points`."""
 
     boundaries: tuple[Boundary, ...]
     labels: IntArray  # (k,) labels of the curves, ascending

@@ -169,11 +169,7 @@ class Sighting:
 
 
 class OrangeCones:
-    """Orange cones as points of the map, at gates and along lanes that lead to a track.
-
-    Each is the mean of its detections, placed by the poses of their cycles. They bound no road and don't hold
-    the vehicle.
-    """
+    """Orange cones as points of the map: means of detections, which bound no road nor hold the vehicle."""
 
     MOST: Final = 500  # newest cycles that are remembered, to be placed again when poses are corrected
 
