@@ -98,15 +98,12 @@ class DriveRecord:
             self._readings[cycle] = replace(known, detections=_together(known.detections, detections))
 
     def estimated(self, state: State) -> None:
-        """Add the newest pose, and its parameter on each of the curves."""
-        for label in state.boundaries:
+        """Add the newest pose, and its parameter on each curve while these are open."""
+        if state.closed and self.unsolvable is not None:
+            return
+        for label in () if state.closed else state.boundaries:
             self._beside.setdefault(label, [nan] * len(self.poses)).append(float(state.pose_u[label][-1]))
         self.poses.append(_kept(state.poses[-1].copy()))
-
-    def followed(self, newest: Array) -> None:
-        """Add the newest pose (3,) on a closed map."""
-        if self.unsolvable is None:
-            self.poses.append(_kept(newest.copy()))
 
     def replaced(self, earlier: Array, window: Array) -> None:
         """Replace all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""

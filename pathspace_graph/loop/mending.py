@@ -117,9 +117,6 @@ def in_rows(points: Array, apart: float) -> list[IntArray]:
     return [np.flatnonzero(group == number) for number in range(count)]
 
 
-# --- the batch that mends the map ------------------------------------------------------------------------
-
-
 class Mending:
     """Whether a closed map is contradicted, and the batch that mends it."""
 

@@ -67,9 +67,6 @@ def transform(function: Callable[[Array], Array], mean: Array, covariance: Array
     return Transformed(centre, spread.T @ spread, np.asarray(slope).T)
 
 
-# --- the belief ------------------------------------------------------------------------------------------
-
-
 _ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
 HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE  # number of entries of the state before its points
 SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)  # entries of the sensor's calibration

@@ -84,7 +84,6 @@ class CurveMap:
             boundary.move(motion)
 
     def activate_all(self) -> None:
-        """Make every control point active."""
         self.state.activate_only({})
 
     def drop_cycle(self, cycle: int) -> None:

@@ -138,7 +138,6 @@ class DetectionTable(DetectionColumns):
         self.used[rows], self.boundary[rows], self.changed[rows] = False, self.label[rows], True
 
     def release_all(self) -> None:
-        """Take all detections out of use."""
         self.release(np.arange(len(self)))
 
     def refine(self, rows: IntArray, u: Array) -> None:

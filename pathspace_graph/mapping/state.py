@@ -107,8 +107,6 @@ class State:
         other.boundaries, other.pose_u = dict(self.boundaries), dict(self.pose_u)
         return other
 
-    # --- by key ------------------------------------------------------------------------------------------
-
     def keys(self, label: int) -> IntArray:
         """Return the keys (m,) of a boundary's control points."""
         return control_keys(label, self.boundaries[label].numbers)
@@ -213,8 +211,6 @@ class State:
     def activate_only(self, active: dict[int, IntArray]) -> None:
         """Make the given control points active, by label, and no others; all of a label that is missing."""
         self.active_stretch = active
-
-    # --- poses beside the curves -------------------------------------------------------------------------
 
     def locate(self, label: int, pose_u: Array) -> None:
         """Set the parameters (P,) of all poses on a boundary."""

@@ -62,7 +62,6 @@ class TentativeTracks:
         return np.asarray((0.5 * (a + d) - np.hypot(0.5 * (a - d), b)) ** -0.5)
 
     def remove(self, indices: IntArray) -> None:
-        """Remove tracks by index."""
         keep = np.ones(len(self.counts), bool)
         keep[indices] = False
         self._keep(keep)
@@ -81,7 +80,6 @@ class TentativeTracks:
         self.information = rotated(self.information, np.full(len(self.points), motion[2]))
 
     def clear(self) -> None:
-        """Remove all tracks."""
         self._keep(np.zeros(len(self.counts), bool))
 
     def _keep(self, keep: BoolArray) -> None:

@@ -51,8 +51,6 @@ class MapperEstimate:
         poses = f"{self.smoother.next_cycle} cycles up to {times[-1]:.1f} s, {len(times)} poses in the window"
         return f"{name}({poses},\n    {self.outline()})"
 
-    # --- the map -----------------------------------------------------------------------------------------
-
     def map(self) -> Map:
         """Return a copy of the present map, with the joint covariance of each boundary's control points.
 
@@ -157,8 +155,6 @@ class MapperEstimate:
         if self.closed or self.smoother.next_cycle == 0:
             return confirmed(self.smoother.map)
         return look_ahead(self.smoother.map, self.growth.tentative, self.path, self.smoother.times[-1])
-
-    # --- the graph ---------------------------------------------------------------------------------------
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
@@ -289,9 +285,6 @@ class MapperEstimate:
     def calibration(self) -> Array:
         """Return a view of the odometry's calibration: (scale error [-], yaw-rate bias [rad/s])."""
         return self.smoother.variables.calibration
-
-
-# --- the window as nonlinear factors ---------------------------------------------------------------------
 
 
 def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gtsam.CustomFactor]:

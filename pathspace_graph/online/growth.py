@@ -52,17 +52,13 @@ class Growth:
         return frozenset(grown)
 
     def move(self, motion: Array) -> None:
-        """Move all tentative tracks by a rigid motion (3,) of the map frame."""
         for tracks in self.tentative.values():
             tracks.move(motion)
 
     def clear(self) -> None:
-        """Remove all tentative tracks."""
         self.notice = ""
         for tracks in self.tentative.values():
             tracks.clear()
-
-    # --- how a curve grows -------------------------------------------------------------------------------
 
     def _begin(self, label: int, path_ahead: PathAhead) -> None:
         """Begin a curve through the first candidates, if there are at least two."""
@@ -227,8 +223,6 @@ class Growth:
             _, beside = path_ahead.locate(boundary.observed[-NEWEST:])
             side = median([*(SIDES[label] * beside).tolist(), side])
         return End(position[0], float(station[0]), side)
-
-    # --- bounds ------------------------------------------------------------------------------------------
 
     def _is_full(self, label: int, path_ahead: PathAhead) -> bool:
         boundary, longest = self._state.boundaries[label], LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
