@@ -105,9 +105,6 @@ def _move_poses(poses: Array, solved: Array) -> None:
     poses[: len(solved)] = solved
 
 
-# --- the gauge -------------------------------------------------------------------------------------------
-
-
 def hold_gauge(smoother: CurveSmoother) -> None:
     """Hold where the closed map as a whole is, across its curves, while its shape goes on to be estimated.
 

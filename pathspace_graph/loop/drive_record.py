@@ -103,15 +103,12 @@ class DriveRecord:
             self._seen[cycle] = _together(self._seen[cycle], detections)
 
     def estimated(self, state: State) -> None:
-        """Add the newest pose, and its parameter on each of the curves."""
-        for label in state.boundaries:
+        """Add the newest pose, and its parameter on each curve while these are open."""
+        if state.closed and self.unsolvable is not None:
+            return
+        for label in () if state.closed else state.boundaries:
             self._beside.setdefault(label, [nan] * len(self.poses)).append(float(state.pose_u[label][-1]))
         self.poses.append(_kept(state.poses[-1].copy()))
-
-    def followed(self, newest: Array) -> None:
-        """Add the newest pose (3,) on a closed map."""
-        if self.unsolvable is None:
-            self.poses.append(_kept(newest.copy()))
 
     def replaced(self, earlier: Array, window: Array) -> None:
         """Replace all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
@@ -222,10 +219,7 @@ class LapBatch:
 
 
 def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Hand work to the process that solves laps; a new process takes the place of one that has died.
-
-    Where none can be begun, the work has failed.
-    """
+    """Hand work to the process that solves laps, a new one if it has died; without any, it has failed."""
     failed = cast("Future[Any]", loky.Future())
     for _ in range(2):
         try:

@@ -101,10 +101,7 @@ def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) 
 
 
 def lay_out_loop(state: State, is_mapped_on: Callable[[int, Array], BoolArray] | None = None) -> Loop:
-    """Return the loop between the two closed curves of a state.
-
-    `is_mapped_on` says which parameters (m,) of a boundary lie between cones; without it, all of them do.
-    """
+    """Return the loop between two closed curves, mapped at parameters (m,) where `is_mapped_on` says so."""
     u, points = {}, {}
     for label, boundary in state.boundaries.items():
         u[label] = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
@@ -304,10 +301,7 @@ class Search:
         return chosen
 
     def _beside_the_loop(self) -> tuple[Array, Array]:
-        """Return motions (n, 3) that lay the path onto the middle before each of its points.
-
-        They are of least squares; the rms distances (n,) of the path from the middle are returned, too.
-        """
+        """Return motions (n, 3) that fit the path to the middle before its points, and rms misfits (n,)."""
         poses = np.array(self._poses)
         behind = np.append(np.hypot(*np.diff(poses[:, :2], axis=0).T)[::-1].cumsum()[::-1], 0.0)
         _, first = np.unique(behind // STEP, return_index=True)
@@ -323,10 +317,7 @@ class Search:
         return np.column_stack([shift.real, shift.imag, np.angle(turn)]), np.sqrt((misfit**2).mean(axis=1))
 
     def _refined(self, state: State, seen: Sightings, start: Motion, i: int) -> tuple[float, RefinedMotion]:
-        """Return what registration makes of a motion onto point `i` of the middle, after its score.
-
-        The score is the agreement of the detections with the map there, from 0 to 1.
-        """
+        """Return the registration from a motion onto point `i` of the middle, after its score (0 to 1)."""
         gate, stretches = self.settings.gate, dict[int, tuple[float, float]]()
         driven = float(path_lengths(np.array(self._poses))[-1])
         for label, u in self.loop.beside.items():  # what the vehicle has seen on a path that ends there

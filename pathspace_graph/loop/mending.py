@@ -90,7 +90,9 @@ class Contradictions:
             chosen = tracks.confirmed()
             if len(chosen) < CONES:
                 continue
-            chosen = chosen[_is_new(loop, label, tracks.points[chosen])]
+            away = {b: curve.query(tracks.points[chosen])[0] > BESIDE for b, curve in loop.curves.items()}
+            in_gap = loop.beside_gaps(np.full(len(chosen), label), tracks.points[chosen])
+            chosen = chosen[(away[label] | in_gap) & away[LEFT + RIGHT - label]]
             chosen = chosen[self._undisputed(label, chosen)]
             if len(chosen) < CONES:
                 continue
@@ -109,21 +111,11 @@ class Contradictions:
         return np.asarray(tracks.counts[chosen] > rival)
 
 
-def _is_new(loop: Loop, label: int, points: Array) -> BoolArray:
-    """Return which points (k, 2) of a colour are farther than `BESIDE` from all curves, or in a gap."""
-    away = {number: curve.query(points)[0] > BESIDE for number, curve in loop.curves.items()}
-    in_gap = loop.beside_gaps(np.full(len(points), label), points)
-    return (away[label] | in_gap) & away[LEFT + RIGHT - label]
-
-
 def in_rows(points: Array, apart: float) -> list[IntArray]:
     """Return the groups (k,) of points (n, 2), by index, whose neighbours are at most this far apart (m)."""
     pairs = KDTree(points).sparse_distance_matrix(KDTree(points), apart)
     count, group = connected_components(pairs, directed=False)
     return [np.flatnonzero(group == number) for number in range(count)]
-
-
-# --- the batch that mends the map ------------------------------------------------------------------------
 
 
 class Mending:
@@ -210,10 +202,7 @@ def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Ar
 
 
 def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
-    """Return the positions (n, 2) and stations (n,) on the newest lap, the first position again at the end.
-
-    It begins at the one of the poses (P, 3) nearest to the newest, about a lap of this length (m) before.
-    """
+    """Return the positions (n, 2), the first repeated, and stations (n,) from `lap_begin` to the newest."""
     first = lap_begin(poses, length)
     lap = np.concatenate([poses[first:, :2], poses[first : first + 1, :2]])
     return lap, path_lengths(lap)

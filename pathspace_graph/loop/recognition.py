@@ -12,18 +12,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import left_of, rotations, wrap_angle
+from pathspace_graph.mapping import registration
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.registration import (
-    BEGINNING_SHARE,
-    START_CHI2,
-    START_STEP,
-    Motion,
-    Sightings,
-    by_motion,
-    is_lost,
-    refine,
-    sigma_of_information,
-)
+from pathspace_graph.mapping.registration import Motion, Sightings, by_motion, is_lost, refine
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.online import ClosingSettings
@@ -58,12 +49,12 @@ def may_tell_place(state: State, settings: ClosingSettings) -> bool:
     Laid on itself, the newest stretch must hold the vehicle in every direction, as no straight does.
     """
     end = min(boundary.confirmed_end for boundary in state.boundaries.values())
-    if not STRETCH < BEGINNING_SHARE * end < end - STRETCH - settings.min_path:
+    if not STRETCH < registration.BEGINNING_SHARE * end < end - STRETCH - settings.min_path:
         return False
     stretch, centre = newest_stretch(state), state.poses[-1, :2]
     rows = np.concatenate([by_motion(normals, cones - centre) for cones, normals in stretch.values()])
     rows /= settings.sigma_reading
-    return sigma_of_information(rows.T @ rows) <= settings.sigma_max
+    return registration.sigma_of_information(rows.T @ rows) <= settings.sigma_max
 
 
 def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) -> RecognizedPlace | None:
@@ -107,18 +98,18 @@ def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple
     Each goes with the parameter at which the earlier stretch of the first boundary begins. The headings along
     both stretches are compared, after a common turn.
     """
-    (label, boundary), step = next(iter(state.boundaries.items())), START_STEP
+    (label, boundary), step = next(iter(state.boundaries.items())), registration.START_STEP
     u = np.arange(boundary.confirmed_end % step, boundary.confirmed_end, step)
     points, tangents = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
     headings = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
-    count, last = int(STRETCH / step), int(BEGINNING_SHARE * len(points))
+    count, last = int(STRETCH / step), int(registration.BEGINNING_SHARE * len(points))
     turns = sliding_window_view(headings[:last], count) - headings[-count:]
     places = sliding_window_view(points[:last], count, axis=0).mean(axis=2)
     turn, unlike = turns.mean(axis=1), turns.std(axis=1)
     centre, middle = state.poses[-1, :2], points[-count:].mean(axis=0)
     turned = rotations(turn) @ (middle - centre) + centre
     motions = np.column_stack([places - turned, wrap_angle(turn)])
-    possible = np.einsum("ij,jk,ik->i", motions, prior, motions) < START_CHI2
+    possible = np.einsum("ij,jk,ik->i", motions, prior, motions) < registration.START_CHI2
     best = _minima(np.where(possible, unlike, np.inf), int(settings.overlap / step))[:STARTS]
     return [(motions[i], float(step * i)) for i in best]
 
@@ -143,7 +134,7 @@ def _register(
     seen = Sightings.of_points(np.arange(len(points)), labels, points)
     found = refine(state, seen, start, stretches, (np.zeros(3), prior), settings)
     shares = [len(found.matches.inliers(b)[0]) / max(len(cones), 1) for b, cones in newest.items()]
-    sigma = sigma_of_information(found.matches.hessian)
+    sigma = registration.sigma_of_information(found.matches.hessian)
     if min(shares) < settings.inlier_share or sigma > settings.sigma_max:
         return None
     place, beside = found.motion.apply(state.poses[-1:, :2]), {}
@@ -156,6 +147,6 @@ def _register(
 def _between(state: State, label: int, corners: Array) -> tuple[float, float]:
     """Return the parameters of the stretch of a boundary between two points (2, 2), and some room."""
     boundary = state.boundaries[label]
-    high = np.full(len(corners), BEGINNING_SHARE * boundary.confirmed_end)
+    high = np.full(len(corners), registration.BEGINNING_SHARE * boundary.confirmed_end)
     u = boundary.find(state.control_points(label), corners, np.zeros(len(corners)), high).u
     return max(float(u[0]) - STRETCH_ROOM, 0.0), float(u[1]) + STRETCH_ROOM

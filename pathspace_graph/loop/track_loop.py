@@ -165,22 +165,19 @@ class TrackLoop:
             self._closes()
             self._boundaries_cross = self._crosses()
             return None, self._solve_lap()
-        if self.closed:
-            self.record.followed(self._smoother.variables.poses[-1])
-        else:
-            self.record.estimated(self._smoother.map.state)
+        self.record.estimated(self._smoother.map.state)
         if self._rests:
             return None, ""
         if not self.closed and self._path.length > self.settings.closing.min_path:
             self.record.prepare()
             if self._lap_batch is None:
                 self._try_loop()
-        if not self.closed and self._lap_batch is None:
+        batch = self._lap_batch
+        if not self.closed and batch is None:
             jump = self.revisits.use()
             if jump is not None:
                 self.corrected_poses = np.array(self.record.poses)
                 return jump, REVISITED if len(self.revisits.found) == 1 else ""
-        batch = self._lap_batch
         if batch is None:
             self._hold_gauge()
             may_mend = self._known_loop.is_whole and self._search is None and self.record.unsolvable is None

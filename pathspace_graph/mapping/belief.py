@@ -67,9 +67,6 @@ def transform(function: Callable[[Array], Array], mean: Array, covariance: Array
     return Transformed(centre, spread.T @ spread, np.asarray(slope).T)
 
 
-# --- the belief ------------------------------------------------------------------------------------------
-
-
 _ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
 HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE  # number of entries of the state before its points
 SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)  # entries of the sensor's calibration
@@ -204,10 +201,7 @@ class Belief:
         self.covariance = np.block([[self.covariance, cross.T], [cross, placed.covariance]])
 
     def transform_points(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
-        """Replace the points [start, stop) by `matrix` (k, stop - start) times them, for both coordinates.
-
-        Independent noise of sigma (k,) in m is added. The change is linear, and exact by the cubature rule.
-        """
+        """Replace the points [start, stop) by `matrix` (k, stop - start) times them, with noise (k,)."""
         low, high = HEAD + POINT * start, HEAD + POINT * stop
         full = np.kron(matrix, np.eye(POINT))
         mean, covariance = self.mean, self.covariance

@@ -84,7 +84,6 @@ class CurveMap:
             boundary.move(motion)
 
     def activate_all(self) -> None:
-        """Make every control point active."""
         self.state.activate_only({})
 
     def drop_cycle(self, cycle: int) -> None:
@@ -93,10 +92,7 @@ class CurveMap:
         self.state.drop_oldest_pose_u()
 
     def replaced_by(self, scatter: dict[int, Array], cones: dict[int, Array]) -> None:
-        """Note that curves and prior are those of a batch.
-
-        By label, cones scatter about the curves by sigmas (m,), and were detected at parameters (k,).
-        """
+        """Note that curves and prior are a batch's, with the scatter and the places of cones by label."""
         self.held_by_prior, self.scatter, self.cones = True, scatter, cones
 
     # --- weak priors -------------------------------------------------------------------------------------

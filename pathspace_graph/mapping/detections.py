@@ -68,10 +68,7 @@ class DetectionColumns:
         """Fill the subclass's columns as they are before any association."""
 
     def append(self, detections: Detections, cycle: int, twist: Array | None = None) -> slice:
-        """Add unused detections at the end of their cycle's; return their rows.
-
-        The twist (3,) of the vehicle (m/s, m/s, rad/s) is zero by default.
-        """
+        """Add unused detections at the end of their cycle's, with a twist (3,) or none; return their rows."""
         start, count = int(self.cycle.searchsorted(cycle, side="right")), len(detections.labels)
         twists = np.zeros((count, 3))
         if twist is not None:
@@ -151,7 +148,6 @@ class DetectionTable(DetectionColumns):
         self.used[rows], self.boundary[rows], self.changed[rows] = False, self.label[rows], True
 
     def release_all(self) -> None:
-        """Take all detections out of use."""
         self.release(np.arange(len(self)))
 
     def refine(self, rows: IntArray, u: Array) -> None:

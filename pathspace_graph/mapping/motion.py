@@ -65,9 +65,6 @@ class MeasuredMotion:
         return "the detections contradict the odometry" if self.doubted else ""
 
 
-# --- prediction ------------------------------------------------------------------------------------------
-
-
 def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
     """Return what is known of the noise before a drive, by default that of the simulator, not stated.
 

@@ -25,7 +25,6 @@ class Revisit:
     root: Array  # (3, 3) A, a square root of its information
 
     def factor(self) -> RelativeFactor:
-        """Return the measurement as a factor of the engine."""
         earlier, later = pose_keys(np.array([self.earlier, self.later]))
         return RelativeFactor(int(earlier), Layout(np.array([later])), self.root, np.zeros(POSE), self.local)
 

@@ -21,10 +21,7 @@ SAMPLE: Final = 0.25  # step at which curves are sampled for comparison with cur
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """The active parts of all curves, side by side by label, so that one pass projects all detections.
-
-    The control points of all curves are rows of one array, `State.map_points`.
-    """
+    """The active parts of all curves by label, whose control points are the rows of `State.map_points`."""
 
     boundaries: tuple[Boundary, ...]
     labels: IntArray  # (k,) labels of the curves, ascending
@@ -107,8 +104,6 @@ class State:
         other = type(self)(self.variables.copy())
         other.boundaries, other.pose_u = dict(self.boundaries), dict(self.pose_u)
         return other
-
-    # --- by key ------------------------------------------------------------------------------------------
 
     def keys(self, label: int) -> IntArray:
         """Return the keys (m,) of a boundary's control points."""
@@ -214,8 +209,6 @@ class State:
     def activate_only(self, active: dict[int, IntArray]) -> None:
         """Make the given control points active, by label, and no others; all of a label that is missing."""
         self.active_stretch = active
-
-    # --- poses beside the curves -------------------------------------------------------------------------
 
     def locate(self, label: int, pose_u: Array) -> None:
         """Set the parameters (P,) of all poses on a boundary."""

@@ -62,7 +62,6 @@ class TentativeTracks:
         return np.asarray((0.5 * (a + d) - np.hypot(0.5 * (a - d), b)) ** -0.5)
 
     def remove(self, indices: IntArray) -> None:
-        """Remove tracks by index."""
         keep = np.ones(len(self.counts), bool)
         keep[indices] = False
         self._keep(keep)
@@ -81,7 +80,6 @@ class TentativeTracks:
         self.information = rotated(self.information, np.full(len(self.points), motion[2]))
 
     def clear(self) -> None:
-        """Remove all tracks."""
         self._keep(np.zeros(len(self.counts), bool))
 
     def _keep(self, keep: BoolArray) -> None:
@@ -169,11 +167,7 @@ class Sighting:
 
 
 class OrangeCones:
-    """Orange cones as points of the map, at gates and along lanes that lead to a track.
-
-    Each is the mean of its detections, placed by the poses of their cycles. They bound no road and don't hold
-    the vehicle.
-    """
+    """Orange cones as points of the map: means of detections, which bound no road nor hold the vehicle."""
 
     MOST: Final = 500  # newest cycles that are remembered, to be placed again when poses are corrected
 

@@ -8,12 +8,8 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors import gtsam_factors
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.gtsam_factors import (
-    smoothness_factors,
-    spacing_factors,
-    spline_projection_factors,
-)
 from pathspace_graph.graph.gaussian import factors_of
 from pathspace_graph.graph.rows import odometry_factor
 from pathspace_graph.graph.variables import POINT, POSE, control_keys, name, pose_key, pose_keys
@@ -54,8 +50,6 @@ class MapperEstimate:
             return f"{name}(no cycle yet)"
         poses = f"{self.smoother.next_cycle} cycles up to {times[-1]:.1f} s, {len(times)} poses in the window"
         return f"{name}({poses},\n    {self.outline()})"
-
-    # --- the map -----------------------------------------------------------------------------------------
 
     def map(self) -> Map:
         """Return a copy of the present map, with the joint covariance of each boundary's control points.
@@ -161,8 +155,6 @@ class MapperEstimate:
         if self.closed or self.smoother.next_cycle == 0:
             return confirmed(self.smoother.map)
         return look_ahead(self.smoother.map, self.growth.tentative, self.path, self.smoother.times[-1])
-
-    # --- the graph ---------------------------------------------------------------------------------------
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
@@ -295,9 +287,6 @@ class MapperEstimate:
         return self.smoother.variables.calibration
 
 
-# --- the window as nonlinear factors ---------------------------------------------------------------------
-
-
 def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gtsam.CustomFactor]:
     """Return a spline-projection factor for each cycle of the detections in use on a boundary.
 
@@ -307,7 +296,7 @@ def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gt
     boundary, rows = track.state.boundaries[label], detections.used_on(label)
     u = detections.u[rows]
     before, past = _room(boundary, active, u, settings.spline.refine_room)
-    return spline_projection_factors(
+    return gtsam_factors.spline_projection_factors(
         pose_keys(detections.cycle[rows]),
         control_keys(label, boundary.numbers).tolist(),
         boundary.tables,
@@ -341,9 +330,9 @@ def _gauge_factors(
     gauge = boundary.gauge_on(active)
     keys = control_keys(label, boundary.first + np.arange(boundary.size)).tolist()
     factors: list[gtsam.NonlinearFactor] = []
-    for (first, second), nominal in zip(gauge.pairs.tolist(), gauge.nominal, strict=True):
-        sigma = np.array([settings.sigma_spacing * nominal])
-        factors += spacing_factors([keys[first], keys[second]], np.array([nominal]), sigma, False)
+    for pair, nominal in zip(gauge.pairs.tolist(), gauge.nominal[:, None], strict=True):
+        sigma = settings.sigma_spacing * nominal
+        factors += gtsam_factors.spacing_factors([keys[j] for j in pair], nominal, sigma, False)
     for triple, bending in zip(gauge.triples.tolist(), gauge.bending, strict=True):
-        factors += smoothness_factors([keys[j] for j in triple], bending[None], 1.0)
+        factors += gtsam_factors.smoothness_factors([keys[j] for j in triple], bending[None], 1.0)
     return factors

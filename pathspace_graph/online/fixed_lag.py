@@ -181,8 +181,7 @@ class FixedLagMapper(MapperEstimate):
         number, unused, seen = self.recovery.failures, self._unused, cycle.detections
         why = f": {type(error).__name__}: {error}" if number == 1 else f" (failure {number})"
         failed = " ".join(f"an update failed{why}".split())
-        nothing = Detections(seen.t, seen.points_vehicle[:0], seen.covariances[:0], seen.labels[:0])
-        blind = replace(cycle, detections=nothing)
+        blind = replace(cycle, detections=seen.where(np.zeros(len(seen.labels), bool)))
         attempts = {
             "the loop is left as it is": partial(self._process, cycle, factors, careful=True),
             "its detections are not used": partial(self._process, blind, factors, careful=True),

@@ -7,21 +7,9 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
+from pathspace_graph.mapping import path
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.path import (
-    CARRIED_TO,
-    END_BEHIND,
-    MIN_CARRY,
-    MIN_LATERAL,
-    SIDES,
-    STATION_MARGIN,
-    STRANDED,
-    Candidates,
-    End,
-    PathAhead,
-    chain,
-    crosses,
-)
+from pathspace_graph.mapping.path import SIDES, Candidates, End, PathAhead, chain, crosses
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
 from pathspace_graph.spline.boundary import Boundary, open_boundary
@@ -64,17 +52,13 @@ class Growth:
         return frozenset(grown)
 
     def move(self, motion: Array) -> None:
-        """Move all tentative tracks by a rigid motion (3,) of the map frame."""
         for tracks in self.tentative.values():
             tracks.move(motion)
 
     def clear(self) -> None:
-        """Remove all tentative tracks."""
         self.notice = ""
         for tracks in self.tentative.values():
             tracks.clear()
-
-    # --- how a curve grows -------------------------------------------------------------------------------
 
     def _begin(self, label: int, path_ahead: PathAhead) -> None:
         """Begin a curve through the first candidates, if there are at least two."""
@@ -93,7 +77,7 @@ class Growth:
         boundary = self._state.boundaries[label]
         kept, self._beside[label] = check_order(boundary, path_ahead, self._beside[label])
         if kept == len(boundary.observed):
-            return self._extend(label, path_ahead, END_BEHIND)
+            return self._extend(label, path_ahead, path.END_BEHIND)
         self._take_back(label, kept)
         from_u = boundary.confirmed_end
         self._extend(label, path_ahead, RECALL)
@@ -111,18 +95,18 @@ class Growth:
         if len(found.points) and np.hypot(*(found.points[0] - end.position)) < room:
             self._consume(label, found, self._extend_through(label, end.position, found.points))
             return True
-        if end.station < path_ahead.driven - STRANDED:
+        if end.station < path_ahead.driven - path.STRANDED:
             return self._follow_path(label, path_ahead, end, room)
         return False
 
     def _follow_path(self, label: int, path_ahead: PathAhead, end: End, room: float) -> bool:
         """Extrapolate an end that was passed, at its distance from the path; True if the curve has grown."""
-        side = max(end.side, MIN_LATERAL)
-        point = path_ahead.beside(path_ahead.driven - CARRIED_TO, SIDES[label] * side)
+        side = max(end.side, path.MIN_LATERAL)
+        point = path_ahead.beside(path_ahead.driven - path.CARRIED_TO, SIDES[label] * side)
         distance = float(np.hypot(*(point - end.position)))
         if distance > room:
             self._say_full(label)
-        if not MIN_CARRY <= distance <= room:
+        if not path.MIN_CARRY <= distance <= room:
             return False
         self._extend_through(label, end.position, point[None])
         return True
@@ -177,15 +161,15 @@ class Growth:
         points = tracks.points[indices]
         if len(points) == 0:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
-        path = path_ahead if end is None else newest(path_ahead, end.station)
-        stations, lateral = path.locate(points)
+        way = path_ahead if end is None else newest(path_ahead, end.station)
+        stations, lateral = way.locate(points)
         sides = SIDES[label] * lateral
         possible = (stations <= path_ahead.stations[-1]) & (sides > 0.0)
         if end is None:
             possible &= sides < settings.max_lateral
         else:
             beyond = np.hypot(*(points - end.position).T) > settings.threshold
-            possible &= beyond & (stations > end.station + STATION_MARGIN)
+            possible &= beyond & (stations > end.station + path.STATION_MARGIN)
         found = Candidates(points, indices, stations, sides).where(possible)
         if len(found.points) == 0:
             return found
@@ -212,8 +196,8 @@ class Growth:
         Lines are the newest stretches of the path driven and of both boundaries, which in a second lap of an
         open loop run along their first ones.
         """
-        path = newest(path_ahead, end.station)
-        lines = [path.points[path.stations <= path.driven]]
+        way = newest(path_ahead, end.station)
+        lines = [way.points[way.stations <= way.driven]]
         for other, boundary in self._state.boundaries.items():
             begin = boundary.confirmed_end - RECALL
             first = int(boundary.cone_parameters.searchsorted(begin))
@@ -239,8 +223,6 @@ class Growth:
             _, beside = path_ahead.locate(boundary.observed[-NEWEST:])
             side = median([*(SIDES[label] * beside).tolist(), side])
         return End(position[0], float(station[0]), side)
-
-    # --- bounds ------------------------------------------------------------------------------------------
 
     def _is_full(self, label: int, path_ahead: PathAhead) -> bool:
         boundary, longest = self._state.boundaries[label], LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
@@ -290,7 +272,7 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
     beside[first:] = now
     at = np.where(now[:, 0] <= path_ahead.driven, now[:, 0], np.inf)
     later = np.minimum.accumulate(at[::-1])[::-1]
-    wrong = np.flatnonzero(at[1:-1] > later[2:] + STATION_MARGIN)
+    wrong = np.flatnonzero(at[1:-1] > later[2:] + path.STATION_MARGIN)
     kept = first + 1 + int(wrong[0]) if len(wrong) else len(beside)
     return kept, beside[:kept]
 

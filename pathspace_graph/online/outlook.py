@@ -43,9 +43,6 @@ the band between tracks that are far apart, and beyond the last one."""
 MIN_TRACKS: Final = 2  # least number of tracks for a tentative curve of a boundary that has not begun
 
 
-# --- rows of tracks --------------------------------------------------------------------------------------
-
-
 @dataclass(eq=False)
 class Row:
     """One boundary as far as it is known, and the tracks that may continue it."""
@@ -128,9 +125,6 @@ def _has_width(row: Row, other: Row, points: Array) -> BoolArray:
     return np.asarray((width[1:] > MIN_WIDTH) & (beyond | (width[1:] < widest)))
 
 
-# --- curves through them ---------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Outlook:
     """A boundary with its tentative stretch."""
@@ -151,7 +145,6 @@ class Outlook:
 
     @property
     def spline(self) -> BSpline:
-        """Return the curve."""
         return self.boundary.spline(self.control_points)
 
 
@@ -192,9 +185,6 @@ def _by_pose(points: Array, vehicle: Array) -> Array:
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
     jacobian[:, 0, 2], jacobian[:, 1, 2] = -offset[:, 1], offset[:, 0]
     return jacobian.reshape(-1, POSE)
-
-
-# --- what is ahead ---------------------------------------------------------------------------------------
 
 
 def curves_ahead(

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.settings.batch import CenterlineSettings, CkfSettings, Knots, LandmarkSettings
 from pathspace_graph.settings.online import (
     ClosingSettings,
     GrowthSettings,
@@ -14,7 +13,7 @@ from pathspace_graph.settings.online import (
     SidesSettings,
 )
 
-from .batch import BatchSettings, OpenLapSettings
+from .batch import BatchSettings, CenterlineSettings, CkfSettings, Knots, LandmarkSettings, OpenLapSettings
 from .calibration import CalibrationSettings, OdometrySettings
 from .checked import Positive
 
