@@ -50,7 +50,7 @@ class Curves:
         )
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
-        """Return whether these are the curves of boundaries with these active control points, or with all."""
+        """Return whether these are the curves of boundaries with active control points, by default all."""
         if len(boundaries) != len(self.boundaries):
             return False
         laid_out = zip(self.tables, self.active, strict=True)
