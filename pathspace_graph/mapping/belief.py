@@ -201,7 +201,7 @@ class Belief:
         self.covariance = np.block([[self.covariance, cross.T], [cross, placed.covariance]])
 
     def transform_points(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
-        """Multiply the points [start, stop) by `matrix` (k, stop - start), and add noise of sigma (k,) in m."""
+        """Multiply points [start, stop) by `matrix` (k, stop - start), and add noise of sigma (k,) in m."""
         low, high = HEAD + POINT * start, HEAD + POINT * stop
         full = np.kron(matrix, np.eye(POINT))
         mean, covariance = self.mean, self.covariance
