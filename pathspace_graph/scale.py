@@ -23,7 +23,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .errors import ReadingError, SettingsError, check_type, solving
 from .labels import LEFT, RIGHT, UNKNOWN
 from .lengths import POSE, scaled, times
-from .run import settings_dict
+from .run import settings_dict, split_odometry
 
 C = TypeVar("C", bound=type[Any])
 
@@ -73,10 +73,9 @@ class SceneScale:
 
 def scale_of(log: Log) -> float:
     """Return the scale of a log's scene, which the first metres of its drive tell."""
-    scene, since = SceneScale(), float(log.odometry.t[0])
-    for detections in log.cycles:
-        scene.see(log.odometry.between(since, detections.t), detections)
-        since = detections.t
+    scene = SceneScale()
+    for cycle in split_odometry(log):
+        scene.see(*cycle)
         if scene.is_final:
             break
     return scene.value

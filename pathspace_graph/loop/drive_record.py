@@ -219,7 +219,7 @@ class LapBatch:
 
 
 def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Hand work to the process that solves laps, a new one if it has died; without any, it has failed."""
+    """Hand work to the process that solves laps, a new one if it has died; if none begins, the work fails."""
     failed = cast("Future[Any]", loky.Future())
     for _ in range(2):
         try:

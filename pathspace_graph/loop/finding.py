@@ -317,7 +317,7 @@ class Search:
         return np.column_stack([shift.real, shift.imag, np.angle(turn)]), np.sqrt((misfit**2).mean(axis=1))
 
     def _refined(self, state: State, seen: Sightings, start: Motion, i: int) -> tuple[float, RefinedMotion]:
-        """Return the registration from a motion onto point `i` of the middle, after its score (0 to 1)."""
+        """Return the score (0 to 1) and the registration from a motion onto point `i` of the middle."""
         gate, stretches = self.settings.gate, dict[int, tuple[float, float]]()
         driven = float(path_lengths(np.array(self._poses))[-1])
         for label, u in self.loop.beside.items():  # what the vehicle has seen on a path that ends there

@@ -133,7 +133,7 @@ class TrackLoop:
             self.record.give_up("the vehicle was lost")
 
     def doubt_calibrations(self, reading: Reading) -> str:
-        """Widen the priors of calibrations that the drive contradicts, unless closed; return a notice."""
+        """Widen the priors of calibrations that the drive contradicts while the loop is open; say so once."""
         if self.closed:
             return ""
         before = self._believed

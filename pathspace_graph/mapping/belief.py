@@ -168,7 +168,7 @@ class Belief:
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
 
     def predict_detections(self, points: IntArray) -> Transformed:
-        """Predict the corrected detections of points (k,), vehicle frame, in order x0, y0, x1, and so on."""
+        """Predict corrected detections of points (k,), vehicle frame: mean (2k,) and covariance (2k, 2k)."""
         columns = self.measuring_columns(point_columns(points))
         covariance = self.covariance[np.ix_(columns, columns)]
         return transform(self.measuring(points), self.mean[columns], covariance)
@@ -201,7 +201,7 @@ class Belief:
         self.covariance = np.block([[self.covariance, cross.T], [cross, placed.covariance]])
 
     def transform_points(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
-        """Replace the points [start, stop) by `matrix` (k, stop - start) times them, with noise (k,)."""
+        """Multiply points [start, stop) by `matrix` (k, stop - start), and add noise of sigma (k,) in m."""
         low, high = HEAD + POINT * start, HEAD + POINT * stop
         full = np.kron(matrix, np.eye(POINT))
         mean, covariance = self.mean, self.covariance

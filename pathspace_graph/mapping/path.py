@@ -149,7 +149,7 @@ def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
 LATERAL_CHANGE: Final = 1.5  # how much farther from the path the next cone may be than the newest ones (m)
 LATERAL_RATE: Final = 0.2  # growth of `LATERAL_CHANGE` with the distance along the path (m/m)
 BESIDE: Final = 2.0  # distance along the path below which cones stand beside each other (m)
-LATERAL_GAP: Final = 0.8  # how much nearer to the path a cone beside another one hides it (m)
+LATERAL_GAP: Final = 0.8  # by how much a cone must be nearer to the path to hide one beside it (m)
 STATION_MARGIN: Final = 0.3  # least distance past the end of a curve of what extends it (m along the path)
 END_BEHIND: Final = 5.0
 """Farthest that the end of a curve is behind the vehicle (m along the path), since a stranded end is carried

@@ -152,7 +152,7 @@ def register(
 
 
 def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
-    """Return whether `register` can agree without the vehicle being lost: detections reach the beginning."""
+    """Return whether the newest detections reach the beginning: otherwise only a lost vehicle registers."""
     recent, state = _recent(track, times), track.state
     unmoved = Motion(state.poses[-1, :2], np.zeros(3))
     found = _match(state, state.whole_curves, settings, recent, unmoved, _beginning(state), REACH)

@@ -146,7 +146,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
     # --- the newest pose beside the curves ---------------------------------------------------------------
 
     def _find(self, rows: IntArray, curve: IntArray, points: Array) -> FootPoints:
-        """Find the foot points of detections (m,), each on its curve (m,), and locate the newest pose."""
+        """Find foot points of detections at points (m, 2) on their curves (m,); locate the newest pose."""
         state, gate, s = self.map.state, self.map.settings.gate, self.map.settings.spline
         curves, room = state.curves, (gate.station_behind, gate.station_ahead)
         if float(np.hypot(*(state.poses[-1, :2] - state.poses[-2, :2]))) < gate.station_step:

@@ -51,7 +51,7 @@ class Curves:
         )
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
-        """Return whether these are the curves of boundaries with these active control points, or with all."""
+        """Return whether these are the curves of boundaries with active control points, by default all."""
         tables = [boundary.tables for boundary in boundaries.values()]
         stretches = [active.get(label, boundary.everything) for label, boundary in boundaries.items()]
         known = *self.tables, *self.active

@@ -167,7 +167,7 @@ class Sighting:
 
 
 class OrangeCones:
-    """Orange cones as points of the map: means of detections, which bound no road nor hold the vehicle."""
+    """Orange cones as points of the map; they bound no road, and do not hold the vehicle."""
 
     MOST: Final = 500  # newest cycles that are remembered, to be placed again when poses are corrected
 
@@ -185,7 +185,7 @@ class OrangeCones:
             self._place(sighting, sensor)
 
     def place_again(self, sensor: Array, *known: tuple[int, Array]) -> None:
-        """Place all detections by better poses (P, 3) from a first cycle on, of which the last ones count."""
+        """Place all detections anew by poses (P, 3), each from a first cycle on; later arguments win."""
         self._tracks = {}
         for k, one in enumerate(self._sightings):
             for first, poses in known:

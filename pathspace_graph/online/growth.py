@@ -226,10 +226,10 @@ class Growth:
 
     def _is_full(self, label: int, path_ahead: PathAhead) -> bool:
         boundary, longest = self._state.boundaries[label], LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
-        if boundary.size < self.settings.max_size and boundary.confirmed_end < longest:
-            return False
-        self._say_full(label)
-        return True
+        is_full = boundary.size >= self.settings.max_size or boundary.confirmed_end >= longest
+        if is_full:
+            self._say_full(label)
+        return is_full
 
     def _say_full(self, label: int) -> None:
         if label not in self._full:
