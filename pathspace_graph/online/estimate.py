@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -15,7 +16,7 @@ from pathspace_graph.graph.rows import odometry_factor
 from pathspace_graph.graph.variables import POINT, POSE, control_keys, name, pose_key, pose_keys
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.graph.window import as_nonlinear
-from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary, joint_covariance
+from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import LapBatches, VehicleState
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -56,35 +57,28 @@ class MapperEstimate:
 
         An open curve goes on beyond its confirmed end, as `outline` says.
         """
-        with self.smoother.variables.looked_at():
+        with self.looked_at():
             return replace(self._map(), points=self.orange.points())
 
     def _map(self) -> Map:
-        state, outlooks = self.smoother.map.state, self._outlooks()
+        """Return the map without points; a closed curve with few control points has its scatter added."""
+        track, outlooks = self.smoother.map, self._outlooks()
         if not outlooks:
             return Map(self.closed, {})
         newest = pose_keys(np.array([self.smoother.next_cycle - 1]))
-        joint = self.smoother.covariance(np.concatenate([state.map_keys, newest]))
+        joint = self.smoother.covariance(np.concatenate([track.state.map_keys, newest]))
         if self.closed:
-            return self._closed_map(joint[:-POSE, :-POSE])
-        joint, blocks = joint_covariance_of(list(outlooks.values()), joint, self.poses[-1])
+            sizes, shape = [len(one.known) for one in outlooks.values()], self.settings.spline.sigma_shape
+            sigmas = [track.scatter.get(b, np.full(n, shape)) for b, n in zip(outlooks, sizes, strict=True)]
+            joint = joint[:-POSE, :-POSE] + np.diag(np.repeat(np.concatenate(sigmas), POINT) ** 2)
+            blocks = [slice(*ends) for ends in pairwise([0, *(POINT * np.cumsum(sizes)).tolist()])]
+        else:
+            joint, blocks = joint_covariance_of(list(outlooks.values()), joint, self.poses[-1])
         boundaries = {
             label: SplineBoundary(outlook.spline, joint[block, block].copy(), outlook.confirmed_until)
             for (label, outlook), block in zip(outlooks.items(), blocks, strict=True)
         }
-        return Map(False, boundaries, joint)
-
-    def _closed_map(self, joint: Array) -> Map:
-        """Return the closed map: the graph's covariance (2m, 2m), and what few control points can't show."""
-        shape, scatter = self.settings.spline.sigma_shape, self.smoother.map.scatter
-        boundaries, at = {}, 0
-        for label, boundary in self.boundaries.items():
-            block = slice(at, at := at + POINT * boundary.size)
-            sigma = scatter.get(label, np.full(boundary.size, shape))
-            covariance = joint[block, block] + np.diag(np.repeat(sigma, POINT) ** 2)
-            spline = self.smoother.map.state.spline(label)
-            boundaries[label] = SplineBoundary(spline, covariance, spline.domain[1])
-        return Map(True, boundaries, joint_covariance(joint, boundaries))
+        return Map(self.closed, boundaries, joint)
 
     def outline(self) -> Map:
         """Return a copy of the present map without covariances, which takes a hundredth of the time.
@@ -92,7 +86,7 @@ class MapperEstimate:
         Past `confirmed_until` an open curve is tentative: fitted in each call through cones that were seen
         less often. A curve that has not begun may consist of a tentative stretch alone.
         """
-        with self.smoother.variables.looked_at():
+        with self.looked_at():
             boundaries = {
                 label: SplineBoundary(outlook.spline, NO_COVARIANCE, outlook.confirmed_until)
                 for label, outlook in self._outlooks().items()
@@ -147,7 +141,7 @@ class MapperEstimate:
 
     def vehicle_state(self) -> VehicleState:
         """Return the newest pose and the calibration, with their joint covariance."""
-        with self.smoother.variables.looked_at():
+        with self.looked_at():
             return vehicle_state(self.smoother)
 
     def _outlooks(self) -> dict[int, Outlook]:
