@@ -184,9 +184,9 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
     def deactivate_distant(self) -> None:
         """Restrict each step to what the window can touch, and some room for the next cycles.
 
-        This changes no result of a closed map (`graph.inactive`), whose active part is chosen again when it
-        no longer holds what the window needs. The inactive part of an open one grows as the vehicle drives
-        on, and the map may differ by decimetres from one that is solved whole.
+        A closed map's active part is chosen again when it no longer holds what the window needs. The inactive
+        part of an open one grows as the vehicle drives on. What is inactive keeps its linearization, by which
+        the map differs from one that is solved whole (`FarSettings`).
         """
         state = self.map.state
         needed = {label: self._needed(label) for label in state.boundaries}

@@ -102,12 +102,13 @@ class GateSettings(Positive):
 class FarSettings(Positive):
     """The inactive part of the map, which is not solved for in every cycle.
 
-    On a closed map it changes the speed only; an open one may move by decimetres with `far.stretch`.
+    What is inactive keeps its linearization: a closed map differs by millimetres to centimetres, an open one
+    by decimetres with `far.stretch`.
     """
 
     stretch: float = 12.0
     """Least length behind the vehicle of which an open curve's control points become inactive, m."""
-    room: float = 25.0
+    room: float = 40.0
     """Length beyond what the vehicle sees that stays active, m, so that it need not change in every cycle."""
 
 
