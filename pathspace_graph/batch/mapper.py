@@ -268,7 +268,9 @@ class BatchMapper:
         optimizer = Optimizer(system, on_round=on_round)
         watch.lap("integrate")
         start, online = start or self.settings.batch.start, None
-        found = None if start == "online" else find_optimum_from_odometry(optimizer, start == "odometry")
+        found = None if start == "online" else find_closed_optimum(optimizer)
+        if found is None and start == "odometry":
+            found = find_open_optimum(optimizer)
         if found is None:
             if self.online is None:
                 raise SettingsError("start online: expected an online mapper to begin with, found none")
@@ -342,29 +344,34 @@ def _vehicle(state: State, known: FactoredSystem) -> VehicleState:
     return VehicleState.split(state.poses[-1], variables.calibrations, covariance)
 
 
-def find_optimum_from_odometry(
-    optimizer: Optimizer, open_too: bool = True
-) -> tuple[Evaluation, Convergence] | None:
-    """Return the optimum whose search begins at odometry alone.
+def find_closed_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence] | None:
+    """Return the optimum whose search begins with the loop in the odometry.
 
-    None where no lap recurs, or the detections are against its loop, unless an open map will do (`open_too`).
+    None where no lap recurs in it, the search fails, or the detections are against the loop.
     """
-    system = optimizer.system
-    chain, detections, settings = system.chain, system.detections, system.settings
+    chain, detections, settings = (
+        optimizer.system.chain,
+        optimizer.system.detections,
+        optimizer.system.settings,
+    )
     recurrence = find_recurrence(chain.dead_reckoned(np.zeros(CALIBRATION_SIZE)), settings)
-    if not (recurrence.recurs or open_too):
+    if not recurrence.recurs:
         return None
-    state = start_odometry(chain, detections, settings, recurrence)
     try:
-        at, convergence = optimizer.find(state)
+        at, convergence = optimizer.find(start_odometry(chain, detections, settings, recurrence))
     except SolveError:
-        if open_too:
-            raise
         return None
-    if is_true_closure(evidence(at, detections, settings), settings) or (open_too and not state.closed):
-        return at, convergence
-    if not open_too:
-        return None
+    return (at, convergence) if is_true_closure(evidence(at, detections, settings), settings) else None
+
+
+def find_open_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:
+    """Return the optimum whose search begins with an open map along the odometry."""
+    chain, detections, settings = (
+        optimizer.system.chain,
+        optimizer.system.detections,
+        optimizer.system.settings,
+    )
+    recurrence = find_recurrence(chain.dead_reckoned(np.zeros(CALIBRATION_SIZE)), settings)
     return optimizer.find(start_odometry(chain, detections, settings, recurrence.denied()))
 
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import Evidence, evidence, is_true_closure, is_worth_trying, objection
-from pathspace_graph.batch.mapper import BatchMapper, find_optimum_from_odometry
+from pathspace_graph.batch.mapper import BatchMapper, find_closed_optimum
 from pathspace_graph.batch.optimizer import LOOSE_GATE, Optimizer
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import Recurrence, find_recurrence, start_odometry
@@ -79,7 +79,9 @@ def driven(laps: float) -> Log:
 def test_a_course_that_is_driven_again_is_closed() -> None:
     """The longest gap is that of a few cones, and the overlap is what was driven of the second lap."""
     optimizer = optimizer_of(driven(1.4))
-    at, convergence = find_optimum_from_odometry(optimizer)
+    found_optimum = find_closed_optimum(optimizer)
+    assert found_optimum is not None
+    at, convergence = found_optimum
     found = evidence(at, optimizer.system.detections, SETTINGS)
     assert convergence.converged
     assert is_true_closure(found, SETTINGS)
