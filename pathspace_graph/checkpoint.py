@@ -1,8 +1,7 @@
 """Copies of an estimator in memory, to which it goes back where an update fails.
 
 A copy shares what nothing changes: frozen dataclasses of arrays, classes that say that they are `constant`,
-arrays that cannot be written, and GTSAM's factors. All else is copied, so that what a failed update has done
-to it is forgotten with it.
+arrays that cannot be written, and GTSAM's factors.
 """
 
 from collections import deque
@@ -164,10 +163,9 @@ def _object(value: Any, memo: Memo) -> Any:
     return found
 
 
-_COPIERS: Final[dict[type, Copier | None]] = {
+_COPIERS: Final[dict[type, Copier | None]] = {  # how each type that was met is copied; None if it is shared
     np.ndarray: _array,
     MethodType: lambda method, memo: MethodType(method.__func__, copied(method.__self__, memo)),
     gtsam.GaussianFactorGraph: _graph,  # factors are added to these in place
     gtsam.GaussianBayesNet: _graph,
 }
-"""How instances of each type that was met are copied; None where they are shared."""

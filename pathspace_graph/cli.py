@@ -19,9 +19,9 @@ NOT_SOLVED: Final = 3
 INTERRUPTED: Final = 130
 BROKEN_PIPE: Final = 141
 TERMINATED: Final = 143
+# options of every command, each with its level of `console.Verbosity`
 LEVELS: Final = {"-q": "QUIET", "--quiet": "QUIET", "-v": "VERBOSE", "--verbose": "VERBOSE"}
-"""Options that every command takes, each with its level of `console.Verbosity`."""
-COMMANDS: Final = {
+COMMANDS: Final = {  # module of `commands`, dataclass of the options in it, and line of the overview
     "demo": ("compare", "Demo", "maps a generated track online, and shows a table, a map and its picture"),
     "simulate": ("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
     "convert": ("convert", "Convert", "writes a ROS bag, CSV files or a known data set as a log"),
@@ -37,8 +37,6 @@ COMMANDS: Final = {
     "export": ("export", "Export", "writes a map in a format that planners and other tools read"),
     "verify": ("plot", "Verify", "checks that the files of a folder are as they were written"),
 }
-"""Commands by name: module of `commands`, dataclass in it with the options as fields, which does the work in
-`run`, and line of the overview. A module is imported when called: the overview need not wait for GTSAM."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -91,16 +89,14 @@ def _run(arguments: list[str], level: str) -> None:
 
 def overview() -> str:
     width = max(map(len, COMMANDS)) + 2
-    lines = [f"  {name:<{width}}{summary}" for name, (_, _, summary) in COMMANDS.items()]
-    return "\n".join(
-        [
-            f"usage: {PROGRAM} COMMAND [OPTIONS]\n",
-            *lines,
-            f"\n{PROGRAM} COMMAND --help explains each command.",
-            "-q prints errors and hints only, -v progress in lines and where an error comes from.",
-            f'eval "$({PROGRAM} --completion)" completes commands and options in bash and zsh.',
-        ]
-    )
+    lines = [
+        f"usage: {PROGRAM} COMMAND [OPTIONS]\n",
+        *(f"  {name:<{width}}{summary}" for name, (_, _, summary) in COMMANDS.items()),
+        f"\n{PROGRAM} COMMAND --help explains each command.",
+        "-q prints errors and hints only, -v progress in lines and where an error comes from.",
+        f'eval "$({PROGRAM} --completion)" completes commands and options in bash and zsh.',
+    ]
+    return "\n".join(lines)
 
 
 def parse_command(name: str, arguments: list[str]) -> Any:
@@ -109,6 +105,7 @@ def parse_command(name: str, arguments: list[str]) -> Any:
 
 
 def command_class(name: str) -> type[Any]:
+    """Return the class of a command, whose module is imported only now: help need not wait for GTSAM."""
     module, found, _ = COMMANDS[name]
     command: type[Any] = getattr(import_module(f".commands.{module}", __package__), found)
     return command

@@ -47,15 +47,12 @@ def output(wide: bool = False) -> Console:
     return _Output(quiet=quiet, width=FILE_WIDTH) if wide and not console.is_terminal else console
 
 
-def say(*lines: str) -> None:
-    _print(output(), lines)
-
-
 def note(*lines: str) -> None:
-    _print(Console(stderr=True), lines)
+    say(*lines, console=Console(stderr=True))
 
 
-def _print(console: Console, lines: tuple[str, ...]) -> None:
+def say(*lines: str, console: Console | None = None) -> None:
+    console = console or output()
     for line in lines:
         console.print(line, highlight=False, soft_wrap=True, markup=False, emoji=False)
 

@@ -33,8 +33,7 @@ class ReadingError(PathspaceError):
         self, field: str, expected: str, found: object, row: int | None = None, t: float | None = None
     ) -> None:
         self.field, self.expected, self.found, self.row = field, expected, found, row
-        self.t = t
-        """Stamp of the cycle (s), where it has one."""
+        self.t = t  # stamp of the cycle (s), where it has one
         when = "" if t is None else f"cycle at {t:.12g} s: "
         where = field if row is None else f"{field}, row {row}"
         value = f"{found:g}" if isinstance(found, float) else str(found)
@@ -94,13 +93,12 @@ def check_type(name: str, value: object, kind: type[Any]) -> None:
         raise SettingsError(f"{name}: expected {article} {kind.__name__}, found {found}")
 
 
-NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {
+NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {  # checks of numbers, by the words of the message
     "a positive number": lambda value: 0 < value < inf,
     "a number of at least 0": lambda value: 0 <= value < inf,
     "a number in [0, 1]": lambda value: 0 <= value <= 1,
     "a number": lambda value: -inf < value < inf,
 }
-"""Checks of numbers, by the words of the message."""
 
 
 def check_numbers(settings: object, group: str, names: Iterable[str], expected: str) -> None:

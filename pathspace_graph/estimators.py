@@ -21,7 +21,6 @@ from .run import BatchEstimator, OnlineEstimator
 
 MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
 MakeBatch = Callable[[MapperSettings, KnownNoise], BatchEstimator]
-
 MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or one centre line with a width
 
 DEFAULT: Final = "fixed-lag"  # online estimator where none is named
@@ -47,7 +46,7 @@ def _baseline(home: str, settings: MapperSettings, noise: KnownNoise, **others: 
     return getattr(import_module(f".baselines.{module}", __package__), name)(settings, noise, **others)
 
 
-ONLINE: Final[dict[str, MakeOnline]] = {
+ONLINE: Final[dict[str, MakeOnline]] = {  # makers, from settings and known noise
     **_installed(ONLINE_GROUP),
     DEFAULT: FixedLagMapper,
     "landmark-fixed-lag": partial(_baseline, "landmark_fixed_lag:LandmarkFixedLag"),
@@ -55,7 +54,6 @@ ONLINE: Final[dict[str, MakeOnline]] = {
     "landmark-ckf": partial(_baseline, "filters:LandmarkCkf"),
     CENTERLINE: partial(_baseline, "centerline:CenterlineMapper"),
 }
-"""Makers of online estimators, from settings and known noise; see `_load` for other packages."""
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
@@ -63,7 +61,6 @@ BATCH: Final[dict[str, MakeBatch]] = {
     "landmark-batch": partial(_baseline, "landmark_batch:LandmarkBatch"),
     CENTERLINE_BATCH: partial(_baseline, "centerline:CenterlineBatch", online=FixedLagMapper),
 }
-"""Makers of batch estimators, in the same way."""
 
 
 def check_online(name: str) -> None:
@@ -72,7 +69,6 @@ def check_online(name: str) -> None:
 
 
 def check_batch(name: str) -> None:
-    """Raise a SettingsError that names the known estimators, unless the name is one of them."""
     _check(name, BATCH, "batch")
 
 
@@ -88,8 +84,7 @@ def for_map(name: str, kind: MapKind) -> str:
     if kind == "boundaries" or name in lines.values():
         return name
     if name not in lines:
-        expected = f"expected --estimator {' or '.join(lines)}"
-        raise SettingsError(f"--map {kind}: {expected}, found {name}")
+        raise SettingsError(f"--map {kind}: expected --estimator {' or '.join(lines)}, found {name}")
     return lines[name]
 
 

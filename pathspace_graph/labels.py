@@ -8,18 +8,12 @@ UNKNOWN: Final = 2
 ORANGE: Final = 3
 BIG_ORANGE: Final = 4
 
-NAMES: Final = ("left", "right", "unknown", "orange", "big_orange")
-"""Words of the file format, indexed by label."""
-
+NAMES: Final = ("left", "right", "unknown", "orange", "big_orange")  # of the file format, by label
 LABELS: Final = {name: label for label, name in enumerate(NAMES)}
-
 BOUNDARIES: Final = (LEFT, RIGHT)
+POINTS: Final = (ORANGE, BIG_ORANGE)  # they bound no road: they stand at gates, and along lanes to a track
 
-POINTS: Final = (ORANGE, BIG_ORANGE)
-"""Cones with these labels bound no road: they stand at gates, and along lanes that lead to a track."""
-
-_CODES: Final = {
-    **LABELS,
+_CODES: Final = LABELS | {
     **{"blue": LEFT, "yellow": RIGHT, "small_orange": ORANGE},
     **{"large_orange": BIG_ORANGE, "orange_big": BIG_ORANGE},
 }

@@ -54,16 +54,14 @@ Bytes = NDArray[np.uint8]
 
 FORMAT: Final = "pathspace-snapshot/2"
 PACKAGE: Final = "pathspace_graph."
-ROOMS: Final = (
+ROOMS: Final = (  # rooms and modules whose classes estimators are made of
     *("baselines", "batch", "factors", "front_end", "graph", "health", "io.log", "loop", "mapping"),
     *("online", "scale", "settings", "spline"),
 )
-"""Rooms and modules whose classes estimators are made of."""
-FORMAT_ERRORS: Final = (
+FORMAT_ERRORS: Final = (  # of a file that does not fit together; they include Recursion- and UnicodeError
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, MemoryError),
     *(OSError, EOFError, BadZipFile),
 )
-"""Raised where a file does not fit together; `RecursionError` and `UnicodeError` are among them."""
 _DTYPES: Final = ("<f8", "<i8", "|b1", "<i4", "<u8", "|u1", "|i1")
 _ALIGNMENT: Final = 64
 _DIGEST_SIZE: Final = 64
@@ -170,6 +168,7 @@ def _conditional(conditional: gtsam.GaussianConditional) -> tuple[Any, ...]:
     return keys, matrix, linear_arrays.frontals_of(conditional, sizes(keys).tolist())
 
 
+# how an instance of a container, or of a type of another package, is taken apart, and made of its parts
 TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]]]] = {
     list: (iter, lambda *values: [*values]),
     tuple: (iter, lambda *values: values),
@@ -199,7 +198,6 @@ TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]
         lambda keys, matrix: linear_arrays.hessian_factor_of(keys, sizes(keys), matrix),
     ),
 }
-"""Containers and types of other packages: how an instance is taken apart, and made of its parts."""
 _MAKERS: Final = {kind.__name__: make for kind, (_, make) in TYPES.items()}
 
 
@@ -236,8 +234,7 @@ class Encoder:
     def _node(self, value: Any) -> list[Any]:
         kind = type(value)
         if kind is np.ndarray and value.dtype.str in _DTYPES:
-            if value.size and 0 in value.strides:
-                value = value.copy()
+            value = value.copy() if value.size and 0 in value.strides else value
             node = ["array", value.dtype.str, [*value.shape], [*value.strides], 0, value.flags.writeable]
             self._arrays.append((value, node))
             return node
@@ -326,9 +323,8 @@ class Decoder:
         known = layout(self._known[name])
         other = [one for one in {**known, **stated} if known.get(one) != stated.get(one)]
         if other := other or [one for one in names if one not in known]:
-            raise ValueError(
-                f"expected the attributes of {name} in this version, found another {shown(other[0])}"
-            )
+            expected = f"expected the attributes of {name} in this version"
+            raise ValueError(f"{expected}, found another {shown(other[0])}")
         return self._known[name], names
 
     def _value(self, value: Any) -> Any:

@@ -11,14 +11,7 @@ from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment.cells import run_estimator
-from pathspace_graph.eval.experiment.compare import (
-    MARKER,
-    Comparison,
-    compare,
-    side_by_side,
-    tables,
-    write_comparison,
-)
+from pathspace_graph.eval.experiment.compare import Comparison, compare, side_by_side
 from pathspace_graph.eval.experiment.run import check_jobs, workers
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import save_plot
@@ -67,7 +60,7 @@ class Compare:
         estimators = experiment.choose(self.estimators)
         reference = experiment.choose_reference(self.reference, estimators)
         check_jobs(self.jobs)
-        check_target(self.out, MARKER)
+        check_target(self.out, experiment.MARKER)
         logs = experiment.read_logs(self.log, self.settings.limits)
         for named in logs:
             tell(named.hints, of=named.name if len(logs) > 1 else "")
@@ -75,12 +68,12 @@ class Compare:
             how: dict[str, Any] = {"reference": reference, "ghosts": self.ghosts, "jobs": self.jobs}
             comparison = compare(logs, estimators, self.settings, on_run=advance, **how)
         with progress("writing"):
-            write_comparison(self.out, comparison, self.settings, self.jobs)
+            experiment.write_comparison(self.out, comparison, self.settings, self.jobs)
         self._report(comparison)
 
     def _report(self, comparison: Comparison) -> None:
         console = output(wide=True)
-        for table in tables(comparison).values():
+        for table in experiment.tables(comparison).values():
             console.print(table.title, highlight=False, markup=False)
             for part in table.parts(console.width):
                 console.print(part.rich())

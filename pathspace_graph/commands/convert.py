@@ -29,8 +29,7 @@ from .estimate import tell
 from .simulate import describe
 
 Kind = Literal["bag", "csv", "jsonl", "victoria-park"]
-SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}
-"""Endings of records in a folder of several."""
+SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}  # of several in a folder
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,19 +11,11 @@ from typing import Annotated, Any, Final
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from pathspace_graph import estimators
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
-from pathspace_graph.estimators import (
-    DEFAULT,
-    DEFAULT_BATCH,
-    MapKind,
-    check_batch,
-    check_online,
-    for_map,
-    make_batch,
-    make_online,
-)
+from pathspace_graph.estimators import DEFAULT, DEFAULT_BATCH, MapKind, for_map
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.reference import gap
@@ -74,7 +66,7 @@ class Online:
     """Settings of the estimator."""
 
     def run(self) -> None:
-        check_online(self.estimator)
+        estimators.check_online(self.estimator)
         name = for_map(self.estimator, self.map)
         check_target(self.out, MAP_FILE)
         self._check_snapshots(name)
@@ -104,16 +96,15 @@ class Online:
         if asked and estimator != DEFAULT:
             raise SettingsError(f"{asked[0]}: expected --estimator {DEFAULT}, found {estimator}")
         if self.resume is not None and self.settings != MapperSettings():
-            raise SettingsError(
-                "--resume: expected no settings, since the saved mapper has its own, found some"
-            )
+            expected = "expected no settings, since the saved mapper has its own"
+            raise SettingsError(f"--resume: {expected}, found some")
         if self.save is not None:
             check_file_target(self.save)
 
     def _begin(self, log: Log, name: str) -> tuple[Log, OnlineEstimator]:
         """Return a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
         if self.resume is None:
-            return log, make_online(name, self.settings, log)
+            return log, estimators.make_online(name, self.settings, log)
         mapper = FixedLagMapper.restore(self.resume)
         times = mapper.smoother.times
         cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])
@@ -141,7 +132,7 @@ class Batch:
     """Settings of the estimator."""
 
     def run(self) -> None:
-        check_batch(self.estimator)
+        estimators.check_batch(self.estimator)
         name = for_map(self.estimator, self.map)
         if self.start == "odometry" and name != DEFAULT_BATCH:
             raise SettingsError(f"--start: expected online for {name}, found {self.start}")
@@ -149,18 +140,18 @@ class Batch:
         log, hints = read_plausible_log(self.log, self.settings.limits)
         tell(hints)
         with progress("optimizing") as advance:
-            estimator = make_batch(name, self.settings, log)
+            estimator = estimators.make_batch(name, self.settings, log)
             options = (self.start, advance) if isinstance(estimator, BatchMapper) else ()
             result: BatchRun = estimator.solve(log, *options)
         write_result(self.out, result, summarize_batch(result, log, hints))
         report(result, log)
         say(f"written to {self.out}")
         known = result if isinstance(result, BatchResult) else None
+        wrong = f"not a map of the drive: {known.objection}" if known and known.objection else ""
         if not result.converged:
-            note(f"not converged: {known.convergence.reason if known else 'associations still change'}")
-            raise SystemExit(NOT_CONVERGED)
-        if known and known.objection:
-            note(f"not a map of the drive: {known.objection}")
+            wrong = f"not converged: {known.convergence.reason if known else 'associations still change'}"
+        if wrong:
+            note(wrong)
             raise SystemExit(NOT_CONVERGED)
 
 
@@ -170,11 +161,9 @@ def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> d
     summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
         return summary
-    summary["convergence"] = asdict(result.convergence)
-    summary["objection"] = result.objection
-    summary["stages"] = result.seconds
-    summary["gap"] = None if result.online is None else asdict(gap(result.online, result))
-    return summary
+    of_start = None if result.online is None else asdict(gap(result.online, result))
+    summary |= {"convergence": asdict(result.convergence), "objection": result.objection}
+    return summary | {"stages": result.seconds, "gap": of_start}
 
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:
@@ -194,8 +183,7 @@ def map_online(
 
 def report(result: RunResult, log: Log) -> None:
     """Print the run, the paper's table where there is truth, and as an error what was not mapped."""
-    laps = laps_of(result, log)
-    if laps:
+    if laps := laps_of(result, log):
         output().print(laps_table(laps))
     say(outline(result))
     say(*(f"at {record.t:.1f} s: {record.notice}" for record in result.cycles if record.notice))
@@ -204,8 +192,7 @@ def report(result: RunResult, log: Log) -> None:
         say(f"in a vehicle the batch of the lap would have been {late} late")
     state = result.vehicle
     say(*noise_lines(result.noise), *([] if state is None else diagnose(state, result.settings)))
-    missing = not_mapped(result.map, log)
-    if missing:
+    if missing := not_mapped(result.map, log):
         note("; ".join(missing))
 
 

@@ -9,14 +9,8 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.io.export import (
-    LocalPlane,
-    write_centre_line,
-    write_geojson,
-    write_lanelet2,
-    write_points,
-    write_profile,
-)
+from pathspace_graph.io import export as formats
+from pathspace_graph.io.export import LocalPlane
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
@@ -25,8 +19,7 @@ from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.spline.ahead import LEAST_STEP, MOST_POINTS
 
 Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
-ON_EARTH = ("geojson", "lanelet2")
-"""Formats that have latitude and longitude."""
+ON_EARTH = ("geojson", "lanelet2")  # formats that have latitude and longitude
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +51,8 @@ class Export:
     def run(self) -> None:
         check_file_target(self.out)
         if not LEAST_STEP <= self.step < np.inf:
-            raise SettingsError(
-                f"--step: expected a number of at least {LEAST_STEP:g} m, found {self.step:g}"
-            )
+            expected = f"expected a number of at least {LEAST_STEP:g} m"
+            raise SettingsError(f"--step: {expected}, found {self.step:g}")
         if self.format != "profile" and (self.stop or self.start_speed is not None):
             raise SettingsError(f"--start-speed, --stop: expected --as profile, found --as {self.format}")
         plane = self._plane()
@@ -78,16 +70,16 @@ class Export:
 
     def _write(self, file: Path, track: Map, plane: LocalPlane | None) -> None:
         if self.format == "centerline":
-            write_centre_line(file, track, self.step)
+            formats.write_centre_line(file, track, self.step)
         elif self.format == "profile":
-            write_profile(file, track, self.step, self.speed, self.start_speed, self.stop)
+            formats.write_profile(file, track, self.step, self.speed, self.start_speed, self.stop)
         elif self.format == "points":
-            write_points(file, track, self.step)
+            formats.write_points(file, track, self.step)
         elif self.format == "tum":
             read_trajectory(self.map / TRAJECTORY_FILE)  # or it is refused
             shutil.copyfile(self.map / TRAJECTORY_FILE, file)
         elif plane is not None:
-            write = write_geojson if self.format == "geojson" else write_lanelet2
+            write = formats.write_geojson if self.format == "geojson" else formats.write_lanelet2
             write(file, track, self.step, plane)
 
     def _plane(self) -> LocalPlane | None:
@@ -110,8 +102,8 @@ def write_true_path(folder: Path, out: Path) -> None:
 
 def check_length(track: Map, step: float, file: Path) -> None:
     """Raise an InputError where a curve has too many points at this step (m)."""
-    most = MOST_POINTS * step
-    for boundary in track.boundaries.values():
-        if isinstance(boundary, SplineBoundary) and boundary.spline.length() > most:
-            found = f"found {boundary.spline.length():.6g} m"
-            raise InputError(file, f"expected curves of at most {most:g} m at this step, {found}")
+    curves = [own.spline for own in track.boundaries.values() if isinstance(own, SplineBoundary)]
+    longest, most = max((curve.length() for curve in curves), default=0.0), MOST_POINTS * step
+    if longest > most:
+        found = f"found {longest:.6g} m"
+        raise InputError(file, f"expected curves of at most {most:g} m at this step, {found}")

@@ -29,7 +29,7 @@ SETTINGS: Final = "--settings"
 SETTINGS_TEXT: Final = (
     "TOML file of settings, or the summary.json of a run; options on the command line override it."
 )
-ESSENTIAL: Final = (
+ESSENTIAL: Final = (  # settings of the estimators that `--help` explains; the others are in `--help-all`
     *("lag", "max_poses", "steps", "noise", "scale"),
     *("limits.silence", "limits.range_max"),
     *("spline.degree", "spline.spacing", "spline.size_share", "spline.knots", "spline.sigma_model"),
@@ -39,7 +39,6 @@ ESSENTIAL: Final = (
     *("calibration.sensor", "calibration.trust", "calibration.yaw", "calibration.lateral"),
     *("calibration.latency", "calibration.range_scale", "calibration.range_bias"),
 )
-"""Settings of the estimators that `--help` explains; the others are in `--help-all`."""
 COLUMN: Final = 38  # column of the short help in which the texts begin
 MOST_COLUMNS: Final = 120
 REQUIRED: Final = " (required)"

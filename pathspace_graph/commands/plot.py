@@ -18,12 +18,7 @@ from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import (
-    CYCLES_FILE,
-    SMOOTHED_FILE,
-    TRAJECTORY_FILE,
-    read_trajectory,
-)
+from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +46,9 @@ class Plot:
         files = (self.map / name for name in (TRAJECTORY_FILE, SMOOTHED_FILE))
         trajectory, smoothed = (read_trajectory(file)[1] if file.exists() else None for file in files)
         cycles = read_cycles(self.map) if (self.map / CYCLES_FILE).exists() else {}
-        health = [*cycles.get("health", [])]
-        look: dict[str, Any] = {"health": health, "band_scale": self.band_scale, "title": self.title}
-        save_plot(plot_map(track, log=log, trajectory=trajectory, smoothed=smoothed, **look), self.out)
+        look: dict[str, Any] = {"band_scale": self.band_scale, "title": self.title}
+        look |= {"trajectory": trajectory, "smoothed": smoothed, "health": [*cycles.get("health", [])]}
+        save_plot(plot_map(track, log=log, **look), self.out)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,14 +14,9 @@ from tyro.conf import Positional, arg
 from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT, ONLINE, check_online
+from pathspace_graph.eval.benchmark import scaling as timing
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
-from pathspace_graph.eval.benchmark.scaling import (
-    MARKER,
-    measure_scaling,
-    scaling_table,
-    stops,
-    write_scaling,
-)
+from pathspace_graph.eval.benchmark.scaling import measure_scaling
 from pathspace_graph.eval.experiment.faults import only, strongest, suite, write_suite
 from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study
@@ -82,10 +77,9 @@ def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], l
     """
     if laps is not None and laps < 1:
         raise SettingsError(f"--laps: expected at least 1, found {laps}")
-    own: dict[str, object] = {"seeds": seeds} if seeds else {}
-    own |= {"laps": laps} if laps else {}
-    own |= {"tracks": tuple(int(t) if t.isdecimal() else Path(t) for t in tracks)} if tracks else {}
-    return replace(study, **own)  # type: ignore[arg-type]
+    chosen = tuple(int(track) if track.isdecimal() else Path(track) for track in tracks)
+    given: dict[str, Any] = {"tracks": chosen, "seeds": seeds, "laps": laps}
+    return replace(study, **{name: value for name, value in given.items() if value})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,15 +140,15 @@ class Scale:
             check_online(name)
         if self.quick and self.scaling != ScalingSettings():
             raise SettingsError("--quick: expected no other --scaling options with it, found some")
-        check_target(self.out, MARKER)
+        check_target(self.out, timing.MARKER)
         measured = QUICK if self.quick else self.scaling
         with progress("simulating"):
             drives = make_drives(measured)
         with progress("timing", drives.cycles) as advance:
             scaling = measure_scaling(names, drives, measured, self.settings, advance)
-        write_scaling(self.out, scaling)
-        output(wide=True).print(scaling_table(scaling).rich())
-        say(*stops(scaling), f"written to {self.out}")
+        timing.write_scaling(self.out, scaling)
+        output(wide=True).print(timing.scaling_table(scaling).rich())
+        say(*timing.stops(scaling), f"written to {self.out}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,14 +181,11 @@ class Report:
         if self.quick and self.pages is not None:
             raise SettingsError("--pages: expected none with --quick, whose figures mean little")
         known = read_figures(self.pages / FIGURES) if self.pages and (self.pages / FIGURES).exists() else {}
-        command = "pathspace-graph report" + (" --tracks TRACKS" if self.tracks else "")
-        about = {
-            "command": command + (" --real LOGS" if self.real else ""),
-            "commit": commit_of(self.pages),
-            "date": date.today().isoformat(),
-        }
+        drives: dict[str, Any] = {"tracks": self.tracks, "real": self.real, "quick": self.quick}
+        command = "pathspace-graph report" + " --tracks TRACKS" * bool(self.tracks)
+        command += " --real LOGS" * bool(self.real)
+        about = {"command": command, "commit": commit_of(self.pages), "date": date.today().isoformat()}
         with progress("runs", lines=LINES) as advance:
-            drives: dict[str, Any] = {"tracks": self.tracks, "real": self.real, "quick": self.quick}
             plan = Plan(jobs=self.jobs, on_cell=advance, **drives)
             tables = measure_figures(plan, self.out, self.only, about, known)
         self.out.mkdir(parents=True, exist_ok=True)
@@ -215,7 +206,5 @@ def commit_of(root: Path | None) -> str:
     git = shutil.which("git")
     if git is None or root is None:
         return ""
-    found = subprocess.run(
-        [git, "-C", str(root), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
-    )
-    return found.stdout.strip()
+    command = [git, "-C", str(root), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

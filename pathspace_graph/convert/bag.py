@@ -18,13 +18,12 @@ from .recording import Recording, twists_between
 from .settings import LabelRule
 
 INSTALL: Final = "pip install 'pathspace-graph[ros]'"  # command that installs the package that reads bags
-SUPPORTED: Final = {
+SUPPORTED: Final = {  # what a message must hold, by the option of its topic
     "--odometry": "a twist, a speed or a pose",
     "--imu": "an angular velocity",
     "--detections": "a point cloud, an array of markers, or a list of cones with points",
     "transforms": "transforms",
 }
-"""What a message must hold, by the option of its topic."""
 STATIC: Final = "/tf_static"  # topic of the transforms between frames that are fixed to the vehicle
 BODIES: Final = ("base_link", "base_footprint")  # frames of a vehicle whose odometry names none
 LEVEL: Final = 0.98  # least cosine of a level sensor's z axis and the vehicle's

@@ -15,11 +15,10 @@ from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from .settings import LABEL_FIELDS, NO_LABEL, LabelRule
 
-LIST_NAMES: Final = {
+LIST_NAMES: Final = {  # labels of the cones in a list with such a word in its name
     **{"big_orange": BIG_ORANGE, "orange": ORANGE},
     **{"blue": LEFT, "left": LEFT, "yellow": RIGHT, "right": RIGHT},
 }
-"""Labels of the cones in a list with such a word in its name."""
 CLOUD_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # by `datatype`
 POINT_MARKERS: Final = (1, 2, 3, 10)  # types of markers that are one point: cube, sphere, cylinder, mesh
 LIST_MARKERS: Final = (6, 7, 8)  # types of markers that are lists of points: cubes, spheres, points
@@ -33,12 +32,24 @@ class MessageError(PathspaceError):
     """A message is not of a kind that can be read; the text says what was expected and what was found."""
 
 
+def first_of(holder: Any, names: Iterable[str]) -> Any:
+    """Return the first of these fields that a message has, or None."""
+    return next((getattr(holder, name) for name in names if hasattr(holder, name)), None)
+
+
 class Points(NamedTuple):
     """Detected points of one message, in the frame of its sensor."""
 
     points: Array  # (m, 2) points in m
     covariances: Array  # (m, 2, 2) covariances in m^2, NaN where the message does not give them
     labels: IntArray  # (m,) labels
+
+    @classmethod
+    def of(cls, points: Any, labels: Any, covariances: Any = None) -> "Points":
+        """Return the points of arrays or lists, which may be empty."""
+        placed = np.array(points, dtype=float).reshape(-1, 2)
+        covariances = np.full((len(placed), 2, 2), np.nan) if covariances is None else covariances
+        return cls(placed, np.array(covariances, float).reshape(-1, 2, 2), np.array(labels, dtype=int))
 
     def where(self, chosen: BoolArray) -> "Points":
         return Points(self.points[chosen], self.covariances[chosen], self.labels[chosen])
@@ -80,10 +91,7 @@ def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
     if hasattr(twist, "linear") and hasattr(twist, "angular"):
         return np.array([twist.linear.x, twist.linear.y, twist.angular.z], dtype=float)
     drive = getattr(message, "drive", message)
-    speed, rate = (
-        next((getattr(drive, name) for name in names if hasattr(drive, name)), None)
-        for names in (SPEEDS, YAW_RATES)
-    )
+    speed, rate = (first_of(drive, names) for names in (SPEEDS, YAW_RATES))
     if isinstance(speed, Real):
         if hasattr(drive, "steering_angle") and wheelbase is not None:
             rate = speed * np.tan(drive.steering_angle) / wheelbase
@@ -129,9 +137,8 @@ def points_of(message: Any, rule: LabelRule) -> Points:
 
 def cloud_points(cloud: Any, rule: LabelRule) -> Points:
     """Return the points of a `PointCloud2` by its fields `x`, `y`, the label and, if any, xx, xy, yy."""
-    columns = _cloud_columns(cloud)
-    points = np.column_stack([columns["x"], columns["y"]]).astype(float)
-    covariances = np.full((len(points), 2, 2), np.nan)
+    columns, covariances = _cloud_columns(cloud), None
+    points = np.column_stack([columns["x"], columns["y"]])
     if {"xx", "xy", "yy"} <= columns.keys():
         covariances = covariances_of(*(columns[entry].astype(float) for entry in ("xx", "xy", "yy")))
     labels = np.full(len(points), UNKNOWN)
@@ -142,7 +149,7 @@ def cloud_points(cloud: Any, rule: LabelRule) -> Points:
             found = f"found {', '.join(columns)} (--label-field names it, `{NO_LABEL}` does without)"
             raise MessageError(f"expected a point cloud with labels in the field {wanted}, {found}")
         labels = rule.of_all(columns[name])
-    return Points(points, covariances, labels)
+    return Points.of(points, labels, covariances)
 
 
 def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
@@ -176,15 +183,13 @@ def array_points(message: Any, rule: LabelRule) -> Points:
     if len(set(lengths)) > 1:
         raise MessageError(f"expected arrays {', '.join(names)} of one length, found {lengths}")
     labels = rule.of_all(values[0]) if values else np.full(len(x), UNKNOWN)
-    return Points(np.column_stack([x, y]).astype(float), np.full((len(x), 2, 2), np.nan), labels)
+    return Points.of(np.column_stack([x, y]), labels)
 
 
 def marker_points(array: Any, rule: LabelRule) -> Points:
     """Return the points of a `MarkerArray` that are added: blue ones are left, yellow ones right."""
     rows = [row for marker in _added(array.markers) for row in _of_marker(marker, rule)]
-    points = np.array([row[:2] for row in rows], dtype=float).reshape(-1, 2)
-    labels = np.array([row[2] for row in rows], dtype=int)
-    return Points(points, np.full((len(points), 2, 2), np.nan), labels)
+    return Points.of([row[:2] for row in rows], [row[2] for row in rows])
 
 
 def _added(markers: Iterable[Any]) -> Iterator[Any]:
@@ -215,11 +220,9 @@ def cone_points(message: Any, rule: LabelRule) -> Points:
     lists = {name: listed for name, listed in lists.items() if _is_list(listed)}
     if not lists:
         raise MessageError(f"expected a message with a list of cones, found the fields {_names(message)}")
-    cones = [(name, cone) for name, listed in lists.items() for cone in listed]
-    points = np.array([_position(cone) for _, cone in cones], dtype=float).reshape(-1, 2)
-    covariances = np.array([_covariance(cone) for _, cone in cones], dtype=float).reshape(-1, 2, 2)
-    labels = [_cone_label(name, cone, rule) for name, cone in cones]
-    return Points(points, covariances, np.array(labels, dtype=int))
+    cones = [cone for listed in lists.values() for cone in listed]
+    labels = [_cone_label(name, cone, rule) for name, listed in lists.items() for cone in listed]
+    return Points.of([*map(_position, cones)], labels, [*map(_covariance, cones)])
 
 
 def _is_list(value: Any) -> bool:
@@ -231,16 +234,15 @@ def _path(cone: Any) -> Iterator[Any]:
     at = cone
     while at is not None:
         yield at
-        name = next((name for name in POSITIONS if hasattr(at, name)), None)
-        at = None if name is None else getattr(at, name)
+        at = first_of(at, POSITIONS)
 
 
 def _position(cone: Any) -> tuple[float, float]:
     """Return the position of a cone (m), which may lie some fields deep, as in a pose with covariance."""
     at = next((at for at in _path(cone) if hasattr(at, "x") and hasattr(at, "y")), None)
     if at is None:
-        expected = f"expected a cone with one of the fields {', '.join(POSITIONS)}"
-        raise MessageError(f"{expected}, found {_names(cone)}")
+        fields_of_one = ", ".join(POSITIONS)
+        raise MessageError(f"expected a cone with one of the fields {fields_of_one}, found {_names(cone)}")
     return float(at.x), float(at.y)
 
 
@@ -262,8 +264,7 @@ def _cone_label(name: str, cone: Any, rule: LabelRule) -> int:
 
 def _label_value(holder: Any, names: Sequence[str]) -> Any:
     """Return the value of the first label field, also inside the first of several hypotheses."""
-    name = next((name for name in names if hasattr(holder, name)), None)
-    value = None if name is None else getattr(holder, name)
+    value = first_of(holder, names)
     if _is_list(value):
         value = value[0] if value else None
     inside = _label_value(value, LABEL_FIELDS) if value is not None else None

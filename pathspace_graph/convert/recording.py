@@ -23,8 +23,8 @@ from .messages import Points, points_of, stamp_of, twist_of
 from .settings import SIGMA_ODOMETRY, Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
+# notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
-"""Note of covariances that the record does not have."""
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
 SHARED_STAMP: Final = "messages with detections have the stamp of another one, and are one cycle with it"
 MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
@@ -91,15 +91,13 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
     """
     frames = replace(frames, mounting=frames.mounting or record.mounting)
     odometry = _odometry(record, frames, file)
-    cycles = _cycles(record, odometry, frames, noise, file)
-    stated = SIGMA_ODOMETRY if record.odometry_sigma is None else record.odometry_sigma
-    sigma = np.array(stated if noise.sigma_odometry is None else noise.sigma_odometry, dtype=float)
+    stated = record.odometry_sigma if noise.sigma_odometry is None else noise.sigma_odometry
     return Log(
         odometry,
-        cycles,
-        sigma,
+        _cycles(record, odometry, frames, noise, file),
+        np.array(SIGMA_ODOMETRY if stated is None else stated, dtype=float),
         source=record.source,
-        odometry_stated=noise.sigma_odometry is not None or record.odometry_sigma is not None,
+        odometry_stated=stated is not None,
         detections_stated=noise.states_detections or not record.notes[ASSUMED],
         truth=record.truth,
     )
@@ -123,8 +121,7 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     t, twists = t[order], twists[order]
     last = np.append(np.diff(t) > 0, True)  # of samples with one stamp the last one counts
     notes["odometry samples had the stamp of another one, and were left out"] += int((~last).sum())
-    twists = twists[last] * frames.flip
-    return Odometry(t[last], twists)
+    return Odometry(t[last], twists[last] * frames.flip)
 
 
 def _check_stamps(t: Array, what: str, file: Path, notes: Counter[str]) -> None:
@@ -161,9 +158,8 @@ def _cycles(
     if not found and notes[OUTSIDE]:
         span = f"{begin:.9g} s to {end - logs.MAX_HOLD:.9g} s"
         stamps = f"from {t.min():.9g} s to {t.max():.9g} s: do both have the same clock?"
-        raise InputError(
-            file, f"expected detections in the time of the odometry, {span}, found them {stamps}"
-        )
+        expected = f"expected detections in the time of the odometry, {span}"
+        raise InputError(file, f"{expected}, found them {stamps}")
     if not found:
         raise InputError(file, f"expected detections that can be used, found {len(t)} messages without any")
     return tuple(in_vehicle_frame(stamp, join(scans), frames, noise, notes) for stamp, scans in found.items())
@@ -203,8 +199,7 @@ def in_vehicle_frame(
 
 def positive_definite(covariances: Array) -> BoolArray:
     """Return which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
-    xx, yy = covariances[:, 0, 0], covariances[:, 1, 1]
-    xy, yx = covariances[:, 0, 1], covariances[:, 1, 0]
+    xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
         good = np.isfinite(covariances).all(axis=(1, 2)) & logs.is_positive_definite(xx, xy, yy)
         good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
@@ -225,8 +220,8 @@ def default_covariances(points: Array, noise: NoiseSettings) -> Array:
 
 
 MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle, the newest ones
+# errors of a message that cannot be read
 BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexError, OverflowError)
-"""Errors of a message that cannot be read."""
 
 
 class MessageStream:

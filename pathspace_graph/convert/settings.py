@@ -15,8 +15,8 @@ from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
 
 Side = Literal["left", "right"]  # side of the x axis to which the y axis points
+# fields of a message that may hold the label of a detection, the first one that is there
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
-"""Fields of a message that may hold the label of a detection, the first one that is there."""
 NO_LABEL: Final = "none"  # name of a label field that says there are no labels
 DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
 SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
@@ -24,11 +24,10 @@ SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)  # (m, m/m, rad) where nothi
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}
+# words of values that mean no side, and of colours, whose hue has decided
 UNKNOWN_WORDS: Final = {"unknown", "none", "other", "undefined", "uncolored", "colourless", "colour"}
-"""Words of values that mean no side, and of colours, whose hue has decided."""
 MOST_TOLD: Final = 12  # number of values of labels that a line lists
-HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}
-"""Hues (degrees) of blue, orange and yellow; that of red is below, that of green between yellow and blue."""
+HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}  # in degrees
 MIN_SATURATION: Final = 0.3  # least saturation of a colour that is not grey
 
 
@@ -55,10 +54,8 @@ class NoiseSettings:
         if sigmas is not None and (len(sigmas) != 3 or not all(0 < sigma < inf for sigma in sigmas)):
             raise SettingsError(f"--sigma-odometry: expected three positive numbers, found {sigmas}")
         for name in ("sigma_range", "sigma_bearing", "sigma_range_growth"):
-            if getattr(self, name) is not None:
-                is_growth = name == "sigma_range_growth"
-                expected = "a number of at least 0" if is_growth else "a positive number"
-                check_numbers(self, "convert", [name], expected)
+            expected = "a number of at least 0" if name == "sigma_range_growth" else "a positive number"
+            check_numbers(self, "convert", [name] if getattr(self, name) is not None else [], expected)
 
     @property
     def _own(self) -> tuple[float | None, ...]:
@@ -90,11 +87,10 @@ class Frames:
     """Side to which the y axis of the odometry points, where it is another one than `y`."""
 
     def __post_init__(self) -> None:
-        if self.mounting is None:
-            return
-        if not all(map(isfinite, self.mounting)) or abs(self.mounting[2]) > 2.0 * pi:
+        mounting = self.mounting or (0.0, 0.0, 0.0)
+        if not all(map(isfinite, mounting)) or abs(mounting[2]) > 2.0 * pi:
             expected = "--mounting: expected X Y YAW in m, m and rad, with a yaw of at most 2 pi"
-            raise SettingsError(f"{expected}, found {' '.join(f'{value:g}' for value in self.mounting)}")
+            raise SettingsError(f"{expected}, found {' '.join(f'{value:g}' for value in mounting)}")
 
     @property
     def flip(self) -> NDArray[np.float64]:
@@ -136,16 +132,15 @@ class LabelRule:
     def __init__(self, pairs: Sequence[str] = (), field: str | None = None) -> None:
         self.fields = (field,) if field else LABEL_FIELDS
         self._labels: dict[str, int] = {}
-        self.met: Counter[tuple[str, int]] = Counter()
-        """Times that each value was met, by its text and the label it was taken for."""
+        self.met: Counter[tuple[str, int]] = Counter()  # values, by their text and the label they got
         for pair in pairs or DEFAULT_LABELS:
             name, equals, value = pair.partition("=")
             if not equals or name not in NAMES or not value:
                 raise SettingsError(f"--labels: expected LABEL=VALUE with a LABEL of {NAMES}, found '{pair}'")
             self._labels[value] = NAMES.index(name)
 
-    def of(self, value: Any) -> int:
-        """Return the label of a value: a number, a text, or a colour with `r`, `g` and `b`."""
+    def of(self, value: Any, times: int = 1) -> int:
+        """Return the label of a value met so often: a number, a text, or a colour with `r`, `g` and `b`."""
         value = getattr(value, "data", value)
         if hasattr(value, "r") and hasattr(value, "g") and hasattr(value, "b"):
             r, g, b = (float(channel) for channel in (value.r, value.g, value.b))
@@ -153,15 +148,12 @@ class LabelRule:
         else:
             text = _whole(str(value).strip())
             label = self._labels[text] if text in self._labels else label_of_words(text)
-        self.met[text, label] += 1
+        self.met[text, label] += times
         return label
 
     def of_all(self, values: NDArray[Any]) -> NDArray[np.int_]:
         texts, place, counts = np.unique(values, return_inverse=True, return_counts=True)
-        labels = np.array([self.of(text) for text in texts.tolist()], dtype=int)
-        for text, label, count in zip(texts.tolist(), labels.tolist(), counts.tolist(), strict=True):
-            self.met[_whole(str(text).strip()), label] += count - 1
-        return labels[place]
+        return np.array([*map(self.of, texts.tolist(), counts.tolist())], dtype=int)[place]
 
     def told(self) -> str:
         """Return in a line what the most frequent values were taken for; empty where there are none."""
@@ -173,10 +165,8 @@ class LabelRule:
         """Return which values may mean a side that nobody has said; empty where there are none."""
         unknown = [text for (text, label), _ in self.met.most_common() if label == UNKNOWN]
         unmapped = [text for text in unknown if label_words(text).isdisjoint(UNKNOWN_WORDS) and text]
-        if not unmapped:
-            return ""
         told = f"labels {', '.join(unmapped[:MOST_TOLD])} are taken for unknown"
-        return f"{told}: --labels left={unmapped[0]} says what they mean"
+        return f"{told}: --labels left={unmapped[0]} says what they mean" if unmapped else ""
 
 
 def _whole(text: str) -> str:

@@ -21,23 +21,21 @@ from .settings import LabelRule
 
 ODOMETRY: Final = "odometry"
 DETECTIONS: Final = "detections"
-QUANTITIES: Final = {
+QUANTITIES: Final = {  # columns of each file and their quantities; a covariance is of the square of one
     ODOMETRY: {"t": "time", "vx": "speed", "vy": "speed", "wz": "yaw_rate"},
     DETECTIONS: {
         **{"t": "time", "x": "length", "y": "length", "range": "length", "bearing": "angle", "label": ""},
         **{"xx": "length", "xy": "length", "yy": "length"},
     },
 }
-"""Columns of each file and their quantities; a covariance is of the square of one."""
 COVARIANCE: Final = ("xx", "xy", "yy")  # columns of the covariance of a detection, if there is one
-UNITS: Final[Mapping[str, Mapping[str, float]]] = {
+UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # units of each quantity, in SI units
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
     "angle": {"rad": 1.0, "deg": pi / 180.0},
     "speed": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/s": 1e3, "km/h": 1.0 / 3.6, "mph": 0.44704},
     "yaw_rate": {"rad/s": 1.0, "deg/s": pi / 180.0},
 }
-"""Units of each quantity, in SI units."""
 MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
 LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
 UNSTATED: Final = ((np.nan, np.nan), (np.nan, np.nan))  # covariance of a detection that states none
@@ -61,10 +59,9 @@ def read_csv(
     t = twists.stamps()
     vx, wz = twists.numbers("vx"), twists.numbers("wz")
     vy = twists.numbers("vy") if twists.has("vy") else np.zeros(len(t))
-    scan_t, scans = _scans(found, rule)
     in_words = ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(used.items()))
     source = {"odometry": odometry.name, "detections": detections.name, "units": in_words}
-    return Recording(t, np.column_stack([vx, vy, wz]), scan_t, scans, source)
+    return Recording(t, np.column_stack([vx, vy, wz]), *_scans(found, rule), source)
 
 
 def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
@@ -75,9 +72,8 @@ def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
         if not equals or not name.removeprefix("-"):
             raise SettingsError(f"--columns: expected QUANTITY=COLUMN, found '{pair}'")
         only, _, key = key.rpartition(".")
-        known = [key for kind, keys in QUANTITIES.items() if only in ("", kind) for key in keys]
-        expected = f"expected one of {', '.join(dict.fromkeys(known))} in '{pair}'"
-        check_name(key, known, f"--columns: {expected}")
+        known = dict.fromkeys(key for kind, keys in QUANTITIES.items() if only in ("", kind) for key in keys)
+        check_name(key, known, f"--columns: expected one of {', '.join(known)} in '{pair}'")
         named |= {(kind, key): name for kind in ([only] if only else QUANTITIES)}
     return named
 
@@ -89,8 +85,8 @@ def _units(pairs: Sequence[str]) -> dict[str, str]:
         quantity, equals, unit = pair.partition("=")
         check_name(quantity, UNITS, f"--units: expected one of {', '.join(UNITS)} in '{pair}'")
         if not equals or unit not in UNITS[quantity]:
-            expected = f"expected {quantity}= one of {', '.join(UNITS[quantity])}"
-            raise SettingsError(f"--units: {expected}, found '{pair}'")
+            known = ", ".join(UNITS[quantity])
+            raise SettingsError(f"--units: expected {quantity}= one of {known}, found '{pair}'")
         names[quantity] = unit
     return {"speed": f"{names['length']}/s", "yaw_rate": f"{names['angle']}/s", **names}
 
@@ -123,9 +119,8 @@ class _File:
     def numbers(self, key: str, power: int = 1) -> Array:
         """Return a column (rows,) in the SI unit, or in its square where `power` is 2."""
         quantity = QUANTITIES[self.kind][key]
-        factor = UNITS[quantity][self.units[quantity]] ** power
-        if self.named.get((self.kind, key), "").startswith("-"):
-            factor = -factor
+        sign = -1.0 if self.named.get((self.kind, key), "").startswith("-") else 1.0
+        factor = sign * UNITS[quantity][self.units[quantity]] ** power
         return np.asarray(factor * self.table.numbers(self.column(key), LARGEST))
 
     def stamps(self) -> Array:
@@ -147,8 +142,8 @@ class _File:
 
 def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
     """Return the stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
-    t, points, rows = file.stamps(), _points(file), len(file.table)
-    covariances, labels = np.full((rows, 2, 2), np.nan), np.full(rows, UNKNOWN)
+    t, points, covariances = file.stamps(), _points(file), None
+    labels = np.full(len(t), UNKNOWN)
     if any(map(file.has, COVARIANCE)):
         covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
     if file.has("label"):
@@ -156,8 +151,8 @@ def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
     cycles: dict[float, list[int]] = {}
     for row, stamp in enumerate(t.tolist()):
         cycles.setdefault(stamp, []).append(row)
-    scans = [Points(points[own], covariances[own], labels[own]) for own in cycles.values()]
-    return np.array([*cycles]), scans
+    detections = Points.of(points, labels, covariances)
+    return np.array([*cycles]), [detections.where(np.array(rows)) for rows in cycles.values()]
 
 
 def _points(file: _File) -> Array:
@@ -172,8 +167,7 @@ def _points(file: _File) -> Array:
         f"expected bearings of at most a whole turn in column '{name}', found more: is their unit not {unit} "
         "(--units angle=deg)?",
     )
-    negative = f"expected ranges of at least 0 in column '{file.column('range')}'"
-    file.table.require(ranges >= 0.0, negative)
+    file.table.require(ranges >= 0.0, f"expected ranges of at least 0 in column '{file.column('range')}'")
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
 
@@ -201,8 +195,8 @@ def read_json_lines(file: Path, rule: LabelRule) -> Recording:
             expected = "expected a line with t, and with twist [vx, vy, wz] or a list of detections"
             found = f"found {shown(line)} ({type(error).__name__}: {error})"
             raise InputError(file, f"{expected}, {found}", row) from None
-    source = {"file": file.name}
-    return Recording(np.array(t), np.array(twists).reshape(-1, 3), np.array(scan_t), scans, source)
+    measured = np.array(t), np.array(twists).reshape(-1, 3)
+    return Recording(*measured, np.array(scan_t), scans, {"file": file.name})
 
 
 def _points_of_objects(objects: list[dict[str, Any]], rule: LabelRule) -> Points:
@@ -216,5 +210,4 @@ def _points_of_objects(objects: list[dict[str, Any]], rule: LabelRule) -> Points
         points.append(np.array(place, dtype=float))
         covariances.append(np.array(one.get("covariance", UNSTATED), dtype=float).reshape(2, 2))
         labels.append(rule.of(one["label"]) if "label" in one else UNKNOWN)
-    shaped = np.array(points).reshape(-1, 2), np.array(covariances).reshape(-1, 2, 2)
-    return Points(*shaped, np.array(labels, dtype=int))
+    return Points.of(points, labels, covariances)

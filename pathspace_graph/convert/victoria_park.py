@@ -25,10 +25,9 @@ from .recording import Recording, twists_of
 EXAMPLE: Final = "victoria_park.txt"  # name of the file that GTSAM brings
 PERIOD: Final = 0.2  # time from pose to pose (s), nearly as the drive had it; the file has none
 SIGMA_ODOMETRY: Final = (0.055, 0.025, 0.08)
-"""Standard deviations (m/s, m/s, rad/s) of white noise with the effect of the odometry's errors.
-
-The rms of the errors against the reference times the square root of their integrated autocorrelation: the
-file's 0.05, 0.01, 0.01 from pose to pose are white, its errors are correlated over a hundred poses."""
+"""Sigmas (m/s, m/s, rad/s) of white noise with the effect of the odometry's errors: their rms against the
+reference times the root of their integrated autocorrelation, as they last for a hundred poses. The file
+has 0.05, 0.01, 0.01 from pose to pose, as if they were white."""
 FIELDS: Final = {"ODOMETRY": 11, "LANDMARK": 7}  # numbers in a row, by its first word
 ANCHOR_SIGMA: Final = 1e-4  # standard deviation of the first pose of the reference (m, m, rad)
 POSES_A_STEP: Final = 10  # of the reference, which no batch finds after the drift of 4 km

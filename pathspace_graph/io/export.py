@@ -97,12 +97,9 @@ class LocalPlane:
     and 8 mm in 10 km.
     """
 
-    latitude: float
-    """Latitude of the map's origin (degrees), positive to the north."""
-    longitude: float
-    """Longitude of the map's origin (degrees), positive to the east."""
-    heading: float
-    """Direction of the map's x axis (degrees), clockwise from north."""
+    latitude: float  # latitude of the map's origin (degrees), positive to the north
+    longitude: float  # longitude of the map's origin (degrees), positive to the east
+    heading: float  # direction of the map's x axis (degrees), clockwise from north
 
     def __post_init__(self) -> None:
         for good, expected, found in (
@@ -193,14 +190,13 @@ def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> Non
 # --- Lanelet2 --------------------------------------------------------------------------------------------
 
 WAY_TAGS: Final = {"type": "line_thin", "subtype": "solid"}  # lines that must not be crossed
-LANELET_TAGS: Final = {
+LANELET_TAGS: Final = {  # tags of a lanelet: a road for vehicles, in the direction of travel
     "type": "lanelet",
     "subtype": "road",
     "location": "nonurban",
     "one_way": "yes",
     "participant:vehicle": "yes",
 }
-"""Tags of a lanelet: a road for vehicles, in the direction of travel."""
 CONE: Final = "cone"  # type of the node of an orange cone, whose subtype is its label
 _PIECES: Final = 4  # lanelets of a loop; Lanelet2 knows neither length nor successor of a single one
 _FEWEST_WAY_INTERVALS: Final = 2

@@ -45,11 +45,11 @@ _TOKEN: Final = "[0-9a-f]{8}"
 
 @contextmanager
 def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
-    """Yield a temporary folder beside `target` that takes its place on success and is removed on failure.
+    """Yield a temporary folder beside `target` that gets a manifest and takes its place on success.
 
-    It is given a manifest. An empty folder at `target` is used. An earlier result, known by the file `marker`
-    in it, is kept as a numbered backup `NAME.~1~`; anything else there is an OutputError. At each moment the
-    target is the old or the new, even if the process is killed or the power is cut.
+    An earlier result, known by the file `marker` in it, is kept as a numbered backup `NAME.~1~`; anything
+    else there but an empty folder is an OutputError. At each moment, even where the process is killed or the
+    power is cut, the target is the old or the new.
     """
     final = _followed(target)
     with _placed(final, Path.mkdir, lambda: check_target(final, marker)) as temporary:
@@ -61,8 +61,8 @@ def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
 def atomic_file(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path of the same suffix, whose file takes its place at `path` on success.
 
-    A file that is there already is kept as a numbered backup `NAME.~1~`; on failure nothing is left behind.
-    Symbolic links are followed. `-` is standard output; it, a device and a pipe are written in place.
+    An earlier file is kept as a numbered backup `NAME.~1~`. Symbolic links are followed. Standard output
+    (`-`), a device and a pipe are written in place.
     """
     path, final = Path(path), _followed(path)
     if is_stream(path):
@@ -143,8 +143,7 @@ def check_target(target: Path | str, marker: str) -> None:
             return
     except OSError as error:
         raise OutputError(f"{target}: expected a readable folder: {error.strerror}") from error
-    expected = "expected an empty folder or an earlier result"
-    raise OutputError(f"{target}: {expected}, found files but no {marker}")
+    raise OutputError(f"{target}: expected an empty folder or an earlier result, found files but no {marker}")
 
 
 def check_file_target(path: Path | str) -> None:
@@ -236,10 +235,7 @@ def is_temporary(name: str) -> bool:
 
 @contextmanager
 def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
-    """Yield a new path beside `final`, made by `make` and locked, which is gone at the end.
-
-    What runs that died have left of the same target is removed before.
-    """
+    """Yield a new path beside `final`, made by `make` and locked, which is gone at the end."""
     remove_leftovers(final)
     descriptor = None
     while descriptor is None:
@@ -315,13 +311,9 @@ def sync(path: Path) -> None:
 
 def sync_tree(path: Path) -> None:
     """Wait until a file, or a folder with everything below it, is on the disk."""
-    for parent, _, names in os.walk(path, topdown=False):
-        for file in (Path(parent, name) for name in names):
-            if not file.is_symlink():
-                sync(file)
-        sync(Path(parent))
-    if path.is_file():
-        sync(path)
+    for inner in (*sorted(path.rglob("*"), reverse=True), path):
+        if not inner.is_symlink():
+            sync(inner)
 
 
 def rename_new(source: Path, target: Path) -> bool:

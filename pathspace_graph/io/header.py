@@ -19,7 +19,7 @@ FORMAT: Final = "pathspace-log/1"
 POSITIVE: Final = math.ulp(0.0)
 STATED: Final = "stated"
 UNSTATED: Final = ("measured", "assumed")  # measured, or assumed where the drive shows too little
-MEASURED: Final = "noise.measured"
+MEASURED: Final = "noise.measured"  # section, whose entries have so many numbers of at least so much
 _ODOMETRY: Final = {"odometry": (3, 0.0), "drift": (3, 0.0), "interval": (1, POSITIVE), "seconds": (1, 0.0)}
 _RAYS: Final = {"along": (4, 0.0), "across": (4, 0.0)}
 _DETECTIONS: Final = {
@@ -27,7 +27,6 @@ _DETECTIONS: Final = {
     **{"count": (1, 1.0), "period": (1, POSITIVE), "per_cycle": (1, POSITIVE)},
     **dict.fromkeys(SENSOR, (2, -MAX_NOISE)),
 }
-"""Entries of the section of measured noise: how many numbers each has, and the least that they may be."""
 
 
 class Header:
@@ -37,9 +36,8 @@ class Header:
         self.file = file
         self._content = parse_toml(read_text(file, most=MAX_HEADER_BYTES), file)
         if self._content.get("format") != FORMAT:
-            raise InputError(
-                file, f'expected format = "{FORMAT}", found {shown(self._content.get("format"))}'
-            )
+            found = shown(self._content.get("format"))
+            raise InputError(file, f'expected format = "{FORMAT}", found {found}')
 
     def section(self, path: str) -> dict[str, Any]:
         """Return the section of a dotted name, which is empty where there is none."""
@@ -75,9 +73,8 @@ class Header:
     def _measured(self) -> MeasuredNoise:
         entries = _ODOMETRY | (_DETECTIONS if "along" in self.section(MEASURED) else {})
         values = {name: self.numbers(MEASURED, name, *expected) for name, expected in entries.items()}
-        self._require(
-            values["odometry"] + values["drift"] > 0.0, "a twist with some noise as odometry or drift"
-        )
+        noisy = values["odometry"] + values["drift"] > 0.0
+        self._require(noisy, "a twist with some noise as odometry or drift")
         fields: dict[str, Any] = {name: values.pop(name) for name in ("odometry", "drift")}
         if "along" in values:
             for name in _RAYS:
@@ -85,11 +82,9 @@ class Header:
                 good = near + growth > 0.0 and share <= 1.0 and time > 0.0
                 self._require(good, f"some noise, a share of at most 1 and a positive time as {name}")
                 fields[name] = RayNoise(np.array([near, growth]), float(share), float(time))
-            sensor = np.array([values.pop(name) for name in SENSOR])
-            self._require(
-                sensor[:, 1] > 0.0, "a positive sigma as the second number of each error of the sensor"
-            )
-            fields |= {"sensor": sensor[:, 0], "sensor_sigma": sensor[:, 1]}
+            sensor, sigma = np.array([values.pop(name) for name in SENSOR]).T
+            self._require(sigma > 0.0, "a positive sigma as the second number of each error of the sensor")
+            fields |= {"sensor": sensor, "sensor_sigma": sigma}
             self._require(values["count"] % 1.0 == 0.0, "a whole number as count")
             fields["count"] = int(values.pop("count").item())
         return MeasuredNoise(**fields | {name: value.item() for name, value in values.items()})

@@ -38,7 +38,7 @@ _POINT: Final = {"x": Column(unit="m"), "y": Column(unit="m")}
 _SPEED: Final = Column(limits.MAX_SPEED, "m/s")
 _RANGE: Final = Column(limits.MAX_RANGE, "m")
 _COVARIANCE: Final = Column(limits.MAX_RANGE**2, "m^2")
-COLUMNS: Final[dict[str, dict[str, Column]]] = {
+COLUMNS: Final[dict[str, dict[str, Column]]] = {  # of each table, in the order of the file
     ODOMETRY_FILE: {**_STAMP, "vx": _SPEED, "vy": _SPEED, "wz": Column(limits.MAX_YAW_RATE, "rad/s")},
     DETECTIONS_FILE: {
         **_STAMP,
@@ -49,16 +49,14 @@ COLUMNS: Final[dict[str, dict[str, Column]]] = {
     TRUTH_CONES_FILE: {**_POINT, "label": Column()},
     TRUTH_ASSOCIATIONS_FILE: {"cone": Column()},
 }
-"""Columns of each table, in the order in which they are written; those of the truth are optional files."""
+TRUTH_FILES: Final = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE)  # which are optional
 FILES: Final = (LOG_FILE, *COLUMNS)
 
-CALIBRATION: Final = ("scale", "bias")  # names of the true calibration of the odometry in the log's header
-
-SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")  # true errors of the sensor
+# entries of the truth in the header; the noise is there where it is not white as the log states it
+CALIBRATION: Final = ("scale", "bias")
+SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
-"""Names of the true noise in the log's header, where it is not white as the log states it."""
 _TRUE_ERRORS: Final = {"calibration": CALIBRATION, "sensor": SENSOR, "noise": NOISE}
-"""Fields of the truth that are in the log's header, by the names of their entries."""
 _SENSOR_INFO: Final = ("range_max", "fov", "rate")
 
 MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
@@ -119,12 +117,9 @@ class SensorInfo:
 
     LENGTHS: ClassVar = {"range_max": 1}
 
-    range_max: float | None = None
-    """Greatest range, m."""
-    fov: float | None = None
-    """Field of view, the whole angle, rad."""
-    rate: float | None = None
-    """Perception cycles per second, Hz."""
+    range_max: float | None = None  # greatest range, m
+    fov: float | None = None  # field of view, the whole angle, rad
+    rate: float | None = None  # perception cycles per second, Hz
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -133,18 +128,12 @@ class Truth(Brief):
 
     LENGTHS: ClassVar = {"poses": POSE, "cones": 1, "sensor": (0, 1, 0, 0, 1), "noise": (1, 1, 0, 0, 0, 0)}
 
-    pose_t: Array
-    """Stamps of the true poses (N,) in s."""
-    poses: Array
-    """True poses [x, y, theta] (N, 3) in m, m, rad, map frame."""
-    cones: Array
-    """True cones (M, 2) in m, map frame."""
-    cone_labels: IntArray
-    """Their labels (M,)."""
-    associations: IntArray | None = None
-    """Index of the true cone of each detection in file order (R,), -1 for none."""
-    calibration: Array | None = None
-    """Calibration of the odometry (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
+    pose_t: Array  # stamps of the true poses (N,) in s
+    poses: Array  # true poses [x, y, theta] (N, 3) in m, m, rad, map frame
+    cones: Array  # true cones (M, 2) in m, map frame
+    cone_labels: IntArray  # their labels (M,)
+    associations: IntArray | None = None  # true cone of each detection in file order (R,), -1 for none
+    calibration: Array | None = None  # (2,) scale error of the speeds (-), bias of the yaw rate (rad/s)
     sensor: Array | None = None
     """Constant errors of the sensor (5,): yaw (rad), lateral offset (m), age of detections at their stamps
     (s), scale error (-) and bias (m) of ranges."""
@@ -211,9 +200,7 @@ def read_log(folder: Path | str) -> Log:
 
 def _read_log(folder: Path) -> Log:
     header = Header(folder / LOG_FILE)
-    odometry = _read_odometry(_table(folder, ODOMETRY_FILE))
-    table = _table(folder, DETECTIONS_FILE)
-    cycles = _cycles(table, float(odometry.t[0]), float(odometry.t[-1]))
+    odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
     sensor = [name for name in _SENSOR_INFO if name in header.section("sensor")]
     truth = header.section("truth")
     true_errors = {
@@ -223,7 +210,7 @@ def _read_log(folder: Path) -> Log:
     }
     return Log(
         odometry=odometry,
-        cycles=cycles,
+        cycles=_cycles(table, float(odometry.t[0]), float(odometry.t[-1])),
         odometry_sigma=header.numbers("odometry", "sigma", 3, POSITIVE),
         sensor=SensorInfo(**{name: header.numbers("sensor", name, 1, POSITIVE).item() for name in sensor}),
         source={key: str(value) for key, value in header.section("source").items()},
@@ -233,6 +220,9 @@ def _read_log(folder: Path) -> Log:
 
 
 def _table(folder: Path, name: str) -> Table:
+    """Return a table of a log; one of the truth that is not known has no rows."""
+    if name in TRUTH_FILES and not (folder / name).exists():
+        return Table(folder / name, {column: [] for column in COLUMNS[name]}, [])
     return read_table(folder / name, COLUMNS[name])
 
 
@@ -256,8 +246,8 @@ def _read_odometry(table: Table) -> Odometry:
         raise InputError(table.file, "expected at least one row, found a header only", 2)
     t, speeds = _increasing_times(table), table.stack(("vx", "vy"))
     held = np.abs(speeds[:-1]).max(axis=1) * np.diff(t)
-    held_far = f"expected a twist that moves the vehicle by at most {limits.MAX_HELD:g} m until the next row"
-    table.require(np.append(held <= limits.MAX_HELD, True), held_far)
+    too_far = f"expected a twist that moves the vehicle by at most {limits.MAX_HELD:g} m until the next row"
+    table.require(np.append(held <= limits.MAX_HELD, True), too_far)
     too_long = f"expected a drive of at most {limits.MAX_DRIVE:g} m up to the next row"
     table.require(np.append(np.cumsum(held) <= limits.MAX_DRIVE, True), too_long)
     return Odometry(t, np.column_stack([speeds, table.numbers("wz")]))
@@ -280,7 +270,7 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
     points, entries = table.stack(("x", "y")), table.stack(("xx", "xy", "yy")).T
     wrong = "expected a positive definite covariance (xx > 0, xx yy > xy^2)"
     table.require(is_positive_definite(*entries), wrong)
-    cycles = cycles_of(t, points, covariances_of(*entries), _labels(table))
+    cycles = cycles_of(t, points, covariances_of(*entries), labels_of(table))
     counts = [len(cycle.labels) for cycle in cycles]
     if max(counts) > limits.MAX_DETECTIONS:
         first = sum(counts[: int(np.argmax(counts))])
@@ -315,26 +305,18 @@ def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
     return np.asarray(good)
 
 
-def _labels(table: Table) -> IntArray:
+def labels_of(table: Table) -> IntArray:
     return np.array([label_from_name(name) for name in table.columns["label"]], dtype=int)
 
 
 def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) -> Truth | None:
-    names = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE)
-    known = {name for name in names if (folder / name).exists()}
-    if not errors and not known:
+    known = [(folder / name).exists() for name in TRUTH_FILES]
+    if not errors and not any(known):
         return None
-    none = {name: Table(folder / name, {column: [] for column in COLUMNS[name]}, []) for name in names}
-    poses, cones, associations = (_table(folder, name) if name in known else none[name] for name in names)
-    points, is_known = cones.stack(("x", "y")), TRUTH_ASSOCIATIONS_FILE in known
-    return Truth(
-        _increasing_times(poses),
-        poses.stack(("x", "y", "theta")),
-        points,
-        _labels(cones),
-        _associations(associations, detection_count, len(points)) if is_known else None,
-        **errors,
-    )
+    poses, cones, table = (_table(folder, name) for name in TRUTH_FILES)
+    t, placed, points = _increasing_times(poses), poses.stack(("x", "y", "theta")), cones.stack(("x", "y"))
+    associations = _associations(table, detection_count, len(points)) if known[-1] else None
+    return Truth(t, placed, points, labels_of(cones), associations, **errors)
 
 
 def _associations(table: Table, detection_count: int, cone_count: int) -> IntArray:
@@ -348,8 +330,7 @@ def _associations(table: Table, detection_count: int, cone_count: int) -> IntArr
 
 
 def _sections(log: Log) -> dict[str, dict[str, Any]]:
-    sensor = {name: getattr(log.sensor, name) for name in _SENSOR_INFO}
-    truth = dict[str, Any]()
+    sensor, truth = {name: getattr(log.sensor, name) for name in _SENSOR_INFO}, dict[str, Any]()
     for name, entries in _TRUE_ERRORS.items():
         values = getattr(log.truth, name, None)
         truth |= {} if values is None else dict(zip(entries, values.tolist(), strict=True))

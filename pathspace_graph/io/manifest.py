@@ -13,8 +13,8 @@ from .parsing import parse_json, read_text, shown
 
 FORMAT: Final = "pathspace-manifest/1"
 MANIFEST_FILE: Final = "manifest.json"
-_MARK: Final = "pathspace"
-"""Word that a manifest holds more than once, so that a damaged one is not taken for another program's."""
+_MARK: Final = "pathspace"  # held more than once, so that a damaged manifest isn't taken for another's
+_ACCEPT: Final = f" (removing {MANIFEST_FILE} accepts the files as they are)"
 _DIGEST: Final = "pathspace_digest"  # key of the manifest's own SHA-256, taken without this key
 
 
@@ -23,12 +23,8 @@ def manifest_of(folder: Path) -> str:
 
     Of a subfolder with a manifest of its own, only that is listed.
     """
-    return _text(
-        {
-            file.relative_to(folder).as_posix(): {"size": file.stat().st_size, "sha256": _digest(file)}
-            for file in sorted(_files(folder))
-        }
-    )
+    files = {file.relative_to(folder).as_posix(): file for file in sorted(_files(folder))}
+    return _text({name: {"size": one.stat().st_size, "sha256": _digest(one)} for name, one in files.items()})
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -65,9 +61,6 @@ def read_manifest(folder: Path) -> dict[str, dict[str, Any]] | None:
     if not isinstance(files, dict) or text != _text(files):
         raise InputError(file, "expected the manifest as it was written, found another content" + _ACCEPT)
     return files
-
-
-_ACCEPT: Final = f" (removing {MANIFEST_FILE} accepts the files as they are)"
 
 
 def verify(folder: Path, names: Iterable[str]) -> None:

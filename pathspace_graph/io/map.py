@@ -26,9 +26,7 @@ if TYPE_CHECKING:
 
 FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
-
 NO_COVARIANCE: Final[Array] = np.zeros((0, 0))  # none was asked for; it can't be written
-
 _SYMMETRY_TOLERANCE = 1e-9  # largest |P - P^T| over max|P| of a covariance that is symmetric to rounding
 _NEGATIVE_TOLERANCE = 1e-9  # most negative eigenvalue over the largest one of P >= 0, to rounding
 
@@ -123,7 +121,7 @@ class Map:
 
     @property
     def right(self) -> MapBoundary:
-        """Return the right boundary; a SettingsError where it could not be mapped."""
+        """Return the right boundary, in the same way."""
         return self._boundary(RIGHT)
 
     def _boundary(self, label: int) -> MapBoundary:
@@ -143,9 +141,8 @@ class Map:
     def centre_line(self, step: float = 1.0) -> CentreLine:
         """Return the centre line with widths, heading, curvature and arc length, and their sigmas.
 
-        Its points are `step` (m) apart. Where the joint covariance isn't known, the boundaries are taken as
-        independent. A tentative stretch takes part as well. Both boundaries must be splines; otherwise, or
-        where they aren't side by side, SettingsError is raised.
+        Its points are `step` (m) apart, also along a tentative stretch. Without a joint covariance the
+        boundaries are taken as independent. SettingsError unless both are splines and side by side.
         """
         left, right = self.curves("a centre line")
         covariance = self.covariance_of(left, right)
@@ -186,9 +183,7 @@ def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Arr
 
 def map_to_json(track: Map) -> dict[str, Any]:
     """Return the content of `map.json` in plain Python types, every number to full precision."""
-    boundaries = {
-        NAMES[label]: _boundary_to_json(track.boundaries[label]) for label in sorted(track.boundaries)
-    }
+    boundaries = {NAMES[label]: _boundary_to_json(own) for label, own in sorted(track.boundaries.items())}
     content = {"format": FORMAT, "closed": bool(track.closed), "boundaries": boundaries}
     if track.joint_covariance is not None and len(track.boundaries) == len(BOUNDARIES):
         left = 2 * track.boundaries[LEFT].size
@@ -308,8 +303,7 @@ class _Object:
     def integer(self, name: str, least: int, most: int = MAX_INTEGER) -> int:
         value = self._get(name)
         if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-            expected = f"expected a whole number from {least} to {most}"
-            raise self.error(name, f"{expected}, found {shown(value)}")
+            raise self.error(name, f"expected a whole number from {least} to {most}, found {shown(value)}")
         return value
 
     def number(self, name: str) -> float:

@@ -54,10 +54,8 @@ def read_settings(file: Path, settings: T) -> T:
 
 def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
     name, *rest = path
-    if rest:
-        new = _set(getattr(settings, name), rest, value, where)
-    else:
-        new = as_type(value, get_type_hints(type(settings))[name], where)
+    hint = get_type_hints(type(settings))[name]
+    new = _set(getattr(settings, name), rest, value, where) if rest else as_type(value, hint, where)
     try:
         return replace(settings, **{name: new})
     except SettingsError as error:

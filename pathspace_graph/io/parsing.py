@@ -1,7 +1,6 @@
 """TOML, JSON, YAML and CSV as plain data, never as code, within limits beyond which a file is refused.
 
-The limits are generous: they guard against damage and mistakes. What a certain vehicle can do is a setting of
-its estimator.
+The limits guard against damage and mistakes; what a vehicle can do is a setting of its estimator.
 """
 
 import csv
@@ -49,7 +48,6 @@ MAX_TRACK_WIDTH: Final = 100.0  # m, from the middle of a track to a boundary
 MAX_CONES: Final = 6_000  # of each boundary of a track
 SHOWN_CHARACTERS: Final = 120  # of what was found, in a message
 
-
 TOO_DEEP: Final = f"expected lists and tables nested at most {MAX_DEPTH} deep, found deeper ones"
 _SHORT: Final = Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 80, 60, 40
@@ -84,11 +82,10 @@ def _children(value: Any) -> Any:
 
 # --- files and their formats -----------------------------------------------------------------------------
 
-
 _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _MERGE: Final = "tag:yaml.org,2002:merge"
+# of the parsers; that of YAML raises most of them for values that do not fit their tags, as `2020-99-99`
 _ERRORS: Final = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError)
-"""Errors of the parsers, that of YAML for values that do not fit their tags, such as `2020-99-99`."""
 
 
 def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> str:
@@ -141,7 +138,7 @@ def _parsed(kind: str, load: Callable[[str], Any], text: str, file: Path) -> Any
 
 
 def parse_json(text: str, file: Path) -> Any:
-    """Return the content of JSON; an InputError names the file and the row."""
+    """Return the content of JSON; an InputError names the file and, where it is known, the row."""
     return _parsed("JSON", json.loads, text, file)
 
 
@@ -151,7 +148,6 @@ def read_json(file: Path, expected: str) -> Any:
 
 
 def parse_toml(text: str, file: Path) -> dict[str, Any]:
-    """Return the content of TOML; an InputError names the file and, where it is known, the row."""
     content: dict[str, Any] = _parsed("TOML", tomllib.loads, text, file)
     return content
 
@@ -167,7 +163,6 @@ class _Loader(_YAML_LOADER):  # type: ignore[misc]
 
 
 def parse_yaml(text: str, file: Path) -> Any:
-    """Return the content of YAML; an InputError names the file and, where it is known, the row."""
     with _parsing(file, "YAML"):
         depth = 0
         for event in yaml.parse(text, Loader=_YAML_LOADER):  # deep ones overflow the stack of its composer
@@ -202,7 +197,6 @@ class Table:
         return len(self.lines)
 
     def fail(self, index: int, message: str) -> NoReturn:
-        """Raise the InputError of the row with this index."""
         raise InputError(self.file, message, self.lines[index])
 
     def require(self, good: BoolArray, message: str) -> None:
@@ -257,13 +251,11 @@ def read_table(
     if not rows:
         raise InputError(file, f"expected a header {','.join(required)}, found an empty file", 1)
     header = [name.strip() for name in rows[0]]
-    if header:
-        header[0] = header[0].removeprefix(comment).strip()
+    header[0] = header[0].removeprefix(comment).strip()
     for name in required:
         if header.count(name) != 1:
-            found = "none" if name not in header else "more than one"
-            expected = f"expected a column '{name}'"
-            raise InputError(file, f"{expected}, found {found} in {shown(','.join(header))}", lines[0])
+            found = f"{'more than one' if name in header else 'none'} in {shown(','.join(header))}"
+            raise InputError(file, f"expected a column '{name}', found {found}", lines[0])
     body, width = rows[1:], len(header)
     for row, line in zip(body, lines[1:], strict=True):
         while len(row) > width and not row[-1].strip():

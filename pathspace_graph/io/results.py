@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 TRAJECTORY_FILE: Final = "trajectory.tum"
 SMOOTHED_FILE: Final = "smoothed.tum"
 _COLUMNS: Final = 8
+NoiseSource = Literal["stated", "measured", "assumed"]  # by the log, by the drive, by default
 
 
 def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
@@ -69,15 +70,12 @@ def _values(file: Path, line: str, number: int) -> list[float]:
     return values
 
 
-NoiseSource = Literal["stated", "measured", "assumed"]  # by the log, by the drive, by default
-
 CYCLES_FILE: Final = "cycles.csv"
-CYCLE_COLUMNS: Final = {
+CYCLE_COLUMNS: Final = {  # columns of `cycles.csv` with their types; any further one is text
     **{"cycle": "int64", "t": "float64", "seconds": "float64"},
     **dict.fromkeys(("size_left", "size_right", "readings", "lap", "offered"), "int64"),
     **{"health": "str", "reason": "str", "dropped": "int64"},
 }
-"""Columns of `cycles.csv` with their types; any further one is text."""
 
 
 @dataclass(frozen=True)
@@ -86,39 +84,23 @@ class CycleRecord:
 
     LENGTHS: ClassVar = {"jump": POSE, "notice": 1, "reason": 1}
 
-    cycle: int
-    """Number of the perception cycle, from 0."""
-    t: float
-    """Stamp of the cycle, s."""
-    seconds: float
-    """Wall time of the whole update, s."""
-    size_left: int
+    cycle: int  # number of the perception cycle, from 0
+    t: float  # stamp of the cycle, s
+    seconds: float  # wall time of the whole update, s
+    size_left: int  # number of control points or landmarks
     size_right: int
-    """Number of control points or landmarks of the right boundary, as of the left one."""
-    readings: int
-    """Number of the cycle's detections that were used."""
-    lap: int
-    """Lap of the estimated trajectory, from 1."""
-    stages: Mapping[str, float] = field(default_factory=dict)
-    """Time of each stage of the update, s, by its name."""
-    closed: bool = False
-    """Whether the loop has closed by the end of the cycle."""
-    jump: tuple[float, float, float] | None = None
-    """Jump of the newest pose [m, m, rad], map frame, where the map was replaced in this cycle."""
-    notice: str = ""
-    """What a user should know of the cycle, if anything."""
-    offered: int = 0
-    """Number of the cycle's detections."""
-    health: str = ""
-    """Good, degraded or lost; empty where the estimator does not say it."""
-    reason: str = ""
-    """Why the estimate is not good."""
-    dropped: int = 0
-    """Number of the cycle's detections that were dropped as impossible."""
-    late: bool = False
-    """Whether the cycle came after a newer one, and was used at its own time."""
-    refused: int = 0
-    """Number of cycles that were refused just before this one."""
+    readings: int  # number of the cycle's detections that were used
+    lap: int  # lap of the estimated trajectory, from 1
+    stages: Mapping[str, float] = field(default_factory=dict)  # time of each stage of the update, s
+    closed: bool = False  # whether the loop has closed by the end of the cycle
+    jump: tuple[float, float, float] | None = None  # of the newest pose [m, m, rad], if the map was replaced
+    notice: str = ""  # what a user should know of the cycle, if anything
+    offered: int = 0  # number of the cycle's detections
+    health: str = ""  # good, degraded or lost; empty where the estimator does not say it
+    reason: str = ""  # why the estimate is not good
+    dropped: int = 0  # number of the cycle's detections that were dropped as impossible
+    late: bool = False  # whether the cycle came after a newer one, and was used at its own time
+    refused: int = 0  # number of cycles that were refused just before this one
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -128,25 +110,20 @@ class VehicleState(Brief):
     LENGTHS: ClassVar = {"pose": POSE, "sensor": (0, 1, 0, 0, 1)}
     COVARIANCES: ClassVar = {"covariance": (*POSE, 0, 0), "sensor_covariance": (0, 1, 0, 0, 1)}
 
-    pose: Array
-    """Pose [x, y, theta] (3,) in m and rad, map frame; theta isn't wrapped."""
-    calibration: Array
-    """Calibration (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
-    covariance: Array
-    """Joint covariance (5, 5) of [pose | calibration]."""
+    pose: Array  # pose [x, y, theta] (3,) in m and rad, map frame; theta isn't wrapped
+    calibration: Array  # calibration (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)
+    covariance: Array  # joint covariance (5, 5) of [pose | calibration]
     sensor: Array = field(default_factory=lambda: np.zeros(0))
     """Calibration of the sensor (5,), `factors.sensor:SENSOR`, or (0,) where there is none."""
-    sensor_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """Its covariance (5, 5), or (0, 0)."""
+    sensor_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (5, 5), or (0, 0)
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
         """Return each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
-        values = [*self.calibration.tolist(), *self.sensor.tolist()]
+        values = np.append(self.calibration, self.sensor).tolist()
         of_sensor = np.sqrt(np.diag(self.sensor_covariance))
-        sigmas = [*self.sigmas[len(self.pose) :].tolist(), *of_sensor.tolist()]
-        known = zip([*CALIBRATION, *SENSOR], values, sigmas, strict=False)
-        return {name: (value, sigma) for name, value, sigma in known}
+        sigmas = np.append(self.sigmas[len(self.pose) :], of_sensor).tolist()
+        return dict(zip((*CALIBRATION, *SENSOR), zip(values, sigmas, strict=True), strict=False))
 
     @classmethod
     def split(cls, pose: Array, calibrations: Array, joint: Array) -> VehicleState:
@@ -165,10 +142,8 @@ class VehicleState(Brief):
 class LapBatches:
     """Ends of the batches that another process solves while an online estimator goes on."""
 
-    ends: tuple[int, ...]
-    """Cycles in which the result of a batch was taken, or the batch was given up."""
-    late: int
-    """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
+    ends: tuple[int, ...]  # cycles in which the result of a batch was taken, or the batch was given up
+    late: int  # cycles by which the slowest batch is late in a vehicle, by its wall time
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,10 +154,8 @@ class RunNoise:
 
     odometry: NoiseSource
     detections: NoiseSource
-    measured: MeasuredNoise | None = None
-    """What was measured in the drive, where anything was."""
-    size: Literal["odometry", "ranges"] | None = None
-    """Ranges and speeds disagree, and the size of the map is that of these; None where they agree."""
+    measured: MeasuredNoise | None = None  # what was measured in the drive, where anything was
+    size: Literal["odometry", "ranges"] | None = None  # whose size the map has, where the two disagree
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -62,8 +62,8 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
 
 REFERENCE: Final = 10.0  # range at which the noise of detections is told (m)
 CLEAR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is told
+# size beyond which it is told (rad, m, s, -, m)
 WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
-"""Size beyond which it is told (rad, m, s, -, m)."""
 TOLD: Final = {
     "latency": ("stamps {:.0f} ms {}", 1e3, ("late", "early")),
     "yaw": ("turned {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
@@ -79,19 +79,16 @@ def noise_lines(noise: RunNoise | None) -> list[str]:
     lines = [measured_line(noise.measured)]
     if noise.size is not None:
         share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
-        of_odometry = "the odometry's", "ranges"
-        whose, other = of_odometry if noise.size == "odometry" else ("the ranges'", "odometry")
+        whose, other = {"odometry": ("odometry's", "ranges"), "ranges": ("ranges'", "odometry")}[noise.size]
         advice = f"--calibration.trust {other} turns it round"
-        lines.append(f"ranges and speeds disagree by {share:.0f} %: the map's size is {whose} ({advice})")
+        lines.append(f"ranges and speeds disagree by {share:.0f} %: the map's size is the {whose} ({advice})")
     return lines
 
 
 def measured_line(measured: MeasuredNoise) -> str:
     """Return a line on the noise, and the constant errors of the sensor that are clearly there."""
-    forward, sideways, turning = measured.odometry.tolist()
-    line = (
-        f"measured: odometry {forward:.2g} m/s, {sideways:.2g} m/s, {turning:.2g} rad/s from sample to sample"
-    )
+    forward, sideways, turning = (f"{sigma:.2g}" for sigma in measured.odometry)
+    line = f"measured: odometry {forward} m/s, {sideways} m/s, {turning} rad/s from sample to sample"
     if measured.along is None or measured.across is None:
         return line
     rays = measured.along, measured.across

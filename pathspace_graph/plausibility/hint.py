@@ -13,13 +13,10 @@ class Hint:
 
     LENGTHS: ClassVar = {"found": 1, "likely": 1, "advice": 1}
 
-    cause: str
-    """Kind of the mistake, which begins its row in `TABLE`."""
+    cause: str  # kind of the mistake, which begins its row in `TABLE`
     file: str
-    columns: str
-    """Columns of the file, in words."""
-    found: str
-    """What was found, with its figure."""
+    columns: str  # columns of the file, in words
+    found: str  # what was found, with its figure
     likely: str
     advice: str
 
@@ -43,6 +40,7 @@ _TURNED = "static cones move as they would for a sensor that is turned by {angle
 _BY_READINGS = "--noise measured takes what is measured"
 _CLASSES = "the classes of the detector were not turned into left and right"
 
+# cause, file, columns, figure, likely cause and advice of each mistake, with places for its numbers
 TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
     "unit of stamps": ("stamps", "{file}", _T, "rows follow each other after {step:.4g} s as a rule",
         "the stamps are in {unit}, not in seconds", "multiply column t by {factor:g}"),
@@ -119,7 +117,6 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
         "detections scatter by {scatter:.2g} m {way} the ray at {at:.0f} m, where {stated:.2g} m is stated",
         "the covariances are too {size}", _BY_READINGS),
 }  # fmt: skip
-"""Cause, file, columns, figure, likely cause and advice of each mistake, with places for its numbers."""
 
 
 def told(mistake: str, **figures: object) -> Hint:

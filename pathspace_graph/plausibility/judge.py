@@ -11,9 +11,10 @@ import numpy as np
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.gate import read_usable_log
-from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry, covariances_of, cycles_of
+from pathspace_graph.io import log as logs
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.parsing import read_table, shown
-from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN, label_from_name
+from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
 from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
@@ -129,9 +130,8 @@ def one_clock(log: Log) -> list[Hint]:
         return []
     first, last = float(log.odometry.t[0]), float(log.odometry.t[-1])
     begin, end = log.cycles[0].t, log.cycles[-1].t
-    if begin <= last and end >= first:
-        return []
-    return [told("two clocks", begin=begin, end=end, first=first, last=last)]
+    apart = begin > last or end < first
+    return [told("two clocks", begin=begin, end=end, first=first, last=last)] if apart else []
 
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
@@ -244,17 +244,11 @@ def _of_odometry(meaning: Hypothesis, figures: dict[str, float]) -> list[Hint]:
     """Return hints about what the odometry means, where it is not a twist of the vehicle in SI units."""
     if (meaning.speed, meaning.rate) == (1e-3, 1e-3):
         return [told("milliseconds", **figures)]
-    if meaning.content == "nothing":
-        return [told("nothing", **figures)]
     found = [] if meaning.content == "twist" else [told(meaning.content, **figures)]
-    if meaning.speed != 1.0:
-        found.append(
-            told("unit of speeds", what=hypotheses.SPEEDS[meaning.speed], factor=meaning.speed, **figures)
-        )
-    if meaning.rate != 1.0:
-        found.append(
-            told("unit of yaw rate", what=hypotheses.RATES[meaning.rate], factor=meaning.rate, **figures)
-        )
+    units = ("speeds", meaning.speed, hypotheses.SPEEDS), ("yaw rate", meaning.rate, hypotheses.RATES)
+    for column, unit, meant in units:
+        if unit != 1.0:
+            found.append(told(f"unit of {column}", what=meant[unit], factor=unit, **figures))
     return found
 
 
@@ -314,17 +308,15 @@ def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
     near = np.hypot(motion[:, 0], motion[:, 1]) < NEAR * np.nanmedian(size)
     near &= (np.abs(motion[:, 2]) < NEAR) & (pairs.count >= MANY)
     share = float(best.explained[near].mean()) if near.sum() >= LEAST_NEAR else 1.0
-    if share > UNEXPLAINED:
-        return []
-    return camera(pairs) or [told("unexplained", share=share)]
+    return [] if share > UNEXPLAINED else camera(pairs) or [told("unexplained", share=share)]
 
 
 def camera(pairs: Pairs) -> list[Hint]:
     """Return a hint where the detections lie on a line, as in the frame of a camera."""
     spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
-    if spread.min() >= LINE_RATIO * spread.max():
-        return []
-    return [told("camera", thin="xy"[int(spread.argmin())], least=spread.min(), most=spread.max())]
+    least, most = spread.min(), spread.max()
+    in_line = least < LINE_RATIO * most
+    return [told("camera", thin="xy"[int(spread.argmin())], least=least, most=most)] if in_line else []
 
 
 NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
@@ -347,23 +339,21 @@ def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[H
 def refused_hints(folder: Path) -> list[Hint]:
     """Return the hints about a log that was refused; there are none where it cannot even be parsed."""
     try:
-        odometry = read_table(folder / ODOMETRY_FILE, ("t", "vx", "vy", "wz"))
-        table = read_table(folder / DETECTIONS_FILE, ("t", "x", "y", "label", "xx", "xy", "yy"))
+        files = ODOMETRY_FILE, DETECTIONS_FILE
+        odometry, table = (read_table(folder / file, logs.COLUMNS[file]) for file in files)
         twists = Odometry(odometry.numbers("t", MOST), odometry.stack(("vx", "vy", "wz"), MOST))
         stamps, points = table.numbers("t", MOST), table.stack(("x", "y"), MOST)
-        covariances = covariances_of(*(table.numbers(name, MOST) for name in ("xx", "xy", "yy")))
+        covariances = logs.covariances_of(*table.stack(("xx", "xy", "yy"), MOST).T)
     except InputError:
         return []
-    labels = np.array([label_from_name(name) for name in table.columns["label"]], dtype=int)
-    cycles = cycles_of(stamps, points, covariances, labels)
+    cycles = logs.cycles_of(stamps, points, covariances, logs.labels_of(table))
     return hints(Log(twists, cycles, np.ones(3), odometry_stated=False, detections_stated=False))
 
 
 def _foreign_labels(folder: Path, log: Log) -> list[Hint]:
     if not log.cycles or any((cycle.labels != UNKNOWN).any() for cycle in log.cycles):
         return []
-    words = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])
-    foreign = [word for word, _ in words.most_common() if word.strip().lower() not in NO_LABEL]
-    if not foreign:
-        return []
-    return [told("foreign labels", words=", ".join(shown(word) for word in foreign[:SHOWN_WORDS]))]
+    met = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])
+    foreign = [word for word, _ in met.most_common() if word.strip().lower() not in NO_LABEL]
+    words = ", ".join(map(shown, foreign[:SHOWN_WORDS]))
+    return [told("foreign labels", words=words)] if foreign else []
