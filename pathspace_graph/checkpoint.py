@@ -35,10 +35,7 @@ class Recovery:
             self._copy, self._calls = self._held(vars(estimator), estimator, shared), []
 
     def called(self, again: partial[Any], *, is_doubtful: bool = False) -> None:
-        """Note a call that has changed the estimator: it is made again after a copy has taken its place.
-
-        No copy is made after a doubtful call until the next sure one, so that `undo` can change all of them.
-        """
+        """Note a call that has changed the estimator; while a newer one is doubtful, `undo` can change it."""
         if not is_doubtful:
             self._doubtful = None
         elif self._doubtful is None:

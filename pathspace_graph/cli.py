@@ -13,12 +13,7 @@ from typing import Any, Final
 from .errors import PathspaceError, SettingsError, SolveError, check_name
 
 PROGRAM: Final = "pathspace-graph"
-DONE: Final = 0
-BAD_INPUT: Final = 2
-NOT_SOLVED: Final = 3
-INTERRUPTED: Final = 130
-BROKEN_PIPE: Final = 141
-TERMINATED: Final = 143
+DONE, BAD_INPUT, NOT_SOLVED, INTERRUPTED, BROKEN_PIPE, TERMINATED = 0, 2, 3, 130, 141, 143  # exit codes
 # options of every command, each with its level of `console.Verbosity`
 LEVELS: Final = {"-q": "QUIET", "--quiet": "QUIET", "-v": "VERBOSE", "--verbose": "VERBOSE"}
 COMMANDS: Final = {  # module of `commands`, dataclass of the options in it, and line of the overview
@@ -40,10 +35,7 @@ COMMANDS: Final = {  # module of `commands`, dataclass of the options in it, and
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return 0 on success.
-
-    Bad usage and bad input give one line on standard error and 2; an estimate that cannot be computed, 3.
-    """
+    """Run a command; return 0, or say what is wrong and return 2 for bad input, 3 for a failed estimate."""
     if threading.current_thread() is threading.main_thread():
         # temporary files are removed on the way
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))

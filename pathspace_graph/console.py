@@ -59,9 +59,9 @@ def say(*lines: str, console: Console | None = None) -> None:
 
 @contextmanager
 def progress(description: str, total: int | None = None, lines: int = 0) -> "Iterator[Steps]":
-    """Show a bar on a terminal, or a spinner where the total isn't known, and yield what counts the steps.
+    """Show a bar on a terminal, or a spinner without a total, and yield what counts the steps.
 
-    Without a terminal nothing is shown, unless `lines` asks for about that many lines over the whole work.
+    Without a terminal nothing is shown, unless `lines` asks for about that many lines.
     """
     level, console = VERBOSITY.get(), Console(stderr=True, highlight=False)
     lines = {Verbosity.QUIET: 0, Verbosity.VERBOSE: LINES}.get(level, lines)

@@ -24,10 +24,7 @@ class InputError(PathspaceError):
 
 
 class ReadingError(PathspaceError):
-    """A perception cycle that no estimator can use, and that changes nothing.
-
-    The text names the field, the row (0 is the first one), what was expected and what was found.
-    """
+    """A perception cycle that cannot be used and changes nothing; the text names field and row, from 0."""
 
     def __init__(
         self, field: str, expected: str, found: object, row: int | None = None, t: float | None = None

@@ -1,7 +1,7 @@
 """The estimators by their names on the command line: our own, and those of other installed packages.
 
-An installed package adds an estimator by an entry point in the group `pathspace_graph.online` or
-`pathspace_graph.batch`. The entry point has the estimator's name, and refers to what makes it.
+A package adds one by an entry point of its name, in the group `pathspace_graph.online` or
+`pathspace_graph.batch`, that refers to what makes it.
 """
 
 from collections.abc import Callable, Mapping

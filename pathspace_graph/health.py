@@ -85,10 +85,7 @@ class HealthMonitor:
         return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
 
     def _wrong_side(self) -> str:
-        """Return which boundary is wrong, where the other one explains its detections.
-
-        It stays so while too little of the other one is mapped to say anything.
-        """
+        """Return which boundary is wrong, where the other one explains its detections or did so last."""
         holds = [self._holds(label) for label in BOUNDARIES]
         if True in holds:
             self._wrong = 1 - holds.index(True)

@@ -2,12 +2,7 @@
 
 from typing import Final
 
-LEFT: Final = 0
-RIGHT: Final = 1
-UNKNOWN: Final = 2
-ORANGE: Final = 3
-BIG_ORANGE: Final = 4
-
+LEFT, RIGHT, UNKNOWN, ORANGE, BIG_ORANGE = range(5)
 NAMES: Final = ("left", "right", "unknown", "orange", "big_orange")  # of the file format, by label
 LABELS: Final = {name: label for label, name in enumerate(NAMES)}
 BOUNDARIES: Final = (LEFT, RIGHT)

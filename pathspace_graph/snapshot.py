@@ -69,18 +69,12 @@ _FLOATS: Final = ("nan", "inf", "-inf")
 
 
 def save(estimator: object, path: Path | str) -> None:
-    """Write all of an estimator to one file, and change nothing of it.
-
-    An earlier file is kept as a numbered backup. SettingsError where it holds something that cannot be saved.
-    """
+    """Write an estimator to one file; SettingsError where it holds something that cannot be saved."""
     write(path, *Encoder(known_classes()).encode(estimator))
 
 
 def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
-    """Return the estimator of a type that a file holds; an InputError of one line says why it cannot.
-
-    `check` is called with a second copy, and must raise nothing.
-    """
+    """Return the estimator of a file; InputError where there is none, or `check` of a copy raises."""
     file = Path(path)
     structure, numbers = read(file)
     try:

@@ -102,8 +102,9 @@ def write_true_path(folder: Path, out: Path) -> None:
 
 def check_length(track: Map, step: float, file: Path) -> None:
     """Raise an InputError where a curve has too many points at this step (m)."""
-    curves = [own.spline for own in track.boundaries.values() if isinstance(own, SplineBoundary)]
-    longest, most = max((curve.length() for curve in curves), default=0.0), MOST_POINTS * step
-    if longest > most:
-        found = f"found {longest:.6g} m"
-        raise InputError(file, f"expected curves of at most {most:g} m at this step, {found}")
+    most = MOST_POINTS * step
+    for boundary in track.boundaries.values():
+        length = boundary.spline.length() if isinstance(boundary, SplineBoundary) else 0.0
+        if length > most:
+            expected = f"expected curves of at most {most:g} m at this step"
+            raise InputError(file, f"{expected}, found {length:.6g} m")

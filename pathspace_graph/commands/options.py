@@ -50,10 +50,7 @@ _SIMILAR: Final = re.compile(r"(?:Perhaps you meant|Arguments similar to).*\n\W*
 
 
 def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
-    """Return the command, made from its options, or None where its help was asked for and printed.
-
-    A command whose defaults depend on its options gives them in `start`. Bad usage is a SettingsError.
-    """
+    """Return the command, made from its options, or None after its help; SettingsError for bad usage."""
     if not set(HELP).isdisjoint(arguments) and HELP_ALL not in arguments:
         sys.stdout.write(short_help(command, program))
         return None
@@ -122,11 +119,10 @@ complete -o default -F _pathspace_graph {program}"""
 
 def completion(program: str, commands: Mapping[str, type[Any]], common: Iterable[str]) -> str:
     """Return a script for bash and zsh that completes the commands, their options and names of files."""
-    shared = ("--help", HELP_ALL, *common)
     cases = []
     for name, command in commands.items():
         options = [option.flag for option in _options(command) if not option.is_place]
-        words = " ".join((*options, *[SETTINGS] * _estimates(command), *shared))
+        words = " ".join((*options, *[SETTINGS] * _estimates(command), "--help", HELP_ALL, *common))
         cases.append(f'    *:{name}) words="{words}" ;;')
     return _COMPLETION.format(commands=" ".join(commands), cases="\n".join(cases), program=program)
 
@@ -186,10 +182,7 @@ def _options(
 
 
 def short_help(command: type[Any], program: str) -> str:
-    """Return a command's own options and the essential settings of the estimators, with their defaults.
-
-    Groups of other options have a line each.
-    """
+    """Return a command's options and essential settings with defaults, and a line for each other group."""
     options = {option.name: option for option in _options(command)}
     settings = leaves(MapperSettings()) if _estimates(command) else {}
     others = [option for name, option in options.items() if name not in settings]
@@ -201,10 +194,9 @@ def short_help(command: type[Any], program: str) -> str:
     places = [f"{name} " for name, _ in entries if not name.startswith("--")]
     lines = [f"usage: {program} {''.join(places)}[OPTIONS]", "", _first_sentence(_description(command)), ""]
     for name, text in entries:
-        first, *rest = wrap(text, width) or [""]
+        texts = [f"{'':<{COLUMN}}{line}" for line in wrap(text, width) or [""]]
         beside = len(name) <= COLUMN - 2
-        lines += [f"{name:<{COLUMN}}{first}" if beside else name]
-        lines += [f"{'':<{COLUMN}}{line}" for line in (rest if beside else [first, *rest])]
+        lines += [name + texts[0][len(name) :], *texts[1:]] if beside else [name, *texts]
     groups = Counter(option.group for option in others if option.group[0])
     lines += [""] * bool(groups)
     lines += [f"--{name}.* ({count}): {text}" for (name, text), count in groups.items()]

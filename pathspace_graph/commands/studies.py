@@ -49,10 +49,7 @@ class StudyCommand:
     """Number of laps in place of the study's own."""
 
     def execute(self, study: Study, write: Callable[[Study, pd.DataFrame, Path], str]) -> None:
-        """Check, run, write and report a study; the exit code is 3 where cells failed.
-
-        `write` writes the results to the folder, and returns the text that is printed.
-        """
+        """Check and run a study, `write` it and print the text of it; exit with 3 where cells failed."""
         check_jobs(self.jobs)
         study = with_drives(study, self.tracks, self.seeds, self.laps)
         plan = make_plan(study)
@@ -71,10 +68,7 @@ class StudyCommand:
 
 
 def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], laps: int | None) -> Study:
-    """Return the study with other tracks, seeds and laps, where any are given.
-
-    A track is a file, or the seed of a generated track.
-    """
+    """Return the study with tracks (files, or seeds of generated ones), seeds and laps that are given."""
     if laps is not None and laps < 1:
         raise SettingsError(f"--laps: expected at least 1, found {laps}")
     chosen = tuple(int(track) if track.isdecimal() else Path(track) for track in tracks)

@@ -72,10 +72,7 @@ class Motion(NamedTuple):
 
 
 def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool = False) -> Recording:
-    """Return what the topics of a bag have of a drive; an InputError lists the topics that are there.
-
-    Where the sensor's pose was stated (`mounted`), frames of other names are no surprise.
-    """
+    """Return what the topics of a bag have of a drive; `mounted` says that the sensor's pose was stated."""
     notes: Counter[str] = Counter()
 
     def motion(message: Any) -> Motion:
@@ -93,8 +90,7 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
     t, twists = _twists(odometry, imu, options, notes, path)
     mounting = None if mounted else _mounting(odometry, detections, static, notes, path)
     source = {"bag": path.name, "odometry": odometry.name, "detections": detections.name}
-    if imu is not None:
-        source["imu"] = imu.name
+    source |= {} if imu is None else {"imu": imu.name}
     scans = [scan for _, scan in detections.values]
     return Recording(t, twists, detections.t, scans, source, notes, mounting=mounting)
 
@@ -183,19 +179,18 @@ def _twists(
 def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[Array, Array]:
     """Return the twists in the time of an IMU with its mean yaw rate until the next of them."""
     order, turn = np.argsort(t, kind="stable"), np.argsort(imu_t, kind="stable")
-    t, twists, imu_t, rates = t[order], twists[order].copy(), imu_t[turn], rates[turn]
-    finite = np.isfinite(rates)
-    imu_t, rates = imu_t[finite], rates[finite]
+    turn = turn[np.isfinite(rates[turn])]
+    t, twists, imu_t, rates = t[order], twists[order], imu_t[turn], rates[turn]
     inside = (t >= imu_t[0]) & (t <= imu_t[-1]) if len(imu_t) else np.zeros(len(t), bool)
     t, twists = t[inside], twists[inside]
     if len(t) < 2:
         return t, twists
     heading = np.append(0.0, np.cumsum(rates[:-1] * np.diff(imu_t)))
-    steps = np.diff(t)
-    turned = np.diff(np.interp(t, imu_t, heading))
+    steps, turned = np.diff(t), np.diff(np.interp(t, imu_t, heading))
     last = rates[np.searchsorted(imu_t, t[-1], side="right") - 1]
-    now = np.interp(t[:-1], imu_t, rates)
-    twists[:, 2] = np.append(np.where(steps > 0, turned / np.where(steps > 0, steps, 1.0), now), last)
+    mean = np.interp(t[:-1], imu_t, rates)  # where no time passes
+    np.divide(turned, steps, out=mean, where=steps > 0)
+    twists[:, 2] = np.append(mean, last)
     return t, twists
 
 
@@ -260,7 +255,7 @@ class Bag:
         connections = self._connections(STATIC)
         if not connections:
             return []
-        _, _, messages = self._read(connections, lambda message: list(message.transforms), "transforms")
+        _, _, messages = self._read(connections, lambda message: message.transforms, "transforms")
         return [one for message in messages for one in message]
 
     def _connections(self, topic: str | None) -> list[Any]:
@@ -347,8 +342,8 @@ def _given_definitions(definitions: Sequence[str]) -> dict[str, Any]:
         try:
             types |= typesys.get_types_from_msg(file.read_text(encoding="utf-8"), name)
         except OSError as error:
-            expected = "expected a message definition"
-            raise InputError(file, f"{expected}, can't be read ({error.strerror})") from None
+            found = f"can't be read ({error.strerror})"
+            raise InputError(file, f"expected a message definition, {found}") from None
         except Exception as error:
             raise InputError(file, f"expected the definition of {name} ({error})") from None
     return types

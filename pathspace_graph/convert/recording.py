@@ -1,7 +1,4 @@
-"""A record as it was found, in any order and with gaps, as a log, and messages as they arrive as cycles.
-
-What was left out is counted.
-"""
+"""A record in any order as a log, and arriving messages as cycles; what was left out is counted."""
 
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
@@ -57,10 +54,7 @@ def twists_between(t: Array, poses: Array) -> Array:
 
 
 def windowed(record: Recording, window: Window) -> Recording:
-    """Return the part of a record that counts, with the stamps of its detections corrected.
-
-    The truth then has no associations, and there is none of a later beginning, where the map begins.
-    """
+    """Return the part of a record that counts; a later beginning, where the map begins, has no truth."""
     if window == Window():
         return record
     scans, most, notes = record.scans, window.range_max, record.notes
@@ -85,10 +79,7 @@ def windowed(record: Recording, window: Window) -> Recording:
 
 
 def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) -> Log:
-    """Return the log of a record in order of time and in the vehicle frame, and note what is left out.
-
-    A record without a usable twist, or without a detection in its time, is an InputError of the `file`.
-    """
+    """Return a record in order of time, in the vehicle frame; InputError of `file` if nothing is usable."""
     frames = replace(frames, mounting=frames.mounting or record.mounting)
     odometry = _odometry(record, frames, file)
     stated = record.odometry_sigma if noise.sigma_odometry is None else noise.sigma_odometry
@@ -208,10 +199,7 @@ def positive_definite(covariances: Array) -> BoolArray:
 
 
 def default_covariances(points: Array, noise: NoiseSettings) -> Array:
-    """Return the covariances (m, 2, 2) of points by the standard deviations of range and bearing.
-
-    Along the ray it is `(sigma_range + sigma_range_growth r)^2`, across it `(r sigma_bearing)^2`.
-    """
+    """Return covariances (m, 2, 2): `(s_range + s_growth r)^2` along the ray, `(r s_bearing)^2` across it."""
     ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
     begin, growth, bearing = noise.sigmas
     along = (begin + growth * ranges) ** 2
@@ -225,11 +213,7 @@ BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexErr
 
 
 class MessageStream:
-    """Buffers twists, and gives each message with detections the twists up to it.
-
-    No message raises an error: one that cannot be used is counted in `refused`, and left out. A message
-    without a stamp has the time at which it was received.
-    """
+    """Buffer of twists, which gives each message with detections those up to it; refused ones are counted."""
 
     def __init__(self, frames: Frames | None = None) -> None:
         self.frames, self.noise, self.rule = frames or Frames(), NoiseSettings(), LabelRule()

@@ -122,11 +122,10 @@ class Window:
 
 
 class LabelRule:
-    """The labels of numbers, words and colours, and a count of the values that were met.
+    """Labels of numbers, words and colours, and a count of the values that were met.
 
-    `left=0 right=1 right=7` gives labels to values. Any other word is read by its parts: `blue_cone`,
-    `yellow-cone`, `b`, `large_orange_cone`. A text may stand in the field `data` of a message. The value
-    of a message is in its `field`, or the first of LABEL_FIELDS that it has.
+    Pairs as `left=0` give labels to values; other words are read by their parts, as in `blue_cone` or `b`.
+    The value of a message is in its `field`, or in the first of LABEL_FIELDS that it has.
     """
 
     def __init__(self, pairs: Sequence[str] = (), field: str | None = None) -> None:

@@ -1,8 +1,7 @@
 """Victoria Park, a public data set: a truck drives 4 km among trees, which a laser scanner detects.
 
-GTSAM brings the file. It has no stamps: its poses are taken as evenly spaced in time. It has no colours: all
-trees are given to one boundary. Its associations of trees are used for the reference only, which is the
-optimum of GTSAM and stands in the log as truth, since no survey of the park is in the file.
+GTSAM brings the file, without stamps and colours: poses are taken as evenly spaced in time, and all trees are
+given to one boundary. The truth in the log is no survey, but GTSAM's optimum with the file's associations.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""What a notebook shows of records: short texts here, pictures and frames from the rooms that make them.
-
-Those rooms stand above the records and import matplotlib and pandas, so they are imported when asked for.
-"""
+"""What a notebook shows of records: texts here; pictures and frames of rooms above, imported on demand."""
 
 from dataclasses import fields, is_dataclass
 from importlib import import_module

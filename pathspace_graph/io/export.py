@@ -35,25 +35,18 @@ def write_centre_line(file: Path, track: Map, step: float) -> None:
 
 
 def write_profile(
-    file: Path,
-    track: Map,
-    step: float,
-    settings: SpeedSettings,
-    start: float | None = None,
-    stop: bool = False,
+    file: Path, track: Map, step: float, limits: SpeedSettings, start: float | None = None, stop: bool = False
 ) -> None:
     """Write the centre line with heading, curvature, speed and acceleration (m, rad, 1/m, m/s, m/s^2).
 
-    The columns are those of TUM's trajectories. The heading is measured from the x axis of the map. An open
-    line begins at the speed `start` (m/s), where it is given, and may end at a stop. SettingsError is raised
-    where the vehicle cannot begin so fast.
+    The columns are those of TUM's trajectories. An open line may begin at the speed `start` (m/s), or else
+    SettingsError is raised, and may end at a stop.
     """
     line = track.centre_line(step)
-    profile = speed_profile(line, settings, start, 0.0 if stop else None)
+    profile = speed_profile(line, limits, start, 0.0 if stop else None)
     if start is not None and profile.speed[0] < start:
-        raise SettingsError(
-            f"expected a start speed of at most {profile.speed[0]:.3g} m/s on this line, found {start:g}"
-        )
+        most = f"{profile.speed[0]:.3g} m/s on this line"
+        raise SettingsError(f"expected a start speed of at most {most}, found {start:g}")
     curve = line.arc_length, line.points, line.heading, line.curvature
     write_table(file, PROFILE, *curve, profile.speed, profile.acceleration)
 
@@ -71,10 +64,10 @@ def boundary_points(boundary: MapBoundary, step: float) -> Array:
     return boundary.points if isinstance(boundary, PointBoundary) else sampled(boundary.spline, step)
 
 
-def sampled(spline: BSpline, step: float) -> Array:
+def sampled(spline: BSpline, step: float, fewest: int = _FEWEST_INTERVALS) -> Array:
     """Return points (n, 2) of a curve about `step` (m) apart; the first of a closed one isn't repeated."""
     length = spline.length()
-    at = np.linspace(0.0, length, max(round(length / step), _FEWEST_INTERVALS) + 1)
+    at = np.linspace(0.0, length, max(round(length / step), fewest) + 1)
     return spline.evaluate(spline.parameters_at(at[:-1] if spline.periodic else at))
 
 
@@ -130,10 +123,7 @@ class LocalPlane:
         up = np.array([*(cosine * np.array([np.cos(longitude), np.sin(longitude)])), sine])
         forward = np.sin(heading) * east + np.cos(heading) * np.cross(up, east)
         normal = _normal_radius(sine)
-        across = normal * cosine
-        origin = np.array(
-            [across * np.cos(longitude), across * np.sin(longitude), normal * (1.0 - _SQUARE) * sine]
-        )
+        origin = normal * np.append(up[:2], (1.0 - _SQUARE) * sine)
         return origin, np.stack([forward, np.cross(up, forward)])
 
 
@@ -145,7 +135,7 @@ def _normal_radius(sine: Any) -> Any:
 # --- GeoJSON ---------------------------------------------------------------------------------------------
 
 CENTRE: Final = "centre"  # name of the centre line
-_PROPERTIES: Final = (
+_PROPERTIES: Final = (  # of the centre line: values of an attribute at its points, none at a repeated one
     ("arc_length_m", "arc_length"),
     ("curvature_per_m", "curvature"),
     ("width_left_m", "width_left"),
@@ -155,15 +145,10 @@ _PROPERTIES: Final = (
     ("width_left_sigma_m", "width_left_sigma"),
     ("width_right_sigma_m", "width_right_sigma"),
 )
-"""Properties of the centre line, each a list with a value of this attribute for each point; it has none for
-the point that a closed line repeats."""
 
 
 def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> None:
-    """Write each boundary and, where both are curves, the centre line as a FeatureCollection.
-
-    A curve is a LineString of points `step` (m) apart; landmarks and orange cones are MultiPoints.
-    """
+    """Write curves, by points `step` (m) apart, as LineStrings with a centre line, cones as MultiPoints."""
 
     def feature(kind: str, points: Array, closed: bool, properties: dict[str, Any]) -> dict[str, Any]:
         degrees = np.round(plane.to_geodetic(points)[:, ::-1], _DECIMALS_DEGREES)
@@ -225,11 +210,10 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
         nodes = []
         for (x, y), degrees in zip(points.tolist(), plane.to_geodetic(points).tolist(), strict=True):
             latitude, longitude = (f"{one:.{_DECIMALS_DEGREES}f}" for one in degrees)
-            node = add("node", lat=latitude, lon=longitude)
+            nodes.append(add("node", lat=latitude, lon=longitude))
             place = {"local_x": f"{x:.{_DECIMALS}f}", "local_y": f"{y:.{_DECIMALS}f}", "ele": "0.0"}
-            add_tags(node, place | tags)
-            nodes.append(node.attrib["id"])
-        return nodes
+            add_tags(nodes[-1], place | tags)
+        return [node.attrib["id"] for node in nodes]
 
     def add_way(nodes: list[str]) -> str:
         way = add("way")
@@ -261,17 +245,14 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
 
 def _pieces(spline: BSpline, cuts: Array, step: float) -> list[Array]:
     """Return the points (n, 2) of each stretch between cuts, without its last one, or of an open curve."""
-    length = spline.length()
-    if len(cuts):
-        low, high = spline.domain
-        begins = spline.arc_length(low + np.mod(cuts - low, high - low))
-        begins = begins[0] + np.mod(begins - begins[0], length)
-        ends = np.append(begins, begins[0] + length)
-    else:
-        ends = np.array([0.0, length])
+    if not len(cuts):
+        return [sampled(spline, step, _FEWEST_WAY_INTERVALS)]
+    length, (low, high) = spline.length(), spline.domain
+    begins = spline.arc_length(low + np.mod(cuts - low, high - low))
+    begins = begins[0] + np.mod(begins - begins[0], length)
     pieces = []
-    for begin, end in pairwise(ends):
+    for begin, end in pairwise([*begins, begins[0] + length]):
         intervals = max(round((end - begin) / step), _FEWEST_WAY_INTERVALS)
-        at = np.linspace(begin, end, intervals + 1)[: -1 if len(cuts) else None]
-        pieces.append(spline.evaluate(spline.parameters_at(np.mod(at, length) if len(cuts) else at)))
+        at = np.linspace(begin, end, intervals + 1)[:-1]
+        pieces.append(spline.evaluate(spline.parameters_at(np.mod(at, length))))
     return pieces

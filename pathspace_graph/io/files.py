@@ -1,7 +1,6 @@
 """Output that appears as a whole or not at all, and never costs an earlier result.
 
-Each step that changes what a path names is one system call that audit hooks see (`sys.addaudithook`), so that
-a test can end the process before any of them.
+Audit hooks (`sys.addaudithook`) see each step that changes what a path names, and can end the process before.
 """
 
 import ctypes
@@ -272,10 +271,7 @@ def _remove(path: Path) -> None:
 
 
 def lock(path: Path, *, wait: bool) -> int | None:
-    """Return a descriptor that locks a file or a folder until it is closed, or the process dies.
-
-    None where there is no such path or lock, or, unless it is to `wait`, another process holds it.
-    """
+    """Return a descriptor that locks a path until it is closed or the process dies; None without a lock."""
     if fcntl is None:
         return None
     try:

@@ -20,7 +20,8 @@ POSITIVE: Final = math.ulp(0.0)
 STATED: Final = "stated"
 UNSTATED: Final = ("measured", "assumed")  # measured, or assumed where the drive shows too little
 MEASURED: Final = "noise.measured"  # section, whose entries have so many numbers of at least so much
-_ODOMETRY: Final = {"odometry": (3, 0.0), "drift": (3, 0.0), "interval": (1, POSITIVE), "seconds": (1, 0.0)}
+_ODOMETRY: Final = {"odometry": (3, 0.0), "drift": (3, 0.0), "interval": (1, POSITIVE)}
+_SECONDS: Final = {"seconds": (1, 0.0)}
 _RAYS: Final = {"along": (4, 0.0), "across": (4, 0.0)}
 _DETECTIONS: Final = {
     **_RAYS,
@@ -71,7 +72,7 @@ class Header:
         return found | {"measured": self._measured() if "measured" in self.section("noise") else None}
 
     def _measured(self) -> MeasuredNoise:
-        entries = _ODOMETRY | (_DETECTIONS if "along" in self.section(MEASURED) else {})
+        entries = _ODOMETRY | (_DETECTIONS if "along" in self.section(MEASURED) else {}) | _SECONDS
         values = {name: self.numbers(MEASURED, name, *expected) for name, expected in entries.items()}
         noisy = values["odometry"] + values["drift"] > 0.0
         self._require(noisy, "a twist with some noise as odometry or drift")
@@ -124,13 +125,9 @@ def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | N
     }
     if measured is None:
         return {"noise": section}
-    entries: dict[str, Any] = {name: getattr(measured, name).tolist() for name in ("odometry", "drift")}
-    entries["interval"] = measured.interval
-    for name, ray in (("along", measured.along), ("across", measured.across)):
-        if ray is not None:
-            entries[name] = [*ray.sigma.tolist(), ray.share, ray.time]
-    if measured.along is not None:
-        entries |= {name: getattr(measured, name) for name in ("count", "period", "per_cycle")}
-        errors = np.column_stack([measured.sensor, measured.sensor_sigma]).tolist()
-        entries |= dict(zip(SENSOR, errors, strict=True))
-    return {"noise": section, MEASURED: entries | {"seconds": measured.seconds}}
+    errors = np.column_stack([measured.sensor, measured.sensor_sigma])
+    values = vars(measured) | dict(zip(SENSOR, errors, strict=True))
+    for name in _RAYS if rays else ():
+        values[name] = [*values[name].sigma, values[name].share, values[name].time]
+    entries = [*_ODOMETRY, *(_DETECTIONS if rays else ()), *_SECONDS]
+    return {"noise": section, MEASURED: {name: np.asarray(values[name]).tolist() for name in entries}}

@@ -69,16 +69,11 @@ class Odometry(Brief):
 
     LENGTHS: ClassVar = {"twist": POSE}
 
-    t: Array
-    """Stamps (N,) in s, strictly increasing."""
-    twist: Array
-    """Twists [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame."""
+    t: Array  # stamps (N,) in s, strictly increasing
+    twist: Array  # twists [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame
 
     def between(self, start: float, end: float) -> Odometry:
-        """Return the twists in force from `start` (s) on, the last of them held to `end` (s).
-
-        Before the first row nothing moves; where no time passes there are no rows.
-        """
+        """Return the twists in force from `start` (s) to `end` (s); before the first row nothing moves."""
         start = max(start, float(self.t[0]))
         first = int(np.searchsorted(self.t, start, side="right")) - 1
         stop = max(first, int(np.searchsorted(self.t, end, side="left"))) if end > start else first
@@ -96,14 +91,10 @@ class Detections(Brief):
 
     LENGTHS: ClassVar = {"points_vehicle": 1, "covariances": 2}
 
-    t: float
-    """Stamp of the cycle, s."""
-    points_vehicle: Array
-    """Detected points (m, 2) in m, vehicle frame."""
-    covariances: Array
-    """Their covariances (m, 2, 2) in m^2, vehicle frame."""
-    labels: IntArray
-    """Their labels (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE."""
+    t: float  # stamp of the cycle, s
+    points_vehicle: Array  # detected points (m, 2) in m, vehicle frame
+    covariances: Array  # their covariances (m, 2, 2) in m^2, vehicle frame
+    labels: IntArray  # their labels (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE
 
     def where(self, chosen: BoolArray) -> Detections:
         if chosen.all():
@@ -153,19 +144,13 @@ class Log:
     }
 
     odometry: Odometry
-    cycles: tuple[Detections, ...]
-    """Perception cycles in order of time."""
-    odometry_sigma: Array
-    """Standard deviations (3,) of a twist in m/s, m/s, rad/s, white from sample to sample."""
+    cycles: tuple[Detections, ...]  # perception cycles in order of time
+    odometry_sigma: Array  # (3,) of a twist in m/s, m/s, rad/s, white from sample to sample
     sensor: SensorInfo = SensorInfo()
-    source: Mapping[str, str] = field(default_factory=dict)
-    """Free texts that say where the log comes from."""
-    odometry_stated: bool = True
-    """Whether somebody has stated the noise of the odometry; otherwise it was measured or assumed."""
-    detections_stated: bool = True
-    """Whether somebody has stated the covariances of the detections."""
-    measured: MeasuredNoise | None = None
-    """Noise and constant errors of the sensor, as the readings themselves show them."""
+    source: Mapping[str, str] = field(default_factory=dict)  # free texts that say where the log comes from
+    odometry_stated: bool = True  # whether its noise was stated, and not measured or assumed
+    detections_stated: bool = True  # whether somebody has stated the covariances of the detections
+    measured: MeasuredNoise | None = None  # noise and constant errors of the sensor, by the readings
     truth: Truth | None = None
 
     def __repr__(self) -> str:
@@ -229,8 +214,7 @@ def _table(folder: Path, name: str) -> Table:
 def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
     """Write a log folder that `read_log` gives back exactly, but for cycles without detections.
 
-    It appears as a whole or not at all; an earlier log is kept as a numbered backup. With `check`, a log that
-    cannot be read is an InputError, and is not written.
+    It is written as by `atomic_folder`; with `check`, a log that cannot be read is an InputError instead.
     """
     check_type("log", log, Log)
     with atomic_folder(folder, LOG_FILE) as target:

@@ -19,10 +19,7 @@ _DIGEST: Final = "pathspace_digest"  # key of the manifest's own SHA-256, taken 
 
 
 def manifest_of(folder: Path) -> str:
-    """Return the text of the manifest of all files of a folder but hidden ones.
-
-    Of a subfolder with a manifest of its own, only that is listed.
-    """
+    """Return the manifest of a folder: of its files but hidden ones, and of manifests of subfolders."""
     files = {file.relative_to(folder).as_posix(): file for file in sorted(_files(folder))}
     return _text({name: {"size": one.stat().st_size, "sha256": _digest(one)} for name, one in files.items()})
 
@@ -45,10 +42,7 @@ def _text(files: Any) -> str:
 
 
 def read_manifest(folder: Path) -> dict[str, dict[str, Any]] | None:
-    """Return size and SHA-256 of each listed file by its path, or None where the folder has no manifest.
-
-    A file of the same name that another program wrote is none. An InputError says where one is damaged.
-    """
+    """Return size and SHA-256 of listed files by path; None without a manifest of this program."""
     file = folder / MANIFEST_FILE
     if not file.is_file():
         return None

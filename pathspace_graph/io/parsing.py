@@ -1,7 +1,4 @@
-"""TOML, JSON, YAML and CSV as plain data, never as code, within limits beyond which a file is refused.
-
-The limits guard against damage and mistakes; what a vehicle can do is a setting of its estimator.
-"""
+"""TOML, JSON, YAML and CSV as plain data, never as code, within limits against damage and mistakes."""
 
 import csv
 import json
@@ -233,10 +230,10 @@ class Table:
 def read_table(
     file: Path, required: Mapping[str, Column] | Sequence[str], comment: str = "", most: int = MAX_FILE_BYTES
 ) -> Table:
-    """Read a CSV file with a header that holds at least the required columns, in any order.
+    """Read a CSV file whose header holds at least the required columns; an InputError says what is wrong.
 
-    Quotes, blanks around fields, empty lines, Windows line ends and a byte-order mark are tolerated;
-    `comment` is stripped from the front of the header. Anything else is an InputError.
+    Quotes, blanks around fields, empty lines, Windows line ends, a byte-order mark and a `comment` in front
+    of the header are tolerated.
     """
     rows: list[list[str]] = []
     lines: list[int] = []

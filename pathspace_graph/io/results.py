@@ -1,7 +1,4 @@
-"""What a run leaves (FORMATS): its map, trajectory, cycles and summary in one folder.
-
-A trajectory is in the TUM format, a row `t tx ty tz qx qy qz qw` for each pose.
-"""
+"""What a run leaves (FORMATS): its map, trajectory in the TUM format, cycles and summary in one folder."""
 
 from __future__ import annotations
 
@@ -167,41 +164,26 @@ class RunResult:
         **{"trajectory": POSE, "smoothed": POSE, "reach": (1, 2, 0), "scale": 1},
     }
 
-    estimator: str
-    """Name of the estimator (FORMATS)."""
-    settings: dict[str, Any]
-    """All settings of the estimator, as plain values."""
-    map: Map
-    """Map at the end of the log."""
-    trajectory_t: Array
-    """Stamps of the perception cycles (n,) in s."""
-    trajectory: Array
-    """Poses [x, y, theta] (n, 3), map frame; of an online estimator as they stood at that cycle."""
+    estimator: str  # name of the estimator (FORMATS)
+    settings: dict[str, Any]  # all settings of the estimator, as plain values
+    map: Map  # map at the end of the log
+    trajectory_t: Array  # stamps of the perception cycles (n,) in s
+    trajectory: Array  # poses [x, y, theta] (n, 3), map frame; of an online estimator as they stood then
     cycles: tuple[CycleRecord, ...]
-    laps: int
-    """Complete laps of the estimated trajectory, with a last one that ends just before the line."""
-    lap_maps: tuple[tuple[int, Map], ...] = ()
-    """Number of each complete lap, and the map as it stood at its end."""
-    snapshots: tuple[Map, ...] = ()
-    """Map as it stood at each of the times that were asked for."""
-    vehicle: VehicleState | None = None
-    """State of the vehicle at the end of the log, where the estimator gives it."""
+    laps: int  # complete laps of the estimated trajectory, with a last one that ends just before the line
+    lap_maps: tuple[tuple[int, Map], ...] = ()  # number of each complete lap, and the map at its end
+    snapshots: tuple[Map, ...] = ()  # map as it stood at each of the times that were asked for
+    vehicle: VehicleState | None = None  # at the end of the log, where the estimator gives it
     reach: Array | None = None
     """Row of each cycle (n, 3), if an observer knew the truth: the reach ahead of the vehicle, m, the sum of
     squared distances of the true cones on that stretch, m^2, and their number. The reach is NaN where the
     cycle doesn't count."""
-    observing: float = 0.0
-    """Wall time of the observers, s, which is no part of the estimator's."""
-    batches: LapBatches | None = None
-    """Ends of the batches of the lap, where the estimator has such."""
-    waited: float = 0.0
-    """Wall time for which the run waited for batches between cycles, s."""
-    noise: RunNoise | None = None
-    """Noise that was used, where the estimator says it."""
-    scale: float = 1.0
-    """Size of the scene by that of a Formula Student track."""
-    smoothed: Array | None = None
-    """Poses (n, 3) of an online estimator whose earlier ones were corrected when the loop closed."""
+    observing: float = 0.0  # wall time of the observers, s, which is no part of the estimator's
+    batches: LapBatches | None = None  # ends of the batches of the lap, where the estimator has such
+    waited: float = 0.0  # wall time for which the run waited for batches between cycles, s
+    noise: RunNoise | None = None  # noise that was used, where the estimator says it
+    scale: float = 1.0  # size of the scene by that of a Formula Student track
+    smoothed: Array | None = None  # poses (n, 3), with earlier ones corrected when the loop closed
 
     def __repr__(self) -> str:
         name = f"{type(self).__name__}({self.estimator}: {len(self.cycles)} cycles, {self.laps} laps"
@@ -227,17 +209,12 @@ class RunResult:
 class BatchRun(RunResult):
     """Result of a batch estimator; its maps of the laps are all the one of the whole log."""
 
-    converged: bool = True
-    """Whether the optimization ended at an optimum."""
-    cost: float = nan
-    """Cost at its end, half the sum of squared whitened residuals, where it is known."""
+    converged: bool = True  # whether the optimization ended at an optimum
+    cost: float = nan  # cost at its end, half the sum of squared whitened residuals, where it is known
 
 
 def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:
-    """Write map.json, the trajectories, cycles.csv and summary.json: all of them, or on failure nothing.
-
-    An earlier result in `folder` is kept as a numbered backup; anything else there is an OutputError.
-    """
+    """Write map.json, the trajectories, cycles.csv and summary.json to a folder, as by `atomic_folder`."""
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
         write_trajectory(temporary / TRAJECTORY_FILE, result.trajectory_t, result.trajectory)

@@ -182,10 +182,7 @@ def _detections(log: Log) -> list[Hint]:
 
 
 def _contradicted(ranges: Array, stated: Array, ray: RayNoise, axis: int) -> str:
-    """Return whether the stated standard deviations (m,) are too small or too large in most detections.
-
-    A cone is no point, which bounds the scatter from below, and a gate bounds it from above.
-    """
+    """Return how stated sigmas (m,) are wrong; the size of a cone and a gate bound the scatter."""
     measured = ray.sigmas(ranges)
     floor = np.array([np.full(len(ranges), LEAST[0]), LEAST[1] * ranges])[axis]
     small = measured > SCATTER_FACTOR * np.maximum(stated, floor)

@@ -1,7 +1,6 @@
 """Hypotheses about a log: in which frame its detections are, and what its odometry means.
 
-Each lays the detections of nearby cycles on each other, since cones stand still. One that explains far more
-of them than the log as it is written is the likely truth.
+Cones stand still, so the one that lays most detections of nearby cycles on each other is the likely truth.
 """
 
 from collections.abc import Iterator, Sequence
@@ -51,8 +50,7 @@ class Pairs:
 
         frame (2, 2) leads from the log's frame to the vehicle's, motion (P, 3) from the later to the earlier.
         """
-        laid = self.laid(frame, motion)
-        off = (self.before @ frame.T)[:, :, None] - laid[:, None]
+        off = (self.before @ frame.T)[:, :, None] - self.laid(frame, motion)[:, None]
         square = np.einsum("pijk,pijk->pij", off, off)
         return np.where(np.isnan(square), np.inf, square)
 
@@ -91,15 +89,13 @@ def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
     """Return pairs of cycles spread over a log, or None where there are none with detections."""
     full = [cycle for cycle in cycles if len(cycle.labels) >= MIN_DETECTIONS]
     spacing = spacing_of(full[:: max(1, len(full) // SOME_CYCLES)])
-    if spacing is None:
+    if spacing is None or len(full) < 2:
         return None
-    stamps = np.array([cycle.t for cycle in full])
-    pairs = []
-    shortest = float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
+    stamps, pairs = np.array([cycle.t for cycle in full]), []
+    longest = max(LONGEST, 1.5 * float(np.median(np.diff(stamps))))
     for gap in GAPS:
         later = np.arange(gap, len(full))
-        near = stamps[later] - stamps[later - gap] <= max(LONGEST, 1.5 * shortest)
-        later = later[near]
+        later = later[stamps[later] - stamps[later - gap] <= longest]
         chosen = later[:: max(1, len(later) // PAIRS_OF_GAP)]
         pairs.append([chosen - gap, chosen, np.full(len(chosen), gap)])
     first, second, gaps = np.concatenate(pairs, axis=1)
@@ -113,8 +109,7 @@ def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
 
 def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:
     """Return the nearest detections (C, m, 2) of each cycle, and a coordinate's variances (C, m), or NaN."""
-    points = np.full((len(cycles), most, 2), np.nan)
-    variances = np.full((len(cycles), most), np.nan)
+    points, variances = np.full((len(cycles), most, 2), np.nan), np.full((len(cycles), most), np.nan)
     for k, cycle in enumerate(cycles):
         nearest = np.argsort(np.hypot(*cycle.points_vehicle.T), kind="stable")[:most]
         points[k, : len(nearest)] = cycle.points_vehicle[nearest]
@@ -134,10 +129,7 @@ def spacing_of(cycles: Sequence[Detections]) -> float | None:
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
-    """Return the motions (P, 3) between stamps (P,), each in the frame of its beginning.
-
-    Poses (N, 3) are interpolated linearly; beyond the ends they are held.
-    """
+    """Return the motions (P, 3) between stamps (P,), in the frame of their beginning, among poses (N, 3)."""
     first, last = (np.column_stack([np.interp(t, odometry_t, one) for one in poses.T]) for t in (begin, end))
     return np.column_stack([to_vehicle(last[:, :2], first), last[:, 2] - first[:, 2]])
 
@@ -261,9 +253,8 @@ class Trials:
         return motions(odometry.t, self._poses[meaning], begin, end)
 
     def trial(self, hypothesis: Hypothesis) -> Trial:
-        matrix = hypothesis.frame
-        explained = self.pairs.explained(matrix, self.motion(hypothesis))
-        return Trial(hypothesis, explained, self.sided(matrix))
+        explained = self.pairs.explained(hypothesis.frame, self.motion(hypothesis))
+        return Trial(hypothesis, explained, self.sided(hypothesis.frame))
 
     @cached_property
     def as_written(self) -> Trial:
@@ -289,9 +280,8 @@ class Trials:
     def sided(self, matrix: Array) -> float:
         """Return the share of labelled detections on the side of their label in a frame; 0.5 without any."""
         points, labels = self._labelled
-        if len(labels) == 0:
-            return 0.5
-        return float((((points @ matrix.T)[:, 1] > 0.0) == (labels == LEFT)).mean())
+        on_side = ((points @ matrix.T)[:, 1] > 0.0) == (labels == LEFT)
+        return float(on_side.mean()) if len(labels) else 0.5
 
     @cached_property
     def _labelled(self) -> tuple[Array, IntArray]:

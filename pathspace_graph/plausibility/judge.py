@@ -61,10 +61,7 @@ MIRRORED: Final = 0.0, True  # frame in which y points to the right and x ahead
 
 
 def hints(log: Log) -> list[Hint]:
-    """Return the likely mistakes in a log by its readings; there are none where evidence is weak.
-
-    There are none either where a number is not finite, as such a log's files cannot be parsed.
-    """
+    """Return likely mistakes in a log by its readings; none if evidence is weak or a number is not finite."""
     check_type("log", log, Log)
     if len(log.odometry.t) < LEAST_TWISTS or not _has_numbers(log):
         return []
