@@ -127,10 +127,9 @@ def with_measured_noise(log: Log) -> Log:
     measured = scaled(measure_log(scaled(log, 1.0 / scale)), scale)
     if measured is None:
         return log
-    log = replace(log, measured=measured)
-    if not log.odometry_stated:
-        log = replace(log, odometry_sigma=measured.twist_sigma)
-    if log.detections_stated or measured.along is None:
+    sigma = log.odometry_sigma if log.odometry_stated else measured.twist_sigma
+    log = replace(log, measured=measured, odometry_sigma=sigma)
+    if log.detections_stated:
         return log
     cycles = []
     for cycle in log.cycles:

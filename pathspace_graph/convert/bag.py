@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.parsing import read_text
 
 from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_of, twist_of, yaw_rate_of
 from .recording import Recording, twists_between
@@ -226,10 +227,7 @@ class Bag:
     notes: Counter[str]
 
     def samples(self, topic: str | None, option: str, take: Callable[[Any], Any]) -> Samples:
-        """Return what to `take` of the messages of a topic; a message may be large, and is not kept.
-
-        They have header stamps where most have one, else the times of receipt: the clocks may differ.
-        """
+        """Return what to `take` of a topic's messages, with header stamps if most have one, or of receipt."""
         connections = self._connections(topic)
         if not connections:
             found = "found none" if topic is None else f"found {topic}"
@@ -339,11 +337,9 @@ def _given_definitions(definitions: Sequence[str]) -> dict[str, Any]:
         if len(parts) < 2 or not all(parts):
             raise SettingsError(f"--definition: expected PACKAGE/msg/NAME=FILE, found '{entry}'")
         name = f"{parts[-2]}/msg/{parts[-1]}"
+        text = read_text(file, "a message definition")
         try:
-            types |= typesys.get_types_from_msg(file.read_text(encoding="utf-8"), name)
-        except OSError as error:
-            found = f"can't be read ({error.strerror})"
-            raise InputError(file, f"expected a message definition, {found}") from None
+            types |= typesys.get_types_from_msg(text, name)
         except Exception as error:
             raise InputError(file, f"expected the definition of {name} ({error})") from None
     return types

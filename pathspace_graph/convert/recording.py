@@ -237,10 +237,7 @@ class MessageStream:
             self.refused[str(error)] += 1
 
     def take_detections(self, message: Any, received: float) -> tuple[Odometry, Detections] | None:
-        """Return a perception cycle with the twists since the last one that was used, or None.
-
-        A late cycle comes without twists. They are kept until the caller says by `use` that it was taken.
-        """
+        """Return a perception cycle with the twists since the last in `use`, none for a late one, or None."""
         try:
             points = usable(points_of(message, self.rule), self.refused)
             t = stamp_of(message) or received

@@ -84,10 +84,9 @@ _DECIMALS_DEGREES: Final = 10  # number of decimals of degrees, which is 0.01 mm
 class LocalPlane:
     """Plane of the map frame, which touches the ellipsoid WGS84 at the origin of the map.
 
-    A point (x, y) of the map lies `east = x sin h - y cos h` and `north = x cos h + y sin h` of the origin on
-    that plane, where h is the heading of the x axis. It has the latitude and longitude of its foot on the
-    ellipsoid. Distances on the ground differ from those of the map by about d^3 / (3 R^2): 0.01 mm in 1 km,
-    and 8 mm in 10 km.
+    A point (x, y) lies `east = x sin h - y cos h` and `north = x cos h + y sin h` of the origin, where h is
+    the heading of the x axis, and has the latitude and longitude of its foot on the ellipsoid. Distances on
+    the ground differ by about d^3 / (3 R^2): 8 mm in 10 km.
     """
 
     latitude: float  # latitude of the map's origin (degrees), positive to the north
@@ -191,9 +190,8 @@ _DECIMALS: Final = 5  # number of decimals of local coordinates (m)
 def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> None:
     """Write both boundaries as ways of points `step` (m) apart, lanelets between them, and orange cones.
 
-    The file is plain OSM XML. Nodes have latitude, longitude and, as tags, their place in the map frame. An
-    open track is one lanelet. A loop is cut where normals of its centre line cross the boundaries;
-    consecutive lanelets share their nodes there.
+    Nodes of the OSM XML have latitude, longitude and, as tags, their place in the map frame. A loop is cut
+    where normals of its centre line cross the boundaries; consecutive lanelets share their nodes there.
     """
     root, numbers = ET.Element("osm", version="0.6", generator="pathspace-graph"), count(1)
 

@@ -154,13 +154,11 @@ class Log:
     truth: Truth | None = None
 
     def __repr__(self) -> str:
-        seconds, noise = self.odometry.t[-1] - self.odometry.t[0], ("measured", "stated")
+        t, noise = self.odometry.t, ("their noise measured", "their noise stated")
         detections = sum(len(cycle.labels) for cycle in self.cycles)
         return (
-            f"Log({seconds:.1f} s: {len(self.odometry.t)} twists,"
-            f" their noise {noise[self.odometry_stated]};\n"
-            f"    {len(self.cycles)} cycles with {detections} detections,"
-            f" their noise {noise[self.detections_stated]};\n"
+            f"Log({t[-1] - t[0]:.1f} s: {len(t)} twists, {noise[self.odometry_stated]};\n"
+            f"    {len(self.cycles)} cycles with {detections} detections, {noise[self.detections_stated]};\n"
             f"    {'no truth' if self.truth is None else 'with truth'})"
         )
 

@@ -13,7 +13,7 @@ from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.gate import TWIST
 from pathspace_graph.front_end.measurement import DRIFT, LEAST
 from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
-from pathspace_graph.io.log import Log
+from pathspace_graph.io.log import CALIBRATION, Log
 from pathspace_graph.io.results import RunNoise, VehicleState
 
 from .hint import Hint, told
@@ -22,30 +22,28 @@ LIMIT: Final = 3.0  # prior standard deviations from zero beyond which a calibra
 
 
 class Cause(NamedTuple):
-    """What a calibration means, and the group of the settings with its prior as `sigma_` and its name."""
+    """What a calibration means."""
 
-    group: str
     text: str  # cause, with a place for the size
     unit: float  # size of a calibration of 1
     signs: tuple[str, str]  # words for a positive and for a negative calibration
 
 
-CAUSES: Final = {  # causes by the name of the calibration
-    "scale": Cause("odometry", "speeds are {:.1f} % too {}", 100.0, ("high", "low")),
-    "bias": Cause("odometry", "the yaw rate is {:.4f} rad/s too {}", 1.0, ("high", "low")),
-    "yaw": Cause(
-        "calibration", "the sensor is turned by {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")
-    ),
-    "lateral": Cause("calibration", "the sensor sits {:.2f} m too far to the {}", 1.0, ("left", "right")),
-    "latency": Cause("calibration", "detections are {:.0f} ms {} than their stamps", 1e3, ("older", "newer")),
-    "range_scale": Cause("calibration", "ranges are {:.1f} % too {}", 100.0, ("long", "short")),
-    "range_bias": Cause("calibration", "ranges are {:.2f} m too {}", 1.0, ("long", "short")),
+CAUSES: Final = {  # by the name of the calibration
+    "scale": Cause("speeds are {:.1f} % too {}", 100.0, ("high", "low")),
+    "bias": Cause("the yaw rate is {:.4f} rad/s too {}", 1.0, ("high", "low")),
+    "yaw": Cause("the sensor is turned by {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
+    "lateral": Cause("the sensor sits {:.2f} m too far to the {}", 1.0, ("left", "right")),
+    "latency": Cause("detections are {:.0f} ms {} than their stamps", 1e3, ("older", "newer")),
+    "range_scale": Cause("ranges are {:.1f} % too {}", 100.0, ("long", "short")),
+    "range_bias": Cause("ranges are {:.2f} m too {}", 1.0, ("long", "short")),
 }
 
 
 def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, float]:
     """Return each calibration whose prior is in a run's settings over the prior's standard deviation."""
-    priors = {name: settings.get(CAUSES[name].group, {}).get(f"sigma_{name}") for name in state.by_name}
+    groups = {name: "odometry" if name in CALIBRATION else "calibration" for name in state.by_name}
+    priors = {name: settings.get(group, {}).get(f"sigma_{name}") for name, group in groups.items()}
     return {name: state.by_name[name][0] / prior for name, prior in priors.items() if prior is not None}
 
 
@@ -65,9 +63,9 @@ CLEAR: Final = 4.0  # standard deviations beyond which a measured error of the s
 # size beyond which it is told (rad, m, s, -, m)
 WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
 TOLD: Final = {
-    "latency": ("stamps {:.0f} ms {}", 1e3, ("late", "early")),
-    "yaw": ("turned {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
-    "lateral": ("{:.2f} m too far to the {}", 1.0, ("left", "right")),
+    "latency": ("stamps {:.0f} ms {}", ("late", "early")),
+    "yaw": ("turned {:.1f} degrees to the {}", ("left", "right")),
+    "lateral": ("{:.2f} m too far to the {}", ("left", "right")),
 }
 STAYING: Final = 0.1  # share of the variance from which errors that stay with a cone are told
 
@@ -106,8 +104,8 @@ def _errors(measured: MeasuredNoise) -> list[str]:
     errors = zip(SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True)
     clear = {name: value for name, value, sigma in errors if abs(value) > max(CLEAR * sigma, WORTH[name])}
     texts = [
-        text.format(unit * abs(clear[name]), words[clear[name] < 0.0])
-        for name, (text, unit, words) in TOLD.items()
+        text.format(CAUSES[name].unit * abs(clear[name]), words[clear[name] < 0.0])
+        for name, (text, words) in TOLD.items()
         if name in clear
     ]
     ranges = []
@@ -134,8 +132,7 @@ def noise_hints(log: Log) -> list[Hint]:
 def _odometry(log: Log) -> list[Hint]:
     """Return a hint where noise from sample to sample contradicts the stated one.
 
-    Motion is in the differences too: noise is too small only where all orders agree, too large only beside
-    the least slow errors of any odometry.
+    It is too small only where all orders of differences, in which motion is too, agree.
     """
     twists = TwistRecord()
     twists.add(log.odometry)

@@ -164,10 +164,9 @@ def _median(values: Array) -> float:
 
 
 def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
-    """Return the pairs of cycles that see the same cones if the odometry is right.
+    """Return the pairs of cycles that see the same cones if the odometry is right, or the nearest ones.
 
-    Cycles without cones in common would agree best with a vehicle that does not move, as one stretch looks
-    like the next. Where the odometry is impossible anyway, the pairs are those that follow each other.
+    Others would agree best with a vehicle that does not move, as one stretch looks like the next.
     """
     if beyond_any_vehicle(log.odometry):
         return pairs.chosen(pairs.gap <= hypotheses.GAPS[1])
