@@ -15,6 +15,7 @@ import numpy as np
 
 Memo = dict[int, Any]  # copies by the `id` of what they are copies of
 Copier = Callable[[Any, Memo], Any]
+Call = partial[Any]
 
 
 class Recovery:
@@ -25,7 +26,7 @@ class Recovery:
     def __init__(self, failures: int = 0) -> None:
         self.failures = failures
         self._copy: dict[str, Any] | None = None
-        self._calls: list[partial[Any]] = []
+        self._calls: list[Call] = []
         self._doubtful: int | None = None  # the first call that may be made in another way yet
 
     def before(self, estimator: object, *shared: object) -> None:
@@ -34,17 +35,15 @@ class Recovery:
         if self._copy is None or due:
             self._copy, self._calls = self._held(vars(estimator), estimator, shared), []
 
-    def called(self, again: partial[Any], *, is_doubtful: bool = False) -> None:
-        """Note a call that has changed the estimator; while a newer one is doubtful, `undo` can change it."""
+    def called(self, again: Call, *, is_doubtful: bool = False) -> None:
+        """Note a call that has changed the estimator; `undo` can change those from a doubtful one on."""
         if not is_doubtful:
             self._doubtful = None
         elif self._doubtful is None:
             self._doubtful = len(self._calls)
         self._calls.append(again)
 
-    def undo(
-        self, estimator: object, *shared: object, instead: Callable[[partial[Any]], partial[Any]]
-    ) -> None:
+    def undo(self, estimator: object, *shared: object, instead: Callable[[Call], Call]) -> None:
         """Take an estimator back to before its doubtful calls, and make these `instead`."""
         first = len(self._calls) if self._doubtful is None else self._doubtful
         self._calls = [*self._calls[:first], *map(instead, self._calls[first:])]
@@ -69,11 +68,9 @@ class Recovery:
                 self._go_back(estimator, *shared)
                 return
 
-    def _held(
-        self, attributes: dict[str, Any], estimator: object, shared: tuple[object, ...]
-    ) -> dict[str, Any]:
+    def _held(self, values: dict[str, Any], estimator: object, shared: tuple[object, ...]) -> dict[str, Any]:
         memo = {id(one): one for one in (self, estimator, *shared)}
-        return {name: copied(own, memo) for name, own in attributes.items()}
+        return {name: copied(own, memo) for name, own in values.items()}
 
 
 def copied(value: Any, memo: Memo) -> Any:

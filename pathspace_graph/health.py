@@ -63,11 +63,9 @@ class HealthMonitor:
         if self._recent and self._recent[-1].closed != evidence.closed:
             self.restart()
         self._remember(evidence)
-        offered = explained = used = 0
-        squares = 0.0
+        offered, explained, used, squares = self._offered, 0, 0, 0.0
         for one in self._recent:
-            offered, explained, used = offered + one.offered, explained + one.explained, used + one.used
-            squares += one.innovations
+            explained, used, squares = explained + one.explained, used + one.used, squares + one.innovations
         share = explained / offered if offered >= self.settings.min_offered else 1.0
         innovation = squares / used if used >= self.settings.min_offered else 0.0
         cones = max(used / len(self._recent), 1.0)  # cycles show the same ones, with the same errors

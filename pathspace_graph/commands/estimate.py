@@ -92,9 +92,9 @@ class Online:
 
     def _check_snapshots(self, estimator: str) -> None:
         """Raise a SettingsError where a snapshot is asked for that cannot be, before anything is mapped."""
-        asked = [f"--{name}" for name in ("save", "resume") if getattr(self, name) is not None]
-        if asked and estimator != DEFAULT:
-            raise SettingsError(f"{asked[0]}: expected --estimator {DEFAULT}, found {estimator}")
+        for name in ("save", "resume"):
+            if getattr(self, name) is not None and estimator != DEFAULT:
+                raise SettingsError(f"--{name}: expected --estimator {DEFAULT}, found {estimator}")
         if self.resume is not None and self.settings != MapperSettings():
             expected = "expected no settings, since the saved mapper has its own"
             raise SettingsError(f"--resume: {expected}, found some")

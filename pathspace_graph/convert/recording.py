@@ -153,11 +153,8 @@ def _cycles(
         raise InputError(file, f"{expected}, found them {stamps}")
     if not found:
         raise InputError(file, f"expected detections that can be used, found {len(t)} messages without any")
-    return tuple(in_vehicle_frame(stamp, join(scans), frames, noise, notes) for stamp, scans in found.items())
-
-
-def join(scans: list[Points]) -> Points:
-    return scans[0] if len(scans) == 1 else Points(*map(np.concatenate, zip(*scans, strict=True)))
+    joined = {stamp: Points(*map(np.concatenate, zip(*scans, strict=True))) for stamp, scans in found.items()}
+    return tuple(in_vehicle_frame(stamp, points, frames, noise, notes) for stamp, points in joined.items())
 
 
 def usable(points: Points, notes: Counter[str]) -> Points:

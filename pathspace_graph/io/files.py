@@ -46,9 +46,8 @@ _TOKEN: Final = "[0-9a-f]{8}"
 def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
     """Yield a temporary folder beside `target` that gets a manifest and takes its place on success.
 
-    An earlier result, known by the file `marker` in it, is kept as a numbered backup `NAME.~1~`; anything
-    else there but an empty folder is an OutputError. At each moment, even where the process is killed or the
-    power is cut, the target is the old or the new.
+    An earlier result, known by the file `marker`, is kept as a numbered backup `NAME.~1~`; anything else but
+    an empty folder is an OutputError. Even where the power is cut, the target is the old or the new.
     """
     final = _followed(target)
     with _placed(final, Path.mkdir, lambda: check_target(final, marker)) as temporary:

@@ -57,7 +57,6 @@ CALIBRATION: Final = ("scale", "bias")
 SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
 _TRUE_ERRORS: Final = {"calibration": CALIBRATION, "sensor": SENSOR, "noise": NOISE}
-_SENSOR_INFO: Final = ("range_max", "fov", "rate")
 
 MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
 MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to double precision below
@@ -184,7 +183,7 @@ def read_log(folder: Path | str) -> Log:
 def _read_log(folder: Path) -> Log:
     header = Header(folder / LOG_FILE)
     odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
-    sensor = [name for name in _SENSOR_INFO if name in header.section("sensor")]
+    sensor = [name for name in vars(SensorInfo()) if name in header.section("sensor")]
     truth = header.section("truth")
     true_errors = {
         name: np.array([header.numbers("truth", entry).item() for entry in entries])
@@ -260,13 +259,11 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
     return cycles
 
 
-def cycles_of(
-    t: Array, points_vehicle: Array, covariances: Array, labels: IntArray
-) -> tuple[Detections, ...]:
+def cycles_of(t: Array, points: Array, covariances: Array, labels: IntArray) -> tuple[Detections, ...]:
     """Return the perception cycles of detections (m,): neighbours with the same stamp (s) are one cycle."""
     starts = np.flatnonzero(np.diff(t, prepend=-np.inf))
     spans = [slice(a, b) for a, b in pairwise([*starts, len(t)])]
-    return tuple(Detections(float(t[s.start]), points_vehicle[s], covariances[s], labels[s]) for s in spans)
+    return tuple(Detections(float(t[s.start]), points[s], covariances[s], labels[s]) for s in spans)
 
 
 def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
@@ -312,13 +309,13 @@ def _associations(table: Table, detection_count: int, cone_count: int) -> IntArr
 
 
 def _sections(log: Log) -> dict[str, dict[str, Any]]:
-    sensor, truth = {name: getattr(log.sensor, name) for name in _SENSOR_INFO}, dict[str, Any]()
+    truth = dict[str, Any]()
     for name, entries in _TRUE_ERRORS.items():
         values = getattr(log.truth, name, None)
         truth |= {} if values is None else dict(zip(entries, values.tolist(), strict=True))
     return {
         "odometry": {"sigma": [float(value) for value in log.odometry_sigma]},
-        "sensor": {name: float(value) for name, value in sensor.items() if value is not None},
+        "sensor": {name: float(value) for name, value in vars(log.sensor).items() if value is not None},
         **noise_sections(log.odometry_stated, log.detections_stated, log.measured),
         "source": {toml_text(key): value for key, value in log.source.items()},
         **({"truth": truth} if truth else {}),

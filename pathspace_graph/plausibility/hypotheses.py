@@ -165,7 +165,6 @@ class Hypothesis:
 
     @property
     def stands(self) -> tuple[float, bool]:
-        """Return how the frame of the detections stands in that of the vehicle."""
         return self.turn, self.mirrored
 
     @property

@@ -134,8 +134,8 @@ def one_clock(log: Log) -> list[Hint]:
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
     typical = _median(np.concatenate([np.zeros(0), *(np.hypot(*c.points_vehicle.T) for c in log.cycles)]))
     if typical > FARTHEST:
-        fitting = [unit for unit in LENGTHS if typical * unit <= FAR] or [min(LENGTHS)]
-        unit, what = fitting[0], f"are in {LENGTHS[fitting[0]]}, not in metres"
+        unit = next((unit for unit in LENGTHS if typical * unit <= FAR), min(LENGTHS))
+        what = f"are in {LENGTHS[unit]}, not in metres"
     elif 0.0 < typical < NEAREST:
         unit, what = 1e3, "were divided by 1000 although they were in metres"
     else:
@@ -250,10 +250,9 @@ def _of_odometry(meaning: Hypothesis, figures: dict[str, float]) -> list[Hint]:
 
 def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
     late = hypotheses.best_lateness(trials, best)
-    figures = far_better(late, best)
+    figures, seconds = far_better(late, best), late.hypothesis.late
     if figures is None:
         return best, []
-    seconds = late.hypothesis.late
     return late, [told("late", seconds=abs(seconds), way="late" if seconds > 0.0 else "early", **figures)]
 
 
@@ -281,12 +280,10 @@ def _placed(mounting: Mounting) -> list[Hint]:
 
 def _certain(mounting: Mounting) -> list[Hint]:
     scatter, claimed = mounting.scatter, mounting.claimed
-    if claimed * CLAIMED_LESS < scatter:
-        unit = "another unit"
-    elif claimed > CLAIMED_MORE * max(scatter, LEAST_SCATTER):
-        unit = "mm^2 or cm^2, not in m^2"
-    else:
+    too_large = claimed > CLAIMED_MORE * max(scatter, LEAST_SCATTER)
+    if not too_large and claimed * CLAIMED_LESS >= scatter:
         return []
+    unit = "mm^2 or cm^2, not in m^2" if too_large else "another unit"
     return [told("covariances", scatter=scatter, claimed=claimed, unit=unit)]
 
 
