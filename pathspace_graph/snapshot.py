@@ -11,9 +11,8 @@ node is one of
     ["number", value]                  a number of NumPy's, by its array
     [type, value, ...]                 of another type of `TYPES`, by the parts that it is made of
 
-The walk needs no list of what to save, so no attribute is forgotten. What is held twice is held twice
-afterwards, circles through objects stay circles, and arrays that overlap in memory overlap again. No code
-comes from the file: an object is of a class of the rooms below, and made without its constructor.
+No attribute is forgotten; what is held twice, circles, and overlaps in memory are kept. No code comes from
+the file: an object is of a class of the rooms below, and made without its constructor.
 """
 
 import dis

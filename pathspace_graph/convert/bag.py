@@ -253,7 +253,7 @@ class Bag:
         connections = self._connections(STATIC)
         if not connections:
             return []
-        _, _, messages = self._read(connections, lambda message: message.transforms, "transforms")
+        _, _, messages = self._read(connections, lambda message: list(message.transforms), "transforms")
         return [one for message in messages for one in message]
 
     def _connections(self, topic: str | None) -> list[Any]:
