@@ -63,15 +63,19 @@ BATCH: Final[dict[str, MakeBatch]] = {
 }
 
 
-def _check(known: Mapping[str, Any], kind: str, name: str) -> None:
+def check_online(name: str) -> None:
     """Raise a SettingsError that names the known estimators, unless the name is one of them."""
+    _check(name, ONLINE, "online")
+
+
+def check_batch(name: str) -> None:
+    _check(name, BATCH, "batch")
+
+
+def _check(name: str, known: Mapping[str, Any], kind: str) -> None:
     if name not in known:
         names = ", ".join(sorted(known))
         raise SettingsError(f"--estimator: expected a known {kind} estimator ({names}), found '{name}'")
-
-
-check_online: Final = partial(_check, ONLINE, "online")
-check_batch: Final = partial(_check, BATCH, "batch")
 
 
 def for_map(name: str, kind: MapKind) -> str:
