@@ -68,8 +68,10 @@ class Odometry(Brief):
 
     LENGTHS: ClassVar = {"twist": POSE}
 
-    t: Array  # stamps (N,) in s, strictly increasing
-    twist: Array  # twists [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame
+    t: Array
+    """Stamps (N,) in s, strictly increasing."""
+    twist: Array
+    """Twists [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame."""
 
     def between(self, start: float, end: float) -> Odometry:
         """Return the twists in force from `start` (s) to `end` (s); before the first row nothing moves."""
@@ -90,10 +92,14 @@ class Detections(Brief):
 
     LENGTHS: ClassVar = {"points_vehicle": 1, "covariances": 2}
 
-    t: float  # stamp of the cycle, s
-    points_vehicle: Array  # detected points (m, 2) in m, vehicle frame
-    covariances: Array  # their covariances (m, 2, 2) in m^2, vehicle frame
-    labels: IntArray  # their labels (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE
+    t: float
+    """Stamp of the cycle, s."""
+    points_vehicle: Array
+    """Detected points (m, 2) in m, vehicle frame."""
+    covariances: Array
+    """Their covariances (m, 2, 2) in m^2, vehicle frame."""
+    labels: IntArray
+    """Their labels (m,): LEFT, RIGHT, UNKNOWN, ORANGE or BIG_ORANGE."""
 
     def where(self, chosen: BoolArray) -> Detections:
         if chosen.all():
@@ -107,9 +113,12 @@ class SensorInfo:
 
     LENGTHS: ClassVar = {"range_max": 1}
 
-    range_max: float | None = None  # greatest range, m
-    fov: float | None = None  # field of view, the whole angle, rad
-    rate: float | None = None  # perception cycles per second, Hz
+    range_max: float | None = None
+    """Greatest range, m."""
+    fov: float | None = None
+    """Field of view, the whole angle, rad."""
+    rate: float | None = None
+    """Perception cycles per second, Hz."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,12 +127,18 @@ class Truth(Brief):
 
     LENGTHS: ClassVar = {"poses": POSE, "cones": 1, "sensor": (0, 1, 0, 0, 1), "noise": (1, 1, 0, 0, 0, 0)}
 
-    pose_t: Array  # stamps of the true poses (N,) in s
-    poses: Array  # true poses [x, y, theta] (N, 3) in m, m, rad, map frame
-    cones: Array  # true cones (M, 2) in m, map frame
-    cone_labels: IntArray  # their labels (M,)
-    associations: IntArray | None = None  # true cone of each detection in file order (R,), -1 for none
-    calibration: Array | None = None  # (2,) scale error of the speeds (-), bias of the yaw rate (rad/s)
+    pose_t: Array
+    """Stamps of the true poses (N,) in s."""
+    poses: Array
+    """True poses [x, y, theta] (N, 3) in m, m, rad, map frame."""
+    cones: Array
+    """True cones (M, 2) in m, map frame."""
+    cone_labels: IntArray
+    """Their labels (M,)."""
+    associations: IntArray | None = None
+    """Index of the true cone of each detection in file order (R,), -1 for none."""
+    calibration: Array | None = None
+    """Calibration of the odometry (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
     sensor: Array | None = None
     """Constant errors of the sensor (5,): yaw (rad), lateral offset (m), age of detections at their stamps
     (s), scale error (-) and bias (m) of ranges."""
@@ -143,13 +158,19 @@ class Log:
     }
 
     odometry: Odometry
-    cycles: tuple[Detections, ...]  # perception cycles in order of time
-    odometry_sigma: Array  # (3,) of a twist in m/s, m/s, rad/s, white from sample to sample
+    cycles: tuple[Detections, ...]
+    """Perception cycles in order of time."""
+    odometry_sigma: Array
+    """Standard deviations (3,) of a twist in m/s, m/s, rad/s, white from sample to sample."""
     sensor: SensorInfo = SensorInfo()
-    source: Mapping[str, str] = field(default_factory=dict)  # free texts that say where the log comes from
-    odometry_stated: bool = True  # whether its noise was stated, and not measured or assumed
-    detections_stated: bool = True  # whether somebody has stated the covariances of the detections
-    measured: MeasuredNoise | None = None  # noise and constant errors of the sensor, by the readings
+    source: Mapping[str, str] = field(default_factory=dict)
+    """Free texts that say where the log comes from."""
+    odometry_stated: bool = True
+    """Whether somebody has stated the noise of the odometry; otherwise it was measured or assumed."""
+    detections_stated: bool = True
+    """Whether somebody has stated the covariances of the detections."""
+    measured: MeasuredNoise | None = None
+    """Noise and constant errors of the sensor, as the readings themselves show them."""
     truth: Truth | None = None
 
     def __repr__(self) -> str:

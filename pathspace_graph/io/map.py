@@ -37,9 +37,12 @@ class SplineBoundary(Brief):
 
     LENGTHS: ClassVar = {"spline": 0, "covariance": 2, "confirmed_until": 1}
 
-    spline: BSpline  # curve in the map frame, in the direction of travel
-    covariance: Array  # (2m, 2m) in m^2 of the distinct control points, in the order x0, y0, x1 and so on
-    confirmed_until: float = math.inf  # parameter beyond which the curve is tentative
+    spline: BSpline
+    """Curve in the map frame, in the direction of travel."""
+    covariance: Array
+    """Joint covariance (2m, 2m) in m^2 of the distinct control points, in the order x0, y0, x1 and so on."""
+    confirmed_until: float = math.inf
+    """Parameter up to which the curve is confirmed; beyond, it is tentative, and may be taken back."""
 
     @property
     def size(self) -> int:
@@ -53,8 +56,10 @@ class PointBoundary(Brief):
 
     LENGTHS: ClassVar = {"points": 1, "covariance": 2}
 
-    points: Array  # points (m, 2) in m, map frame, in no particular order
-    covariance: Array  # joint covariance (2m, 2m) in m^2 of the points, in the order x0, y0, x1 and so on
+    points: Array
+    """Points (m, 2) in m, map frame, in no particular order."""
+    covariance: Array
+    """Joint covariance (2m, 2m) in m^2 of the points, in the order x0, y0, x1 and so on."""
 
     @property
     def size(self) -> int:
@@ -86,9 +91,12 @@ class Map:
 
     LENGTHS: ClassVar = {"boundaries": 0, "joint_covariance": 2, "points": 0}
 
-    closed: bool  # whether the track was found to be a loop
-    boundaries: Mapping[Any, MapBoundary]  # those that could be mapped, by label or its name
-    joint_covariance: Array | None = None  # (2m, 2m) in m^2 of all boundaries, in the order of their labels
+    closed: bool
+    """Whether the track was found to be a loop."""
+    boundaries: Mapping[Any, MapBoundary]
+    """Boundaries by label, LEFT or RIGHT, or by its name; one that could not be mapped is absent."""
+    joint_covariance: Array | None = None
+    """Joint covariance (2m, 2m) in m^2 of the points of all boundaries, in the order of their labels."""
     points: Mapping[int, PointBoundary] = field(default_factory=dict)
     """Cones of no boundary by their label, ORANGE or BIG_ORANGE, each label with one covariance."""
 

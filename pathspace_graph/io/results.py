@@ -81,23 +81,39 @@ class CycleRecord:
 
     LENGTHS: ClassVar = {"jump": POSE, "notice": 1, "reason": 1}
 
-    cycle: int  # number of the perception cycle, from 0
-    t: float  # stamp of the cycle, s
-    seconds: float  # wall time of the whole update, s
-    size_left: int  # number of control points or landmarks
+    cycle: int
+    """Number of the perception cycle, from 0."""
+    t: float
+    """Stamp of the cycle, s."""
+    seconds: float
+    """Wall time of the whole update, s."""
+    size_left: int
     size_right: int
-    readings: int  # number of the cycle's detections that were used
-    lap: int  # lap of the estimated trajectory, from 1
-    stages: Mapping[str, float] = field(default_factory=dict)  # time of each stage of the update, s
-    closed: bool = False  # whether the loop has closed by the end of the cycle
-    jump: tuple[float, float, float] | None = None  # of the newest pose [m, m, rad], if the map was replaced
-    notice: str = ""  # what a user should know of the cycle, if anything
-    offered: int = 0  # number of the cycle's detections
-    health: str = ""  # good, degraded or lost; empty where the estimator does not say it
-    reason: str = ""  # why the estimate is not good
-    dropped: int = 0  # number of the cycle's detections that were dropped as impossible
-    late: bool = False  # whether the cycle came after a newer one, and was used at its own time
-    refused: int = 0  # number of cycles that were refused just before this one
+    """Number of control points or landmarks of the right boundary, as of the left one."""
+    readings: int
+    """Number of the cycle's detections that were used."""
+    lap: int
+    """Lap of the estimated trajectory, from 1."""
+    stages: Mapping[str, float] = field(default_factory=dict)
+    """Time of each stage of the update, s, by its name."""
+    closed: bool = False
+    """Whether the loop has closed by the end of the cycle."""
+    jump: tuple[float, float, float] | None = None
+    """Jump of the newest pose [m, m, rad], map frame, where the map was replaced in this cycle."""
+    notice: str = ""
+    """What a user should know of the cycle, if anything."""
+    offered: int = 0
+    """Number of the cycle's detections."""
+    health: str = ""
+    """Good, degraded or lost; empty where the estimator does not say it."""
+    reason: str = ""
+    """Why the estimate is not good."""
+    dropped: int = 0
+    """Number of the cycle's detections that were dropped as impossible."""
+    late: bool = False
+    """Whether the cycle came after a newer one, and was used at its own time."""
+    refused: int = 0
+    """Number of cycles that were refused just before this one."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -107,12 +123,16 @@ class VehicleState(Brief):
     LENGTHS: ClassVar = {"pose": POSE, "sensor": (0, 1, 0, 0, 1)}
     COVARIANCES: ClassVar = {"covariance": (*POSE, 0, 0), "sensor_covariance": (0, 1, 0, 0, 1)}
 
-    pose: Array  # pose [x, y, theta] (3,) in m and rad, map frame; theta isn't wrapped
-    calibration: Array  # calibration (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)
-    covariance: Array  # joint covariance (5, 5) of [pose | calibration]
+    pose: Array
+    """Pose [x, y, theta] (3,) in m and rad, map frame; theta isn't wrapped."""
+    calibration: Array
+    """Calibration (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
+    covariance: Array
+    """Joint covariance (5, 5) of [pose | calibration]."""
     sensor: Array = field(default_factory=lambda: np.zeros(0))
     """Calibration of the sensor (5,), `factors.sensor:SENSOR`, or (0,) where there is none."""
-    sensor_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (5, 5), or (0, 0)
+    sensor_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """Its covariance (5, 5), or (0, 0)."""
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
@@ -139,8 +159,10 @@ class VehicleState(Brief):
 class LapBatches:
     """Ends of the batches that another process solves while an online estimator goes on."""
 
-    ends: tuple[int, ...]  # cycles in which the result of a batch was taken, or the batch was given up
-    late: int  # cycles by which the slowest batch is late in a vehicle, by its wall time
+    ends: tuple[int, ...]
+    """Cycles in which the result of a batch was taken, or the batch was given up."""
+    late: int
+    """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +173,10 @@ class RunNoise:
 
     odometry: NoiseSource
     detections: NoiseSource
-    measured: MeasuredNoise | None = None  # what was measured in the drive, where anything was
-    size: Literal["odometry", "ranges"] | None = None  # whose size the map has, where the two disagree
+    measured: MeasuredNoise | None = None
+    """What was measured in the drive, where anything was."""
+    size: Literal["odometry", "ranges"] | None = None
+    """Ranges and speeds disagree, and the size of the map is that of these; None where they agree."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -164,26 +188,41 @@ class RunResult:
         **{"trajectory": POSE, "smoothed": POSE, "reach": (1, 2, 0), "scale": 1},
     }
 
-    estimator: str  # name of the estimator (FORMATS)
-    settings: dict[str, Any]  # all settings of the estimator, as plain values
-    map: Map  # map at the end of the log
-    trajectory_t: Array  # stamps of the perception cycles (n,) in s
-    trajectory: Array  # poses [x, y, theta] (n, 3), map frame; of an online estimator as they stood then
+    estimator: str
+    """Name of the estimator (FORMATS)."""
+    settings: dict[str, Any]
+    """All settings of the estimator, as plain values."""
+    map: Map
+    """Map at the end of the log."""
+    trajectory_t: Array
+    """Stamps of the perception cycles (n,) in s."""
+    trajectory: Array
+    """Poses [x, y, theta] (n, 3), map frame; of an online estimator as they stood at that cycle."""
     cycles: tuple[CycleRecord, ...]
-    laps: int  # complete laps of the estimated trajectory, with a last one that ends just before the line
-    lap_maps: tuple[tuple[int, Map], ...] = ()  # number of each complete lap, and the map at its end
-    snapshots: tuple[Map, ...] = ()  # map as it stood at each of the times that were asked for
-    vehicle: VehicleState | None = None  # at the end of the log, where the estimator gives it
+    laps: int
+    """Complete laps of the estimated trajectory, with a last one that ends just before the line."""
+    lap_maps: tuple[tuple[int, Map], ...] = ()
+    """Number of each complete lap, and the map as it stood at its end."""
+    snapshots: tuple[Map, ...] = ()
+    """Map as it stood at each of the times that were asked for."""
+    vehicle: VehicleState | None = None
+    """State of the vehicle at the end of the log, where the estimator gives it."""
     reach: Array | None = None
     """Row of each cycle (n, 3), if an observer knew the truth: the reach ahead of the vehicle, m, the sum of
     squared distances of the true cones on that stretch, m^2, and their number. The reach is NaN where the
     cycle doesn't count."""
-    observing: float = 0.0  # wall time of the observers, s, which is no part of the estimator's
-    batches: LapBatches | None = None  # ends of the batches of the lap, where the estimator has such
-    waited: float = 0.0  # wall time for which the run waited for batches between cycles, s
-    noise: RunNoise | None = None  # noise that was used, where the estimator says it
-    scale: float = 1.0  # size of the scene by that of a Formula Student track
-    smoothed: Array | None = None  # poses (n, 3), with earlier ones corrected when the loop closed
+    observing: float = 0.0
+    """Wall time of the observers, s, which is no part of the estimator's."""
+    batches: LapBatches | None = None
+    """Ends of the batches of the lap, where the estimator has such."""
+    waited: float = 0.0
+    """Wall time for which the run waited for batches between cycles, s."""
+    noise: RunNoise | None = None
+    """Noise that was used, where the estimator says it."""
+    scale: float = 1.0
+    """Size of the scene by that of a Formula Student track."""
+    smoothed: Array | None = None
+    """Poses (n, 3) of an online estimator whose earlier ones were corrected when the loop closed."""
 
     def __repr__(self) -> str:
         name = f"{type(self).__name__}({self.estimator}: {len(self.cycles)} cycles, {self.laps} laps"
@@ -209,8 +248,10 @@ class RunResult:
 class BatchRun(RunResult):
     """Result of a batch estimator; its maps of the laps are all the one of the whole log."""
 
-    converged: bool = True  # whether the optimization ended at an optimum
-    cost: float = nan  # cost at its end, half the sum of squared whitened residuals, where it is known
+    converged: bool = True
+    """Whether the optimization ended at an optimum."""
+    cost: float = nan
+    """Cost at its end, half the sum of squared whitened residuals, where it is known."""
 
 
 def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:

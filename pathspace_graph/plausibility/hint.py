@@ -13,10 +13,13 @@ class Hint:
 
     LENGTHS: ClassVar = {"found": 1, "likely": 1, "advice": 1}
 
-    cause: str  # kind of the mistake, which begins its row in `TABLE`
+    cause: str
+    """Kind of the mistake, which begins its row in `TABLE`."""
     file: str
-    columns: str  # columns of the file, in words
-    found: str  # what was found, with its figure
+    columns: str
+    """Columns of the file, in words."""
+    found: str
+    """What was found, with its figure."""
     likely: str
     advice: str
 
