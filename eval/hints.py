@@ -40,12 +40,10 @@ from pathspace_graph.sim.track import Track
 
 Row = dict[str, Any]
 
-MARKER: Final = "hints.csv"
-"""File of the results, by which their folder is recognized."""
-AS_SIMULATED: Final = "as simulated"
-"""Kind of good logs with nothing unusual."""
+MARKER: Final = "hints.csv"  # file of the results, by which their folder is recognized
+AS_SIMULATED: Final = "as simulated"  # kind of good logs with nothing unusual
 CONFIDENCE: Final = 0.95
-CAUSES: Final = {
+CAUSES: Final = {  # causes that tell a mistake, by the longest beginning of its name
     "positions": ("positions",),
     "speeds": ("speeds",),
     "all lengths": ("positions", "speeds"),
@@ -61,7 +59,6 @@ CAUSES: Final = {
     "covariances": ("covariances",),
     "all labels": ("labels",),
 }
-"""A mistake whose name begins so is told if one of these causes is named; the longest beginning counts."""
 
 
 # --- good logs -------------------------------------------------------------------------------------------
@@ -228,8 +225,7 @@ class HintStudy:
         return table
 
 
-HintCell = tuple[HintStudy, Track, int, str]
-"""Logs of one kind of one drive: the study, the track, the seed and the kind."""
+HintCell = tuple[HintStudy, Track, int, str]  # study, track, seed and kind of good log
 
 
 def judge(cell: HintCell) -> list[Row]:

@@ -31,22 +31,18 @@ from .metrics.reference import aligned_distance
 from .metrics.summary import summarize
 from .views import Figure, View
 
-RUNS: Final = {
+RUNS: Final = {  # estimator of each run
     "online": registry.DEFAULT,
     "batch": registry.DEFAULT_BATCH,
     "landmarks": "landmark-fixed-lag",
 }
-"""Estimator of each run."""
-FIRST, LAST = 25.0, 14.0
-"""Lengths of the beginning of a drive, and of its end that is registered on it (m)."""
-LEAST: Final = 6
-"""Least number of cones of a registration."""
-ERRORS: Final = {
+FIRST, LAST = 25.0, 14.0  # lengths of the beginning of a drive, and of its end that is registered on it (m)
+LEAST: Final = 6  # least number of cones of a registration
+ERRORS: Final = {  # errors of the sensor in the table, with titles and units
     "latency": ("latency [ms]", 1e3),
     "yaw": ("yaw [°]", 180.0 / np.pi),
     "range_scale": ("scale [%]", 100.0),
 }
-"""Errors of the sensor in the table, in these units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +52,8 @@ class RealDrive:
     name: str
     log: Log
     runs: dict[str, RunResult]
-    dead_reckoned: Array
-    """Last pose (3,) by odometry alone."""
-    registered: Array | None
-    """Last pose (3,) by registration, where the drive comes back to its beginning."""
+    dead_reckoned: Array  # last pose (3,) by odometry alone
+    registered: Array | None  # last pose (3,) by registration, where the drive comes back to its beginning
 
     def off(self, pose: Array) -> tuple[float, float]:
         """Return how far (m) and by what angle (degrees) a last pose (3,) is from that by registration."""

@@ -36,9 +36,8 @@ FORMAT: Final = "pathspace-figures/1"
 FILE: Final = "figures.json"
 ABLATIONS: Final = ("gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
 """Studies of parts of the method, driven by one estimator on the generated tracks for two laps."""
-ONE_SEED: Final = ("gauge", "robust")
-"""Those with so many variants that they are driven with one seed."""
-PAGES: Final = {
+ONE_SEED: Final = ("gauge", "robust")  # those with so many variants that they are driven with one seed
+PAGES: Final = {  # tables of each page, from the root of the project
     "README.md": ("readme-accuracy", "readme-compared", "readme-speed", "readme-real"),
     "docs/results.md": (
         *("results-speed", "results-tracks", "results-laps", "results-compared", "results-scaling"),
@@ -49,10 +48,8 @@ PAGES: Final = {
     "docs/reliability.md": ("faults", "recovery", "hints"),
     "docs/ablations.md": ("centerline", *ABLATIONS),
 }
-"""Tables of each page, from the root of the project."""
-GENERATED: Final = (0, 1, 2)
-"""Seeds of the generated tracks, also of the benchmark."""
-SPEED: Final = {
+GENERATED: Final = (0, 1, 2)  # seeds of the generated tracks, also of the benchmark
+SPEED: Final = {  # figures of the benchmark, each with its label
     "mean_by_isam2": "mean update by that of GTSAM's `ISAM2` on landmarks, given every association",
     "p99_by_isam2": "99th percentile by that of `ISAM2`",
     "mean_by_landmark": "mean update by that of `landmark-fixed-lag`",
@@ -62,13 +59,11 @@ SPEED: Final = {
     "swap": "the update that swaps the map [ms]",
     "solve": "the batch of the open lap, in its own process [s]",
 }
-"""Figures of the benchmark, each with its label."""
 README: Final = ("rmse", "missed", "reach_median")
-COMPARED: Final = (
+COMPARED: Final = (  # metrics of the wider comparison
     *("missed_2m", "missed_1m", "rmse_capped", "mapped_to_truth", "truth_to_mapped", "ghost_landmarks"),
     *("ghost_metres", "along", "across", "nees", "inside", "closed", "bytes", "bytes_covariance"),
 )
-"""Metrics of the wider comparison."""
 CLOSING: Final = ("rmse", "rmse_by_batch", "turn_from_batch", "turn_nees", "inside", "ate")
 """Metrics by which a closed map is held against that of the batch."""
 ENDURANCE: Final = ("rmse", "inside", "nees", "ate")
@@ -85,11 +80,9 @@ class MeasuredTable:
     """A table of figures, and how they were measured."""
 
     command: str
-    commit: str
-    """Commit of the sources, where that was known."""
+    commit: str  # commit of the sources, where that was known
     date: str
-    sources: str
-    """Digest of the sources of the estimators."""
+    sources: str  # digest of the sources of the estimators
     header: tuple[str, ...]
     rows: Rows
 
@@ -122,15 +115,11 @@ Views = dict[str, View]
 class Plan:
     """What is driven; each experiment keeps its runs in a folder, and returns the tables that it measures."""
 
-    quick: bool = False
-    """Drive little, to see that everything works."""
-    tracks: tuple[Path, ...] = ()
-    """Folders of track files that are driven beside the generated tracks."""
-    real: tuple[Path, ...] = ()
-    """Folders of logs of a real car."""
+    quick: bool = False  # drive little, to see that everything works
+    tracks: tuple[Path, ...] = ()  # folders of track files that are driven beside the generated tracks
+    real: tuple[Path, ...] = ()  # folders of logs of a real car
     jobs: int = 1
-    on_cell: Callable[[int, int], None] | None = None
-    """Observer of the progress of a study."""
+    on_cell: Callable[[int, int], None] | None = None  # observer of the progress of a study
 
     def accuracy(self, folder: Path) -> Views:
         """Drive all estimators on all tracks."""

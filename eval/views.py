@@ -16,12 +16,11 @@ from .metrics.metric import METRICS
 
 ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
 ONLINE, BATCH, LANDMARKS = ESTIMATORS[:3]
-STATED: Final = {DEFAULT: "stated"}
-"""Name of the default noise, since a simulated log states its own."""
+STATED: Final = {DEFAULT: "stated"}  # name of the default noise, since a simulated log states its own
 TITLES: Final = {"ate": "trajectory error [m]", "nees": "NEES of the map"}
 TITLES_CAMERA: Final = TITLES | {"turn_nees": "NEES of the turn", "told_degraded": "degraded [%]"}
 """Headings in tables that are short of room."""
-FAULTS: Final = {
+FAULTS: Final = {  # columns of the table of faults: value and digits
     "rmse by clean": ("ratio_mean", 2),
     "least": ("ratio_min", 2),
     "most": ("ratio_max", 2),
@@ -32,20 +31,17 @@ FAULTS: Final = {
     "called degraded [%]": ("told_degraded", 1),
     "said so [%]": ("told", 0),
 }
-"""Columns of the table of faults, each with its value and digits."""
-RECOVERY: Final = {
+RECOVERY: Final = {  # how long a vehicle is over a metre off after closing: value and digits
     "longest time [s]": ("astray_time", 1),
     "longest way [m]": ("astray_way", 0),
 }
-"""Columns of the table of how long a vehicle is over a metre off, once the loop has closed."""
 
 
 @dataclass(frozen=True)
 class Figure:
     """A measured value, with half the width of its 95 % interval over drives or runs."""
 
-    value: float | None
-    """Value in the table's unit; None where there is none."""
+    value: float | None  # value in the table's unit; None where there is none
     half: float | None = None
     digits: int = 3
 
@@ -71,10 +67,8 @@ class Figure:
         return f"{self.value:.{self.digits}f}{half}"
 
 
-Rows = tuple[tuple[str, tuple[Figure, ...]], ...]
-"""Label and figures of each row."""
-View = tuple[tuple[str, ...], Rows]
-"""Header and rows of a table."""
+Rows = tuple[tuple[str, tuple[Figure, ...]], ...]  # label and figures of each row
+View = tuple[tuple[str, ...], Rows]  # header and rows of a table
 
 
 def lap_columns(frame: pd.DataFrame, laps: Sequence[int], keys: Sequence[str]) -> View:

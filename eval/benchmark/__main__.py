@@ -26,8 +26,7 @@ from .measurement import (
     write_baseline,
 )
 
-WORSE, BAD_INPUT = 1, 2
-"""Exit codes where a figure is worse than the baseline, and where a file can't be read or written."""
+WORSE, BAD_INPUT = 1, 2  # exit codes: a figure is worse than the baseline, a bad file
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,13 +39,10 @@ from pathspace_graph.sim.track_generator import generate_track
 
 FORMAT: Final = "pathspace-benchmark-baseline/1"
 BASELINE: Final = Path(__file__).with_name("baseline.json")
-AHEAD: Final = 20.0
-"""Distance ahead (m) at which the track is looked at after every cycle, as a controller does."""
-RIVAL: Final = "landmark-fixed-lag"
-"""Estimator that gets the same cycles in turn."""
-WARM_UP: Final = 50
-"""Number of cycles after which the window is full, before which the means do not begin."""
-BOUNDS: Final = {
+AHEAD: Final = 20.0  # distance ahead (m) at which the track is looked at each cycle, as a controller does
+RIVAL: Final = "landmark-fixed-lag"  # estimator that gets the same cycles in turn
+WARM_UP: Final = 50  # number of cycles after which the window is full, before which the means do not begin
+BOUNDS: Final = {  # largest value allowed of a figure, in its unit
     "p99": 10.0,  # a mean cycle of 3 ms was measured when it was chosen
     "last_lap_by_lap_2": 1.1,
     "closing": 100.0,
@@ -55,14 +52,12 @@ BOUNDS: Final = {
     "ahead_open": 1.0,
     "ahead_closed": 1.0,
 }
-"""Largest value allowed of a figure, in its unit."""
-TOLERANCES: Final = {
+TOLERANCES: Final = {  # share by which a ratio may be larger than its baseline
     # two means over the whole run
     **dict.fromkeys(("mean_by_landmark", "mean_by_isam2"), 0.2),
     "last_lap_by_lap_2": 0.15,
     **dict.fromkeys(("p99_by_mean", "closing_by_mean"), 0.5),  # tails, single cycles
 }
-"""Share by which a ratio may be larger than its baseline; those of the solver's delay have none."""
 
 
 # --- figures and their baseline --------------------------------------------------------------------------
@@ -73,14 +68,10 @@ class Metric:
     """One figure of a run, of which less is better."""
 
     key: str
-    value: float
-    """Value; NaN where the run was too short for the figure."""
-    unit: str
-    """Unit of the value; empty for a ratio."""
-    bound: float | None = None
-    """Largest value allowed, if any value is not."""
-    tolerance: float | None = None
-    """Share by which the figure may be larger than its baseline, if there is one."""
+    value: float  # value; NaN where the run was too short for the figure
+    unit: str  # unit of the value; empty for a ratio
+    bound: float | None = None  # largest value allowed, if any value is not
+    tolerance: float | None = None  # share by which it may be larger than its baseline, if there is one
 
     @property
     def holds(self) -> bool:
@@ -92,8 +83,7 @@ class Metric:
         return baseline is not None and not self.value <= baseline * (1.0 + (self.tolerance or 0.0))
 
 
-Compared = tuple[Metric, float | None]
-"""A figure of this run, and that of the baseline."""
+Compared = tuple[Metric, float | None]  # a figure of this run, and that of the baseline
 
 
 def ratios(figures: Iterable[Metric]) -> dict[str, Metric]:
@@ -238,18 +228,12 @@ class ToldLandmarks:
 class Measurement:
     """Result of one run."""
 
-    cycles: Sequence[CycleRecord]
-    """Cycles, with processor times in place of wall times."""
-    laps: int
-    """Number of complete laps."""
-    rival: Sequence[float]
-    """Time of each update of the landmark graph (s)."""
-    isam2: Sequence[float]
-    """Time of each update of ISAM2 (s)."""
-    solve: float = math.nan
-    """Time of the batch of the open lap in its own process (s)."""
-    ahead: Sequence[float] = ()
-    """Time of each look at the track ahead (s), after each cycle."""
+    cycles: Sequence[CycleRecord]  # cycles, with processor times in place of wall times
+    laps: int  # number of complete laps
+    rival: Sequence[float]  # time of each update of the landmark graph (s)
+    isam2: Sequence[float]  # time of each update of ISAM2 (s)
+    solve: float = math.nan  # time of the batch of the open lap in its own process (s)
+    ahead: Sequence[float] = ()  # time of each look at the track ahead (s), after each cycle
 
     @property
     def closing(self) -> int | None:

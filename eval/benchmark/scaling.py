@@ -39,27 +39,20 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .roads import Drives, ScalingSettings, first_cycles
 
-MARKER: Final = "scaling.json"
-"""File by which a folder of results is known."""
-COMPARED_AT: Final = 200.0
-"""Number of cones at which estimators are compared, that of an ordinary track."""
-Sweep = Literal["cones", "readings", "laps"]
-"""What is varied: the cones seen, the detections of an update (readings), or the lap."""
+MARKER: Final = "scaling.json"  # file by which a folder of results is known
+COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track
+Sweep = Literal["cones", "readings", "laps"]  # cones seen, detections of an update, or lap
 CONES: Final[Sweep] = "cones"
 READINGS: Final[Sweep] = "readings"
 LAPS: Final[Sweep] = "laps"
-Logs = Sequence[tuple[Log, int, Array]]
-"""Log, number of detections where that is varied, and the abscissa of each cycle; NaN doesn't count."""
-_HEIGHT: Final = 3.1
-"""Height of a figure (in)."""
-_TITLES: Final[dict[Sweep, tuple[str, str]]] = {
+Logs = Sequence[tuple[Log, int, Array]]  # log, number of detections if varied, abscissae (NaN doesn't count)
+_HEIGHT: Final = 3.1  # height of a figure (in)
+_TITLES: Final[dict[Sweep, tuple[str, str]]] = {  # axis title and title of each panel
     CONES: ("cones seen", "(a) map size"),
     READINGS: ("detections per update", "(b) detections"),
     LAPS: ("lap", "time per lap on a closed road"),
 }
-"""Axis title and title of each panel."""
-JUDGED: Final = 10
-"""Number of updates whose mean is compared with the budget."""
+JUDGED: Final = 10  # number of updates whose mean is compared with the budget
 
 
 # --- lanes -----------------------------------------------------------------------------------------------
@@ -71,15 +64,11 @@ class Lane:
 
     estimator: str
     log: Log
-    at: Array = field(default_factory=lambda: np.zeros(0))
-    """Abscissa (n,) of each cycle of the log; NaN doesn't count."""
-    readings: int = 0
-    """Number of detections in each cycle of the log, where they are varied."""
-    seconds: list[float] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
-    """Processor time of each update (s), and size of the map after it."""
-    stopped: str = ""
-    """Why it did not reach the log's end; empty where it did."""
+    at: Array = field(default_factory=lambda: np.zeros(0))  # (n,) abscissa of each cycle; NaN doesn't count
+    readings: int = 0  # number of detections in each cycle of the log, where they are varied
+    seconds: list[float] = field(default_factory=list)  # processor time of each update (s)
+    sizes: list[int] = field(default_factory=list)  # size of the map after each update
+    stopped: str = ""  # why it did not reach the log's end; empty where it did
 
     def updates(self, settings: MapperSettings, budget: float) -> Iterator[None]:
         """Do an update at each step, until the log ends or the lane is stopped."""
@@ -143,12 +132,9 @@ class Scaling:
 
     settings: ScalingSettings
     mapper: dict[str, Any]
-    points: pd.DataFrame
-    """Row for each mean of some updates, as `binned` returns them."""
-    slopes: pd.DataFrame
-    """Row for each sweep and estimator, as `fit_slope` returns it."""
-    memory: dict[str, float]
-    """Most memory (MB) that Python and numpy held while each estimator mapped the first lap."""
+    points: pd.DataFrame  # row for each mean of some updates, as `binned` returns them
+    slopes: pd.DataFrame  # row for each sweep and estimator, as `fit_slope` returns it
+    memory: dict[str, float]  # peak (MB) of Python and numpy, by each estimator's first lap
 
     def of(self, sweep: Sweep, estimator: str) -> pd.DataFrame:
         return self.points[(self.points["sweep"] == sweep) & (self.points["estimator"] == estimator)]

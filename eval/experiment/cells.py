@@ -34,26 +34,19 @@ from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import generate_track
 
 TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
-ESTIMATORS: Final = (
+ESTIMATORS: Final = (  # rooms on whose sources an estimate on a simulated log depends
     *("baselines", "batch", "factors", "front_end", "graph", "loop", "mapping", "online"),
     *("scale", "settings", "sim", "spline"),
 )
-"""Rooms whose sources an estimate on a simulated log depends on."""
 MEASURED: Final = (*ESTIMATORS, "health", "laps", "run", "plausibility", "eval.metrics")
 """Rooms whose sources the metrics of a run depend on."""
-CELLS: Final = "cells"
-"""Folder of the kept cells."""
+CELLS: Final = "cells"  # folder of the kept cells
 FORMAT: Final = "pathspace-cell/3"
-DIGEST: Final = "digest"
-"""Key of a record's digest in its file."""
-RESOLUTION: Final = 1e-3
-"""Length (m) and angle (rad) to which the geometry of a track identifies it."""
-ROUNDING: Final = 1.0 / np.pi
-"""Shift by which no coordinate with few decimals lies on the edge between two whole millimetres."""
-Record = dict[str, Any]
-"""What is kept of a cell, in the types of JSON only."""
-_latest: dict[str, Log] = {}
-"""The log that was simulated last, by its drive."""
+DIGEST: Final = "digest"  # key of a record's digest in its file
+RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
+ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
+Record = dict[str, Any]  # what is kept of a cell, in the types of JSON only
+_latest: dict[str, Log] = {}  # the log that was simulated last, by its drive
 
 
 def track_digest(track: Track) -> str:
@@ -72,8 +65,7 @@ class Drive:
     """One lap or more on a track."""
 
     track: Track
-    seed: int
-    """Number of the drive on its track."""
+    seed: int  # number of the drive on its track
     noise: str
     simulation: SimulationSettings
 
@@ -189,10 +181,8 @@ class Cell(Generic[D]):
     drive: D
     estimator: str
     settings: MapperSettings
-    variant: str | None = None
-    """Name of the settings, where there are several."""
-    measured: Mapping[str, Any] = field(default_factory=dict)
-    """Keyword arguments of `measure`."""
+    variant: str | None = None  # name of the settings, where there are several
+    measured: Mapping[str, Any] = field(default_factory=dict)  # keyword arguments of `measure`
 
     @cached_property
     def id(self) -> str:
@@ -216,12 +206,9 @@ class Outcome:
     """What came of a cell; a failure is a result as well."""
 
     names: Mapping[str, Any]
-    rows: Sequence[Row] = ()
-    """Metrics of each lap and, as the last row, of the whole run; none where the cell failed."""
-    result: RunResult | None = None
-    """Result of the run; None where the cell failed."""
-    failure: str = ""
-    """Line that names the error, if there was one."""
+    rows: Sequence[Row] = ()  # metrics of each lap and, as the last row, of the run; none if it failed
+    result: RunResult | None = None  # result of the run; None where the cell failed
+    failure: str = ""  # line that names the error, if there was one
     trace: str = ""
 
     @property

@@ -33,16 +33,13 @@ from .run import OnCell, run_cells
 from .study import known_estimators
 from .tables import TextTable, group_starts
 
-MARKER: Final = "comparison.json"
-"""File by which a comparison's folder is recognized."""
+MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
 RUN: Final = ("log", "estimator")
-_PRINTED: Final = (
+_PRINTED: Final = (  # metrics whose differences are in the table; the file has all
     *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "two_way", "ghost_share", "size", "ate"),
     "ms_mean",
 )
-"""Metrics whose differences are in the table; the file has those of all."""
-_NOT_PAIRED: Final = ("nees_low", "nees_high")
-"""Metrics whose differences mean nothing."""
+_NOT_PAIRED: Final = ("nees_low", "nees_high")  # metrics whose differences mean nothing
 
 
 @dataclass(frozen=True, eq=False)

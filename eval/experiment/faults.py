@@ -25,14 +25,10 @@ from .frame import RUN, last_laps
 from .study import Study, find_study, read_study
 from .tables import TextTable, group_starts, write_csv, write_results
 
-SUITE: Final = Path("faults")
-"""Name of the shipped study that is the suite."""
-CLEAN: Final = "clean"
-"""Name of the noise without a fault, which every other one is compared with."""
-FAULT_COLUMNS: Final = 4
-"""Panels side by side in the figure of faults."""
-Values = Mapping[str, Any]
-"""Values of an outcome by name."""
+SUITE: Final = Path("faults")  # name of the shipped study that is the suite
+CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
+FAULT_COLUMNS: Final = 4  # panels side by side in the figure of faults
+Values = Mapping[str, Any]  # values of an outcome by name
 _WORST: Final = ("error_max", "error_end", "astray_time", "astray_way")
 _MEASURED: Final = (
     *("rmse", "size", "missed", "closed_at_end", "lost_at_end", "told_degraded", "told_lost", *_WORST),
@@ -48,8 +44,7 @@ class Fault:
     """A fault of a kind and a strength."""
 
     kind: str
-    strength: str
-    """Strength as it is written, a number and a unit."""
+    strength: str  # strength as it is written, a number and a unit
     value: float
     unit: str
 
@@ -200,7 +195,7 @@ def _form(form: str, *names: str, factor: float = 1.0) -> Callable[[Values], str
     )
 
 
-COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
+COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {  # columns after fault and strength
     "rmse by clean": _ratio,
     "range": _form("{:.1f} to {:.1f}", "ratio_min", "ratio_max"),
     "size by clean": _form("{:.2f}", "size_ratio"),
@@ -217,7 +212,6 @@ COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
     ),
     "said": _said,
 }
-"""Columns of the table after the fault and its strength, each made of the values of an outcome."""
 
 
 # --- figure and files ------------------------------------------------------------------------------------

@@ -20,15 +20,11 @@ from pathspace_graph.io.overrides import leaves
 from .cells import Cell, Drive, Record
 from .study import Study
 
-COMBINATION: Final = ("noise", "estimator", "variant")
-"""Columns that name a combination, which is compared with others."""
-RUN: Final = ("track", "seed")
-"""Columns that name a drive; combinations are paired on the same drive and noise."""
+COMBINATION: Final = ("noise", "estimator", "variant")  # columns of a combination, which is compared
+RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on the same drive and noise
 RUN_OF: Final = (*RUN, *COMBINATION)
-TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
-"""Columns of wall times, all that differs when a study is run again."""
-LEVEL: Final = 0.95
-"""Confidence level of intervals; a difference is significant where its p is below 1 - LEVEL."""
+TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)  # wall times
+LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
 
 
 def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -> pd.DataFrame:
@@ -90,12 +86,9 @@ def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
 class Estimate:
     """Mean and its 95 % interval by Student's t over runs."""
 
-    mean: float
-    """NaN without runs."""
-    half: float
-    """Half the width of the interval; NaN for fewer than two runs."""
-    count: int
-    """Number of runs, or of pairs of runs."""
+    mean: float  # NaN without runs
+    half: float  # half the width of the interval; NaN for fewer than two runs
+    count: int  # number of runs, or of pairs of runs
 
     @property
     def low(self) -> float:
@@ -155,15 +148,11 @@ class Contrast:
     noise: str
     estimator: str
     variant: str
-    metric: str
-    """Key of the metric."""
-    value: Estimate
-    """Mean over all runs, each at the end of its last lap."""
-    difference: Estimate | None
-    """Mean over the pairs; None for the baseline itself."""
+    metric: str  # key of the metric
+    value: Estimate  # mean over all runs, each at the end of its last lap
+    difference: Estimate | None  # mean over the pairs; None for the baseline itself
     differences: tuple[float, ...] = ()
-    p: float = float("nan")
-    """P of the paired t-test, corrected for all comparisons of the metric."""
+    p: float = float("nan")  # p of the paired t-test, corrected for all comparisons of the metric
 
     @property
     def significant(self) -> bool:

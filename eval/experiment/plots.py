@@ -21,12 +21,9 @@ from pathspace_graph.labels import BOUNDARIES
 
 from .cells import Outcome
 
-COLUMNS: Final = (2, 3, 4)
-"""Numbers of maps side by side; the first with which the figure fits a page is taken."""
-MAX_HEIGHT: Final = 10.0
-"""Height of a page (in)."""
-DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)
-"""Distances (m) within which nothing is mapped at a missed cone, in the order in which they are tried."""
+COLUMNS: Final = (2, 3, 4)  # maps side by side; the first with which the figure fits a page is taken
+MAX_HEIGHT: Final = 10.0  # height of a page (in)
+DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)  # distances (m) of a missed cone, as they are tried
 CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
 """Style of a panel that shows a short stretch of a track."""
 
@@ -35,14 +32,11 @@ CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, 
 class BlindSpot:
     """Stretch of the track, and the true cones in it that maps miss."""
 
-    centre: Array
-    half_size: tuple[float, float]
-    """Centre (2,), half width and half height of the stretch in m, map frame."""
-    distance: float
-    """Distance (m) within which nothing is mapped at a missed cone."""
+    centre: Array  # (2,) centre of the stretch, map frame (m)
+    half_size: tuple[float, float]  # its half width and half height (m)
+    distance: float  # distance (m) within which nothing is mapped at a missed cone
     cones: int
-    missed: tuple[Array, ...]
-    """Positions (k, 2) of the cones that each map misses in the stretch."""
+    missed: tuple[Array, ...]  # positions (k, 2) of the cones that each map misses in the stretch
 
 
 def find_blind_spot(

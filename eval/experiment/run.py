@@ -42,13 +42,10 @@ R = TypeVar("R")
 
 FORMAT: Final = "pathspace-study/1"
 STUDY_FILE: Final = "study.json"
-CONNECT_SECONDS: Final = 20.0
-"""Time (s) within which a cluster has to answer."""
-_PRESENTATION: Final = ("question", "metrics", "columns")
-"""Keys that may change without making another study, since no cell depends on them."""
+CONNECT_SECONDS: Final = 20.0  # time (s) within which a cluster has to answer
+_PRESENTATION: Final = ("question", "metrics", "columns")  # keys on which no cell depends
 
-OnCell = Callable[[int, int], None]
-"""Called with the number of cells that are done, and with the number of all cells."""
+OnCell = Callable[[int, int], None]  # called with the numbers of cells that are done, and of all
 
 
 class WorkerDiedError(RuntimeError):

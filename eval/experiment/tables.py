@@ -31,27 +31,22 @@ from .frame import (
 )
 from .study import Study
 
-MAX_PANELS: Final = 3
-"""Most metrics side by side in the figure of differences."""
+MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
 
-_UNICODE: Final = str.maketrans(
+_UNICODE: Final = str.maketrans(  # LaTeX for characters that not every font has
     {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
 )
-"""LaTeX commands in place of characters that not every font has."""
 
 
 @dataclass(frozen=True)
 class TextTable:
     """Rows of text under a header: first names, left-aligned, then numbers, right-aligned."""
 
-    title: str
-    """Sentence above the table, which may be empty."""
+    title: str  # sentence above the table, which may be empty
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    groups: tuple[int, ...] = ()
-    """Row numbers at which a new group of rows begins."""
-    names: int = 1
-    """Number of first columns that are names."""
+    groups: tuple[int, ...] = ()  # row numbers at which a new group of rows begins
+    names: int = 1  # number of first columns that are names
 
     def parts(self, width: int) -> list[Self]:
         """Return tables of at most `width` characters, each with the names and some of the other columns."""

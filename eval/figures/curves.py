@@ -19,8 +19,7 @@ from pathspace_graph.spline.knots import BASELINE, curvature_weighted_breaks, fi
 from . import style
 from .style import BLUE, DARK, LIGHT, ORANGE, PURPLE, THIN_WIDTH, WIDTH
 
-BLIND: Final = (0.52, 0.74)
-"""Shares of the length of the curve between which no cone was seen."""
+BLIND: Final = (0.52, 0.74)  # shares of the length of the curve between which no cone was seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,17 +27,13 @@ class Uncertainty:
     """Curve with its standard deviation (m) across itself at n places, computed in three ways."""
 
     boundary: SplineBoundary
-    cones: Array
-    """(k, 2) Positions of the seen cones (m)."""
-    u: Array
-    length: Array
-    """Parameters (n,) of the places, and lengths along the curve (m)."""
-    joint: Array
-    marginals: Array
-    sampled: Array
-    """Sigmas (n,): B Sigma B', the paper's sum of beta_j^2 Sigma_j, and of splines drawn at random."""
-    curves: Array
-    """Points (s, n, 2) of the splines drawn at random (m)."""
+    cones: Array  # (k, 2) positions of the seen cones (m)
+    u: Array  # (n,) parameters of the places
+    length: Array  # (n,) lengths along the curve (m)
+    joint: Array  # (n,) sigmas by B Sigma B'
+    marginals: Array  # (n,) sigmas by the paper's sum of beta_j^2 Sigma_j
+    sampled: Array  # (n,) sigmas of splines drawn at random
+    curves: Array  # (s, n, 2) points of the splines drawn at random (m)
 
 
 def uncertainty(rng: np.random.Generator, samples: int = 2000) -> Uncertainty:
@@ -136,8 +131,7 @@ class Simplified:
     """Curve on fewer knots and its distance from the old one."""
 
     curve: BSpline
-    errors: Array
-    """Distances (n,) of points of the old curve, at equal lengths, from the new one (m)."""
+    errors: Array  # distances (n,) of points of the old curve, at equal lengths, from the new one (m)
 
     @property
     def rms(self) -> float:
@@ -149,12 +143,10 @@ class Simplification:
     """The paper's simplification beside one that ignores curvature."""
 
     old: BSpline
-    length: Array
-    curvature: Array
-    """Lengths (n,) along the old curve at which the errors are taken (m), and its curvature there (1/m)."""
+    length: Array  # (n,) lengths along the curve (m)
+    curvature: Array  # (n,) curvature of the old curve there (1/m)
     weighted: Simplified
-    uniform: Simplified
-    """Curve on as many knots at equal lengths."""
+    uniform: Simplified  # curve on as many knots at equal lengths
 
 
 def simplification() -> Simplification:

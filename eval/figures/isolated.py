@@ -27,10 +27,8 @@ from .style import BLUE, DARK, GREEN, LIGHT, MARKER_SIZE, ORANGE, PURPLE, RED, T
 
 SIGMA_DETECTION: Final = 0.2
 RIDGE: Final = 0.05
-MARKER: Final = "captions.md"
-"""File by which a folder of these figures is known."""
-_INVISIBLE: Final = 1e-3
-"""Value of a basis function below which it can't be seen."""
+MARKER: Final = "captions.md"  # file by which a folder of these figures is known
+_INVISIBLE: Final = 1e-3  # value of a basis function below which it can't be seen
 _DIAMOND: Final = 0.8 * MARKER_SIZE
 
 
@@ -41,11 +39,9 @@ _DIAMOND: Final = 0.8 * MARKER_SIZE
 class Expansion:
     """The three steps, on a curve with the joint covariance of its control points."""
 
-    detections: Array
-    expands: BoolArray
-    """Positions (m, 2) of the detections (m), and which mark an expansion of the curve in step (a)."""
-    order: IntArray
-    """Proximity chain of those; the curve is extended to the last one."""
+    detections: Array  # (m, 2) positions (m)
+    expands: BoolArray  # (m,) which mark an expansion in step (a)
+    order: IntArray  # proximity chain of those; the curve is extended to the last one
     before: SplineBoundary
     extended: SplineBoundary
     updated: SplineBoundary
@@ -163,20 +159,14 @@ def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: B
 class Fit:
     """The four steps."""
 
-    curve: BSpline
-    """S_mu, the state's curve."""
-    detections: Array
-    covariances: Array
-    """Positions z (m, 2) in m, and their covariances (m, 2, 2), m^2."""
-    foot_u: Array
-    basis: Array
-    """Parameters (m,) of the closest points, and the basis functions B (m, n) there."""
-    sigma_points: Array
-    """Sigma points X (4 m, m, 2) of the detections (m)."""
-    fitted_points: Array
-    """Control points Z (4 m, n, 2) fitted to each sigma point (m)."""
-    measurement: SplineMeasurement
-    """S_z."""
+    curve: BSpline  # S_mu, the state's curve
+    detections: Array  # (m, 2) positions (m)
+    covariances: Array  # (m, 2, 2) their covariances (m^2)
+    foot_u: Array  # (m,) parameters of the closest points
+    basis: Array  # (m, n) basis functions B there
+    sigma_points: Array  # (4 m, m, 2) sigma points X of the detections (m)
+    fitted_points: Array  # (4 m, n, 2) control points Z fitted to each sigma point (m)
+    measurement: SplineMeasurement  # S_z
 
     @property
     def fitted(self) -> BSpline:
@@ -283,13 +273,12 @@ def _draw_basis(axes: Axes, data: Fit) -> None:
 # --- all figures -----------------------------------------------------------------------------------------
 
 
-FIGURES: Final[Mapping[str, Callable[[], tuple[Figure, str]]]] = {
+FIGURES: Final[Mapping[str, Callable[[], tuple[Figure, str]]]] = {  # each returns a figure and its caption
     "uncertainty": plot_uncertainty,
     "expansion": plot_expansion,
     "fit": plot_fit,
     "simplification": plot_simplification,
 }
-"""Functions that compute and draw a figure, and return it with its caption."""
 
 
 def write_figures(out: Path, on_figure: Callable[[], None] = lambda: None) -> None:

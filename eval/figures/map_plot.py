@@ -22,16 +22,13 @@ from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, POINTS, RIGHT, UNKNO
 from . import style
 from .style import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, RED, WIDTH, Picture
 
-MARGIN: Final = 3.0
-"""Free space around what is drawn (m)."""
-BOUNDARY_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
-"""Colours of the boundaries, those of their cones; yellow is amber, which can be seen on white paper."""
+MARGIN: Final = 3.0  # free space around what is drawn (m)
+BOUNDARY_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}  # those of their cones; yellow is amber, seen on white
 TRAJECTORY_COLOR: Final = GREEN
 HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
 LABEL_COLORS: Final = {**BOUNDARY_COLORS, UNKNOWN: GREY, **dict.fromkeys(POINTS, RED)}
 BAND_ALPHA: Final = 0.35
-TENTATIVE_DASHES: Final = (0, (4, 2))
-"""Dashes of the stretch of a curve that is not confirmed."""
+TENTATIVE_DASHES: Final = (0, (4, 2))  # dashes of the stretch of a curve that is not confirmed
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,17 +36,13 @@ class MapStyle:
     """Line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
 
     curve_width: float = 0.7
-    path_width: float = 0.6
-    """Width of the trajectory; the true path is thinner."""
+    path_width: float = 0.6  # width of the trajectory; the true path is thinner
     marker_size: float = 2.6
-    landmark_size: float = 1.4
-    """Size of landmarks, small enough for their ellipses to be seen."""
-    widest_band: float = np.inf
-    """Greatest width of a band on either side of its curve (m)."""
+    landmark_size: float = 1.4  # size of landmarks, small enough for their ellipses to be seen
+    widest_band: float = np.inf  # greatest width of a band on either side of its curve (m)
 
 
-WHOLE_TRACK: Final = MapStyle()
-"""Style of a panel that shows a whole track."""
+WHOLE_TRACK: Final = MapStyle()  # style of a panel that shows a whole track
 
 
 def plot_map(

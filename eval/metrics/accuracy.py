@@ -19,30 +19,21 @@ from pathspace_graph.settings.checked import Positive
 from pathspace_graph.sim.curves import along_polyline, arc_lengths
 from pathspace_graph.spline.bspline import BSpline
 
-MISSED_DISTANCE: Final = 3.0
-"""Distance from its mapped boundary beyond which a true cone is missed (m; paper, Table 1)."""
-TRUE_STEP: Final = 0.02
-"""Largest distance of points of a true curve (m): a distance of 0.1 m is at most 0.5 mm too long."""
-MAPPED_STEP: Final = 0.1
-"""Largest distance of the points of a mapped curve from which distances are measured (m)."""
-GRID_PER_SPAN: Final = 64
-"""Grid points on each span from which closest points are searched, about every 0.1 m of a track."""
-_OVERLAP: Final = 3
-"""Cones beyond the seam that Akima's tangents of a closed curve need."""
+MISSED_DISTANCE: Final = 3.0  # distance from its boundary beyond which a cone is missed (m; Table 1)
+TRUE_STEP: Final = 0.02  # largest step on a true curve (m): 0.1 m is at most 0.5 mm too long
+MAPPED_STEP: Final = 0.1  # largest step on a mapped curve (m)
+GRID_PER_SPAN: Final = 64  # grid points of a span for closest points, about every 0.1 m
+_OVERLAP: Final = 3  # cones beyond the seam that Akima's tangents of a closed curve need
 
 
 @dataclass(frozen=True, slots=True)
 class LapMetrics:
     """One row of the paper's Table 1."""
 
-    lap: int
-    """Number of the lap, from 1; the map is taken as it stood at its end."""
-    rmse: float
-    """Rmse (m) over the cones that aren't missed; NaN where all are."""
-    missed: float
-    """Share (0 to 1) of all true cones that is missed; NaN without true cones."""
-    size: int
-    """Number of control points or landmarks of both boundaries."""
+    lap: int  # number of the lap, from 1; the map is taken as it stood at its end
+    rmse: float  # rmse (m) over the cones that aren't missed; NaN where all are
+    missed: float  # share (0 to 1) of all true cones that is missed; NaN without true cones
+    size: int  # number of control points or landmarks of both boundaries
 
 
 def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:

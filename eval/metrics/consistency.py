@@ -20,8 +20,7 @@ from pathspace_graph.labels import BOUNDARIES
 
 from .accuracy import MISSED_DISTANCE, closest_points, mean_of, true_curve
 
-LEVEL: Final = 0.95
-"""Probability with which an honest map's NEES lies in the interval."""
+LEVEL: Final = 0.95  # probability with which an honest map's NEES lies in the interval
 
 
 # --- squared errors --------------------------------------------------------------------------------------
@@ -35,10 +34,8 @@ class NormalizedError:
     Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4).
     """
 
-    value: float
-    """`e' P^-1 e`; NaN where P is singular."""
-    dof: int
-    """Degrees of freedom of the chi-squared distribution."""
+    value: float  # `e' P^-1 e`; NaN where P is singular
+    dof: int  # degrees of freedom of the chi-squared distribution
 
     @property
     def ratio(self) -> float:
@@ -134,9 +131,8 @@ def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array
 class NormalErrors:
     """Errors of a map's curves at k true cones along the normals at their foot points, left positive."""
 
-    errors: Array
-    sigmas: Array
-    """Errors and their claimed standard deviations (k,) in m."""
+    errors: Array  # (k,) in m
+    sigmas: Array  # (k,) their claimed standard deviations (m)
 
     def share_inside(self, factor: float = 2.0) -> float:
         """Return the share of the cones with |error| <= factor * sigma; NaN without cones."""
@@ -207,10 +203,8 @@ def with_marginals(track: Map) -> Map:
 class Turn:
     """Rotation of a map about the start."""
 
-    angle: float
-    """Angle by which the map is turned to the left (rad); NaN where nothing of it can be compared."""
-    sigma: float
-    """Its standard deviation by the map's joint covariance (rad); NaN where the map has none."""
+    angle: float  # angle to the left (rad); NaN where nothing can be compared
+    sigma: float  # its standard deviation by the map's joint covariance (rad); NaN where the map has none
 
     @property
     def nees(self) -> float:

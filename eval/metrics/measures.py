@@ -22,10 +22,8 @@ from .consistency import joint_cone_error, map_nees, normal_errors, turn_from_tr
 from .reference import limit
 from .summary import has_cones, lap_times
 
-WHOLE: Final = "whole"
-"""Name of the whole cycle among its stages."""
-EARLY: Final = 30.0
-"""How far before the true drive is back at the start a loop may close (m), as the sensor sees ahead."""
+WHOLE: Final = "whole"  # name of the whole cycle among its stages
+EARLY: Final = 30.0  # how far before the start a loop may close (m), as the sensor sees ahead
 
 
 def stage_times(cycles: Sequence[CycleRecord]) -> list[dict[str, Any]]:
@@ -64,8 +62,7 @@ def covariance_bytes(track: Map) -> int:
 class Row:
     """Metrics of one lap, or of a whole run."""
 
-    lap: int | None
-    """Number of the lap, from 1; None for the whole run."""
+    lap: int | None  # number of the lap, from 1; None for the whole run
     values: dict[str, float]
     """Values by the metric's key, counts as whole numbers and `closed` as a truth value. Unknown ones, for
     example without truth, are absent."""

@@ -15,13 +15,10 @@ from .accuracy import root_mean_square
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.rad2deg(1.0)), "mrad/s": 1e3}
 """Factors from the shares, bytes and radians of the columns to the units of the tables."""
-MEAN_DIGITS: Final = 2
-"""Least number of digits after the decimal point of a mean with its interval."""
+MEAN_DIGITS: Final = 2  # least number of digits after the decimal point of a mean with its interval
 UNKNOWN: Final = "–"
-EVERY_LAP: Final = "all"
-"""Suffix of a column that is the average over all laps, such as `rmse@all`."""
-LATER_LAPS: Final = "later"
-"""Suffix of a column that is the average over the laps from the second on, such as `rmse@later`."""
+EVERY_LAP: Final = "all"  # suffix of the average over all laps, as in `rmse@all`
+LATER_LAPS: Final = "later"  # suffix of the average over the laps from the second on, as in `rmse@later`
 _SLOPE: Final = re.compile(r"slope\((\w+), (\w+)\)")
 
 
@@ -29,20 +26,13 @@ _SLOPE: Final = re.compile(r"slope\((\w+), (\w+)\)")
 class Metric:
     """A number that is measured of every lap or of every run."""
 
-    key: str
-    """Name of its column in every file."""
-    title: str
-    """Name in tables."""
-    unit: str = ""
-    """Unit in tables; empty for pure numbers and counts."""
-    digits: int = 3
-    """Number of digits after the decimal point in tables."""
-    scope: Literal["lap", "run"] = "lap"
-    """`lap`: measured of every lap and of the whole run; `run`: of the whole run only."""
-    time: bool = False
-    """Whether it is a wall time, all that differs when the same run is repeated."""
-    average: Literal["mean", "rms"] = "mean"
-    """Average over several runs: a root mean square for errors with a sign."""
+    key: str  # name of its column in every file
+    title: str  # name in tables
+    unit: str = ""  # unit in tables; empty for pure numbers and counts
+    digits: int = 3  # number of digits after the decimal point in tables
+    scope: Literal["lap", "run"] = "lap"  # of laps and the whole run, or of the whole run only
+    time: bool = False  # whether it is a wall time, all that differs when the same run is repeated
+    average: Literal["mean", "rms"] = "mean"  # over runs: a root mean square for errors with a sign
 
     @property
     def heading(self) -> str:
@@ -165,8 +155,7 @@ _ALL: Final = (
     Metric("ms_p99", "update, 99th percentile", "ms", 2, time=True),
     Metric("seconds", "whole run", "s", 1, "run", time=True),
 )
-METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}
-"""All metrics by key, in the order of the tables."""
+METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}  # in the order of tables
 
 
 @dataclass(frozen=True)
@@ -174,10 +163,8 @@ class Column:
     """A figure of several runs: a metric of one lap or several, or a slope of one metric on another."""
 
     metric: Metric
-    laps: str = ""
-    """Number of a lap, `later` or `all`; empty for the last lap."""
-    given: Metric | None = None
-    """Metric on which the slope is taken, if it is a slope."""
+    laps: str = ""  # number of a lap, `later` or `all`; empty for the last lap
+    given: Metric | None = None  # metric on which the slope is taken, if it is a slope
 
     @property
     def title(self) -> str:

@@ -160,12 +160,10 @@ def _truth(log: Log) -> Truth:
 class Gap:
     """Distance of one run from another."""
 
-    curves: dict[str, float]
-    """Two-way distance (m) of the two curves of each boundary that both runs have mapped."""
-    along: float
-    across: float
-    heading: float
-    """Root mean square errors of the poses in the reference's frame (m, m, rad)."""
+    curves: dict[str, float]  # two-way distance (m) of each boundary that both have mapped
+    along: float  # rms error along (m), in the frames of the reference
+    across: float  # (m)
+    heading: float  # (rad)
 
 
 def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:

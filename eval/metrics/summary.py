@@ -27,8 +27,7 @@ from .accuracy import LapMetrics, lap_metrics, root_mean_square
 from .consistency import normal_errors
 from .trajectory import position_rms, trajectory_errors
 
-GATE: Final = ("dropped", "late", "refused")
-"""Counts of the gate in each cycle."""
+GATE: Final = ("dropped", "late", "refused")  # counts of the gate in each cycle
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:

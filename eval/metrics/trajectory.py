@@ -19,16 +19,11 @@ from pathspace_graph.sim.curves import arc_lengths
 
 from .accuracy import boundary_distances, root_mean_square
 
-LOST, ASTRAY = 5.0, 1.0
-"""Position errors beyond which a vehicle is lost, or astray (m)."""
-MOST: Final = 35.0
-"""Greatest length of a reach (m)."""
-ON_CURVE: Final = 0.5
-"""Distance of a true cone from the mapped boundary at which the reach ends (m)."""
-SHORT: Final = 4.0
-"""Reach below which no planner can work (m)."""
-STARTING: Final = 0.03
-"""Share of lap 1 on which the map has only begun, and cycles don't count."""
+LOST, ASTRAY = 5.0, 1.0  # position errors beyond which a vehicle is lost, or astray (m)
+MOST: Final = 35.0  # greatest length of a reach (m)
+ON_CURVE: Final = 0.5  # distance of a true cone from the mapped boundary at which the reach ends (m)
+SHORT: Final = 4.0  # reach below which no planner can work (m)
+STARTING: Final = 0.03  # share of lap 1 on which the map has only begun, and cycles don't count
 
 
 def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:

@@ -32,18 +32,14 @@ from pathspace_graph.run import ObservedCycle, Readings
 from pathspace_graph.settings.output import FilmSettings
 
 SUFFIXES: Final = (".gif", ".mp4")
-DPI: Final = 100.0
-"""Resolution of a frame (dots per inch), which decides how large the text is."""
-VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
-"""Arrow that stands for the vehicle (m, vehicle frame), larger than it is, so that it is seen."""
+DPI: Final = 100.0  # resolution of a frame (dots per inch), which decides how large the text is
+VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])  # arrow (m), larger than life
 Pixels = NDArray[np.uint8]
 _STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8, widest_band=5.0)
 """Lines are wider than on paper, since a film has few pixels."""
-_MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)
-"""Place of the map: left, bottom, width, height, as shares of the frame."""
+_MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)  # left, bottom, width and height, as shares of the frame
 _TEXT_PLACE: Final = (0.775, 0.085, 0.212, 0.845)
-_FRAME_STEP: Final = 10.0
-"""Step (m) by which the part of the plane that is shown grows."""
+_FRAME_STEP: Final = 10.0  # step (m) by which the part of the plane that is shown grows
 
 
 def lap_seconds(log: Log) -> float:
