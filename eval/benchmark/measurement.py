@@ -144,9 +144,6 @@ def baseline_table(compared: Sequence[Compared]) -> TextTable:
     return TextTable("against the baseline", header, tuple(rows))
 
 
-# --- ISAM2 on landmarks ----------------------------------------------------------------------------------
-
-
 class ToldLandmarks:
     """GTSAM's ISAM2 over the cycles of a log whose associations are known.
 
@@ -219,9 +216,6 @@ class ToldLandmarks:
             bearing = gtsam.Rot2.relativeBearing(points[i])
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[i])
             graph.add(gtsam.BearingRangeFactor2D(key, landmark, bearing, ranges[i], noise))
-
-
-# --- a run ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

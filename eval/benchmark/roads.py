@@ -105,9 +105,6 @@ def make_drives(settings: ScalingSettings) -> Drives:
     return Drives(first_cycles(long, count), seen[:count].astype(float), readings, laps, lap_times(laps))
 
 
-# --- roads -----------------------------------------------------------------------------------------------
-
-
 def open_road(cones: int, gap: float) -> Track:
     """Return a winding road that never comes near itself, on which at least `cones` cones can be seen.
 
@@ -140,9 +137,6 @@ def _with_rows(middle: Array, gap: float, closed: bool) -> Track:
         rows.append(along_polyline(at, s, row))
     start = np.append(middle[0], np.arctan2(tangents[0, 1], tangents[0, 0]))
     return Track(rows[0], rows[1], np.zeros((0, 2)), closed, start, "road")
-
-
-# --- logs ------------------------------------------------------------------------------------------------
 
 
 def drive_log(track: Track, seed: int, laps: int = 1, dense: bool = False) -> Log:

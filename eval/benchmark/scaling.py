@@ -55,9 +55,6 @@ _TITLES: Final[dict[Sweep, tuple[str, str]]] = {  # axis title and title of each
 JUDGED: Final = 10  # number of updates whose mean is compared with the budget
 
 
-# --- lanes -----------------------------------------------------------------------------------------------
-
-
 @dataclass(eq=False)
 class Lane:
     """An estimator that is to map a log, and what was measured, until the log ended or it was stopped."""
@@ -123,9 +120,6 @@ def peak_memory(lane: Lane, settings: MapperSettings) -> float:
         tracemalloc.stop()
 
 
-# --- points and slopes -----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Scaling:
     """All results of the measurement."""
@@ -186,9 +180,6 @@ def fit_slope(
     fitted = {"slope": slope, "error": error, "points": len(kept)}
     ends = {"low": float(kept["at"].min()), "high": float(kept["at"].max())}
     return {"sweep": sweep, "estimator": estimator, **fitted, **ends, "stopped": stopped}
-
-
-# --- the measurement -------------------------------------------------------------------------------------
 
 
 def sweeps(drives: Drives, settings: ScalingSettings) -> dict[Sweep, tuple[Logs, Array, float]]:

@@ -38,8 +38,8 @@ ESTIMATORS: Final = (  # rooms on whose sources an estimate on a simulated log d
     *("baselines", "batch", "factors", "front_end", "graph", "loop", "mapping", "online"),
     *("scale", "settings", "sim", "spline"),
 )
+# rooms on whose sources the metrics of a run depend
 MEASURED: Final = (*ESTIMATORS, "health", "laps", "run", "plausibility", "eval.metrics")
-"""Rooms whose sources the metrics of a run depend on."""
 CELLS: Final = "cells"  # folder of the kept cells
 FORMAT: Final = "pathspace-cell/3"
 DIGEST: Final = "digest"  # key of a record's digest in its file
@@ -88,17 +88,13 @@ class Drive:
         """Return the log; the last one is kept, since cells are in the order of their logs."""
         if self.id not in _latest:
             _latest.clear()
-            _latest[self.id] = self.simulate()
+            _latest[self.id] = simulate(self.track, self.simulation, self.own_seed)
         return _latest[self.id]
-
-    def simulate(self) -> Log:
-        return simulate(self.track, self.simulation, self.own_seed)
 
 
 def identity(**parts: Any) -> str:
     """Return a text that is the same for the same values, which are JSON's types only."""
-    text = json.dumps(parts, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:20]
 
 
 @cache
@@ -122,12 +118,12 @@ def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:
     """
     every = list[Path | int]()
     for entry in tracks:
-        files = [entry]
-        if isinstance(entry, Path) and entry.is_dir():
-            files = [*sorted(file for file in entry.iterdir() if file.suffix in TRACK_SUFFIXES)]
-            if not files:
-                raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
-        every += files
+        if not isinstance(entry, Path) or not entry.is_dir():
+            every.append(entry)
+        elif files := sorted(file for file in entry.iterdir() if file.suffix in TRACK_SUFFIXES):
+            every += files
+        else:
+            raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
     stems = [track.stem for track in every if isinstance(track, Path)]
     return [_load(track, stems) for track in every]
 
@@ -145,9 +141,6 @@ def _load(track: Path | int, stems: list[str]) -> Track:
             raise InputError(track, str(error)) from error
     folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
     return replace(read_track(track), name=f"{folder}{track.stem}")
-
-
-# --- runs ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,11 +204,6 @@ class Outcome:
     failure: str = ""  # line that names the error, if there was one
     trace: str = ""
 
-    @property
-    def laps(self) -> int:
-        """Number of laps that the estimator counted."""
-        return 0 if self.result is None else self.result.laps
-
     @classmethod
     def failed(cls, cell: Cell[Any], error: BaseException) -> Self:
         """Make the outcome of a cell that ended with an error."""
@@ -263,16 +251,9 @@ def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
     if run is not None:
         said += [record.notice for record in run.cycles if record.notice]
         said += [] if run.vehicle is None else diagnose(run.vehicle, run.settings)
-    record: Record = {
-        "format": FORMAT,
-        "id": cell.id,
-        "cell": cell.names,
-        "versions": versions(),
-        "failure": outcome.failure,
-        "traceback": outcome.trace,
-        "said": "; ".join(dict.fromkeys(said)),
-        "laps": lap_rows(outcome.rows),
-    }
+    record: Record = {"format": FORMAT, "id": cell.id, "cell": cell.names, "versions": versions()}
+    record |= {"failure": outcome.failure, "traceback": outcome.trace}
+    record |= {"said": "; ".join(dict.fromkeys(said)), "laps": lap_rows(outcome.rows)}
     return dict(to_plain(record))
 
 

@@ -36,8 +36,8 @@ from .tables import TextTable, group_starts
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
 RUN: Final = ("log", "estimator")
 _PRINTED: Final = (  # metrics whose differences are in the table; the file has all
-    *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "two_way", "ghost_share", "size", "ate"),
-    "ms_mean",
+    *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m"),
+    *("two_way", "ghost_share", "size", "ate", "ms_mean"),
 )
 _NOT_PAIRED: Final = ("nees_low", "nees_high")  # metrics whose differences mean nothing
 
@@ -57,8 +57,9 @@ class Comparison:
         results = {tuple(outcome.names.values()): outcome.result for outcome in self.outcomes}
         rows: list[dict[str, Any]] = []
         for outcome in self.outcomes:
+            laps = 0 if outcome.result is None else outcome.result.laps
             for row in outcome.rows:
-                about = {"scope": "lap" if row.lap else "log", "lap": row.lap or outcome.laps}
+                about = {"scope": "lap" if row.lap else "log", "lap": row.lap or laps}
                 rows.append({**outcome.names, **about, **row.values})
             batch = results.get((outcome.names["log"], registry.DEFAULT_BATCH))
             if outcome.result is not None and batch is not None and outcome.result is not batch:
@@ -72,16 +73,9 @@ class Comparison:
 
     def times(self) -> pd.DataFrame:
         """Return a tidy row per run and stage, in s."""
-        rows = [
-            {**outcome.names, **stage}
-            for outcome in self.outcomes
-            if outcome.result is not None
-            for stage in stage_times(online_cycles(outcome.result))
-        ]
+        ran = [(outcome.names, outcome.result) for outcome in self.outcomes if outcome.result is not None]
+        rows = [{**names, **stage} for names, run in ran for stage in stage_times(online_cycles(run))]
         return pd.DataFrame(rows, columns=[*RUN, "stage", "mean", "median", "p99", "share"])
-
-    def of(self, log: str) -> list[Outcome]:
-        return [outcome for outcome in self.outcomes if outcome.names["log"] == log]
 
     @property
     def has_truth(self) -> bool:
@@ -313,7 +307,7 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
 
 def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
     folder.mkdir(exist_ok=True)
-    found = comparison.of(named.name)
+    found = [outcome for outcome in comparison.outcomes if outcome.names["log"] == named.name]
     maps = {str(o.names["estimator"]): o.result.map for o in found if o.result is not None}
     for outcome in found:
         if outcome.result is not None:

@@ -21,9 +21,9 @@ from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN
 from pathspace_graph.io.files import write_json, write_text
 from pathspace_graph.plausibility.diagnosis import LIMIT
 
-from .frame import RUN, last_laps
+from .frame import RUN, last_laps, write_csv, write_results
 from .study import Study, find_study, read_study
-from .tables import TextTable, group_starts, write_csv, write_results
+from .tables import TextTable, group_starts
 
 SUITE: Final = Path("faults")  # name of the shipped study that is the suite
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
@@ -36,15 +36,12 @@ _MEASURED: Final = (
 _NAME: Final = re.compile(r"(?P<kind>.+): (?P<strength>(?P<value>[-+.\d]+)(?: (?P<unit>\S+))?)")
 
 
-# --- the suite -------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Fault:
     """A fault of a kind and a strength."""
 
     kind: str
-    strength: str  # strength as it is written, a number and a unit
+    strength: str  # as it is written, a number and a unit
     value: float
     unit: str
 
@@ -106,10 +103,8 @@ def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
     `runs` that finished count, `failed` ones don't. What is not known is NaN.
     """
     every, failures = beside_clean(frame), frame.loc[frame["failure"] != "", "noise"].value_counts()
-    return [
-        _outcome(fault_of(noise), every[every["noise"] == noise], int(failures.get(noise, 0)))
-        for noise in study.noise
-    ]
+    of = ((fault_of(noise), every[every["noise"] == noise], failures.get(noise, 0)) for noise in study.noise)
+    return [_outcome(fault, runs, int(failed)) for fault, runs, failed in of]
 
 
 def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
@@ -117,15 +112,9 @@ def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
     sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith("_by_prior")}
     titles = {key: METRICS[key].title.removesuffix(" by its prior's sigma") for key in sigmas}
     return {
-        "fault": fault.kind,
-        "strength": fault.value,
-        "unit": fault.unit,
-        "runs": len(runs),
-        "failed": failed,
-        "with_map": len(ratios),
-        "ratio_mean": float(ratios.mean()),
-        "ratio_min": float(ratios.min()),
-        "ratio_max": float(ratios.max()),
+        **{"fault": fault.kind, "strength": fault.value, "unit": fault.unit},
+        **{"runs": len(runs), "failed": failed, "with_map": len(ratios)},
+        **{f"ratio_{name}": float(ratios.agg(name)) for name in ("mean", "min", "max")},
         "size_ratio": float(runs["size_ratio"].mean()),
         "missed": float(runs["missed"].mean()),
         "closed": int((runs["closed_at_end"] == 1.0).sum()),

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +16,7 @@ from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.reference import from_batch
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.files import replacing
 from pathspace_graph.io.overrides import leaves
 
 from .cells import Cell, Drive, Record
@@ -68,9 +70,16 @@ def without_times(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.drop(columns=[*TIMES], errors="ignore")
 
 
-def times_of(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the wall times, in the same rows."""
-    return frame[["study", *RUN_OF, "lap", *(name for name in TIMES if name in frame)]]
+def write_results(frame: pd.DataFrame, out: Path) -> None:
+    write_csv(out / "results.csv", without_times(frame))
+    times = [name for name in TIMES if name in frame]
+    write_csv(out / "times.csv", frame[["study", *RUN_OF, "lap", *times]])
+
+
+def write_csv(file: Path, frame: pd.DataFrame) -> None:
+    """Write a frame without its index, whole or not at all."""
+    with replacing(file) as temporary:
+        frame.to_csv(temporary, index=False, lineterminator="\n")
 
 
 def last_laps(frame: pd.DataFrame) -> pd.DataFrame:

@@ -45,10 +45,9 @@ class Study:
     name: str = "study"
     question: str = ""
     estimators: tuple[str, ...] = (registry.DEFAULT,)  # online or batch ones; `all` for every one
+    # overrides of the simulation by the name of a noise, and of the settings by that of a variant
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
-    """Overrides of the simulation by the name of a noise."""
-    variants: Mapping[str, Overrides] = field(default_factory=dict)
-    """Overrides of the settings by the name of a variant; `default` is always there."""
+    variants: Mapping[str, Overrides] = field(default_factory=dict)  # beside `default`, always there
     grids: tuple[Mapping[str, Sequence[Any]], ...] = ()
     """Values by dotted field; every combination is a variant with a name such as `lag=1, steps=2`."""
     baseline: Baseline = field(default_factory=Baseline)  # combination that the others are compared with

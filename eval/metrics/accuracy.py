@@ -96,9 +96,6 @@ def root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-# --- points on curves ------------------------------------------------------------------------------------
-
-
 @lru_cache(maxsize=16)  # every map of a log is compared with the same ones
 def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     """Return points (k, 2) in m, at most `step` apart, on the curve through the true cones of a boundary.
@@ -151,9 +148,6 @@ def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
     return spline.evaluate(spline.parameters_at((np.arange(count) + 0.5) * length / count))
 
 
-# --- distances -------------------------------------------------------------------------------------------
-
-
 def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
     """Return mean_p min_q |p - q| over mapped points p, mean_q min_p |q - p| over true ones q, and the mean.
 
@@ -174,8 +168,8 @@ def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
             forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
             back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
     to_truth, to_mapped = mean_of(np.concatenate(forth)), mean_of(np.concatenate(back))
-    both = 0.5 * (to_truth + to_mapped)
-    return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped, "two_way": both}
+    two_way = 0.5 * (to_truth + to_mapped)
+    return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped, "two_way": two_way}
 
 
 def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
@@ -287,6 +281,5 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> d
             distances, nearest = KDTree(cones).query(boundary.points)
             matched = np.asarray(nearest)[np.asarray(distances) <= settings.distance]
             duplicates += len(matched) - len(np.unique(matched))
-    share = mean_of(np.concatenate(all_ghosts))
-    found = {"ghost_landmarks": landmarks, "ghost_metres": metres, "ghost_share": share}
-    return {**found, "duplicates": duplicates}
+    found = {"ghost_landmarks": landmarks, "ghost_metres": metres}
+    return found | {"ghost_share": mean_of(np.concatenate(all_ghosts)), "duplicates": duplicates}

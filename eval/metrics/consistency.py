@@ -23,9 +23,6 @@ from .accuracy import MISSED_DISTANCE, closest_points, mean_of, true_curve
 LEVEL: Final = 0.95  # probability with which an honest map's NEES lies in the interval
 
 
-# --- squared errors --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class NormalizedError:
     """Normalized error squared `e' P^-1 e`, where P is the covariance that an estimator claims.
@@ -64,9 +61,6 @@ def _squared(error: Array, covariance: Array) -> float:
         return float(error @ cho_solve(cho_factor(covariance), error))
     except np.linalg.LinAlgError:
         return float("nan")
-
-
-# --- the whole map ---------------------------------------------------------------------------------------
 
 
 def map_nees(track: Map, truth: Truth) -> NormalizedError:
@@ -122,9 +116,6 @@ def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array
     columns = (2 * landmark[:, None] + np.arange(2)).ravel()
     error = (cones[cone] - boundary.points[landmark]).ravel()
     return error, boundary.covariance[np.ix_(columns, columns)]
-
-
-# --- at the true cones -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,9 +187,6 @@ def with_marginals(track: Map) -> Map:
     return Map(track.closed, {k: replace(b, covariance=b.covariance * blocks[k]) for k, b in splines.items()})
 
 
-# --- the turn about the start ----------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Turn:
     """Rotation of a map about the start."""
@@ -236,7 +224,6 @@ def turn(track: Map, points: Mapping[int, Array]) -> Turn:
             break
     joint = track.joint_covariance
     variance = float("nan") if joint is None else float(gradient @ joint @ gradient)
-    # of sum lever n . S / sum lever^2
     return Turn(angle, float(np.sqrt(variance)) / float(lever @ lever))
 
 

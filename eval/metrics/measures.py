@@ -54,8 +54,7 @@ def map_bytes(track: Map) -> int:
 
 def covariance_bytes(track: Map) -> int:
     """Return 8 n (n + 1) / 2 bytes for each boundary's symmetric joint covariance, n = 2 m."""
-    sizes = [2 * boundary.size for boundary in track.boundaries.values()]
-    return 8 * sum(n * (n + 1) // 2 for n in sizes)
+    return 8 * sum(boundary.size * (2 * boundary.size + 1) for boundary in track.boundaries.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,9 +155,8 @@ def _map_values(
     turns = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
     values |= {key: value for key, value in turns.items() if not np.isnan(value)}
     if marginals:
-        by_marginals = _consistency_values(with_marginals(track), truth)
-        keys = ("nees", "inside", "normalized_error")
-        values |= {f"{key}_marginals": by_marginals[key] for key in keys}
+        found = _consistency_values(with_marginals(track), truth)
+        values |= {f"{key}_marginals": found[key] for key in ("nees", "inside", "normalized_error")}
     return values
 
 

@@ -143,9 +143,7 @@ _ALL: Final = (
     Metric("range_bias_by_prior", "bias of ranges by its prior's sigma", "", 1, "run"),
     Metric("heading_sigma", "last heading, claimed sigma", "°", 2, "run", average="rms"),
     Metric("heading_error", "error of the last heading", "°", 2, "run", average="rms"),
-    Metric(
-        "heading_by_sigma", "error of the last heading by claimed sigma", digits=2, scope="run", average="rms"
-    ),
+    Metric("heading_by_sigma", "error of the last heading by claimed sigma", "", 2, "run", average="rms"),
     Metric("converged", "batch converged", "%", 0, "run"),
     Metric("cost", "cost of the batch", "", 1, "run"),
     Metric("bytes", "map", "kB", 2),
@@ -181,13 +179,15 @@ class Column:
     def text(self, values: pd.DataFrame, over: str = "mean") -> str:
         """Return the text of the average over runs, whose metrics are columns by key, or of the slope.
 
-        `median` and `max` are of magnitudes where there are signs; a slope has none.
+        `median` and `max` are of magnitudes where there are signs; a slope, `sum e t / sum t^2`, has none. It
+        leads through the origin, as estimator and simulator both expect zero.
         """
         of = values[self.metric.key].astype(float)
         if self.given is not None:
-            given = values[self.given.key].astype(float)
-            slope = slope_of(of.to_numpy(), given.to_numpy()) if over == "mean" else np.nan
-            return UNKNOWN if np.isnan(slope) else f"{slope:.2f}"
+            known = values.astype(float).dropna(subset=[self.metric.key, self.given.key])
+            t = known[self.given.key].to_numpy()
+            moment = float(t @ t) if over == "mean" else 0.0
+            return f"{float(known[self.metric.key].to_numpy() @ t) / moment:.2f}" if moment > 0.0 else UNKNOWN
         if over == "mean":
             return self.metric.text(self.metric.over(of))
         return self.metric.text(float((of.abs() if self.metric.average == "rms" else of).agg(over)))
@@ -208,16 +208,6 @@ def column_of(text: str) -> Column:
             f"columns: expected a lap's number, '{LATER_LAPS}' or '{EVERY_LAP}' after @, found '{text}'"
         )
     return Column(metric, laps)
-
-
-def slope_of(estimates: np.ndarray, truths: np.ndarray) -> float:
-    """Return `sum e t / sum t^2` over the runs (n,) whose estimate and truth are known; NaN without any.
-
-    The line leads through the origin, as estimator and simulator both expect zero.
-    """
-    known = ~(np.isnan(estimates) | np.isnan(truths))
-    moment = float(truths[known] @ truths[known])
-    return float(estimates[known] @ truths[known]) / moment if moment > 0.0 else float("nan")
 
 
 def _metric(key: str) -> Metric:

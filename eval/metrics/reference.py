@@ -19,14 +19,8 @@ from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.knots import fit_spline
 
-from .accuracy import (
-    boundary_distances,
-    closest_points,
-    driving_order,
-    mapped_points,
-    root_mean_square,
-    two_way_distance,
-)
+from . import accuracy
+from .accuracy import boundary_distances, closest_points, mapped_points, root_mean_square
 from .consistency import near_pairs
 from .trajectory import pose_errors
 
@@ -51,12 +45,9 @@ def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:
     truth = _truth(log)
     if truth.associations is None:
         raise ValueError("expected a simulated log, whose associations are known, found one without")
-    if truth.sensor is None and truth.noise is None:
-        return solve_landmarks(log, truth.associations)
     settings = MapperSettings(calibration=CalibrationSettings(sensor=truth.sensor is None))
     told, associations = without_sensor_errors(log, truth.associations)
-    told = with_true_noise(told, associations)
-    return solve_landmarks(told, associations, settings)
+    return solve_landmarks(with_true_noise(told, associations), associations, settings)
 
 
 def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArray]:
@@ -79,8 +70,7 @@ def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArr
         measured = cycle.points_vehicle
         distance, radial = _rays(measured)
         across = (distance - bias) / (1.0 + scale) / distance
-        change = radial / (1.0 + scale) + across[:, None, None] * (np.eye(2) - radial)
-        change = to_vehicle @ change
+        change = to_vehicle @ (radial / (1.0 + scale) + across[:, None, None] * (np.eye(2) - radial))
         points = measured * across[:, None] @ to_vehicle.T + [0.0, lateral]
         covariances = change @ cycle.covariances @ change.transpose(0, 2, 1)
         cycles.append(Detections(cycle.t - latency, points, covariances, cycle.labels))
@@ -137,7 +127,7 @@ def fit_rmse(track: Map, truth: Truth) -> float:
     """
     distances = [np.zeros(0)]
     for label, boundary in track.boundaries.items():
-        cones = driving_order(truth, label)
+        cones = accuracy.driving_order(truth, label)
         fitted = cones
         if isinstance(boundary, SplineBoundary) and boundary.size < len(cones):
             like = boundary.spline
@@ -151,9 +141,6 @@ def _truth(log: Log) -> Truth:
     if log.truth is None:
         raise ValueError("expected a log with truth, found one without")
     return log.truth
-
-
-# --- another run -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -182,7 +169,7 @@ def gap(run: RunResult, reference: RunResult) -> Gap:
     """Return the gap of a run from a reference over the same log."""
     shared = sorted(set(run.map.boundaries) & set(reference.map.boundaries))
     own, others = run.map.boundaries, reference.map.boundaries
-    curves = {NAMES[label]: two_way_distance(own[label], others[label]) for label in shared}
+    curves = {NAMES[label]: accuracy.two_way_distance(own[label], others[label]) for label in shared}
     errors = pose_errors(run.trajectory_t, run.trajectory, reference.trajectory_t, reference.trajectory)
     return Gap(curves, *(root_mean_square(column) for column in errors.T))
 
@@ -215,6 +202,5 @@ def _aligning(points: list[Array], boundaries: list[MapBoundary], start: float) 
             lever = np.einsum("kd,kd->k", normal, left_of(point - motion[:2]))
             rows.append(np.column_stack([normal, lever]))
             errors.append(np.einsum("kd,kd->k", normal, position - point))
-        change = np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
-        motion = motion + change
+        motion = motion + np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
     return motion

@@ -39,8 +39,7 @@ def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
 def pose_errors(t: Array, poses: Array, reference_t: Array, reference: Array) -> Array:
     """Return [along, across, heading] (k, 3) in m, m, rad: the error of each pose in its reference's frame.
 
-    t is (n,), poses is (n, 3). Nothing is aligned. Stamps outside those of the reference are left out (k <=
-    n).
+    t is (n,), poses is (n, 3). Nothing is aligned. Stamps outside those of the reference are left out.
     """
     inside = (t >= reference_t[0]) & (t <= reference_t[-1])
     expected = interpolate_poses(reference_t, reference, t[inside])
@@ -54,23 +53,15 @@ def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
     return pose_errors(t, poses, truth.pose_t, truth.poses)
 
 
-def ate(t: Array, poses: Array, truth: Truth) -> float:
-    """Return the absolute trajectory error sqrt(mean |p - p_true|^2) in m, without alignment."""
-    return position_rms(trajectory_errors(t, poses, truth))
-
-
 def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
     """Return the largest position error (m), its rms in the last second (m), and whether that is lost."""
     errors = trajectory_errors(t, poses, truth)
     if len(errors) == 0:
         return {}
     known = t[(t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])]
-    error_end = position_rms(errors[known >= known[-1] - 1.0])
-    return {
-        "error_max": float(np.linalg.norm(errors[:, :2], axis=1).max()),
-        "error_end": error_end,
-        "lost_at_end": bool(error_end > LOST),
-    }
+    largest = float(np.linalg.norm(errors[:, :2], axis=1).max())
+    end = position_rms(errors[known >= known[-1] - 1.0])
+    return {"error_max": largest, "error_end": end, "lost_at_end": end > LOST}
 
 
 def longest_astray(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:
@@ -114,11 +105,8 @@ def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, flo
 
 
 def position_rms(errors: Array) -> float:
-    """Return the root mean square distance (m) of pose errors (k, 3)."""
+    """Return sqrt(mean |p - p_true|^2), m, of pose errors (k, 3): the absolute trajectory error (ATE)."""
     return root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
-
-
-# --- reach -----------------------------------------------------------------------------------------------
 
 
 class ReachObserver:
@@ -207,11 +195,7 @@ def reach_values(rows: Array) -> dict[str, float]:
     if len(counted) == 0:
         return {}
     reach, squares, cones = counted.T
-    median, tenth = np.quantile(reach, [0.5, 0.1])
-    error = np.sqrt(squares.sum() / cones.sum()) if cones.sum() else np.nan
-    return {
-        "reach_median": float(median),
-        "reach_p10": float(tenth),
-        "reach_short": float(np.mean(reach < SHORT)),
-        "reach_error": float(error),
-    }
+    median, tenth = np.quantile(reach, [0.5, 0.1]).tolist()
+    error = float(np.sqrt(squares.sum() / cones.sum())) if cones.sum() else float("nan")
+    short = float(np.mean(reach < SHORT))
+    return {"reach_median": median, "reach_p10": tenth, "reach_short": short, "reach_error": error}
