@@ -75,9 +75,6 @@ def map_real_log(folder: Path, out: Path) -> RealDrive:
     return RealDrive(folder.name, log, runs, cycles[-1].pose, end)
 
 
-# --- the pose at the end ---------------------------------------------------------------------------------
-
-
 def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Array | None:
     """Return the last pose (3,) of a drive, by the cones of its end laid on those of its beginning.
 

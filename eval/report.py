@@ -258,9 +258,6 @@ QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "hints",
 """Experiments of a quick report: the others have no view of their own."""
 
 
-# --- files -----------------------------------------------------------------------------------------------
-
-
 def measure_figures(
     plan: Plan, folder: Path, only: Sequence[str], about: Mapping[str, str], known: Tables
 ) -> Tables:

@@ -94,10 +94,8 @@ def ratios(figures: Iterable[Metric]) -> dict[str, Metric]:
 def compare(figures: Iterable[Metric], baseline: Mapping[str, float]) -> list[Compared]:
     """Return every figure that has a baseline or should; one that the run lacks is unknown."""
     known = ratios(figures)
-    return [
-        (known.get(key, Metric(key, math.nan, "")), baseline.get(key))
-        for key in dict.fromkeys([*known, *baseline])
-    ]
+    keys = dict.fromkeys([*known, *baseline])
+    return [(known.get(key, Metric(key, math.nan, "")), baseline.get(key)) for key in keys]
 
 
 def write_baseline(file: Path, figures: Iterable[Metric]) -> None:
@@ -306,10 +304,5 @@ def metrics(run: Measurement) -> tuple[Metric, ...]:
     found |= {"landmark": rival, "isam2": isam2, "isam2_p99": isam2_p99}
     found |= {f"mean_lap_{number}": value for number, value in enumerate(laps, start=1)}
     found |= {f"mean_{stage['stage']}": 1e3 * stage["mean"] for stage in stage_times(cycles)[1:]}
-    return tuple(
-        Metric(key, value, _unit(key), BOUNDS.get(key), TOLERANCES.get(key)) for key, value in found.items()
-    )
-
-
-def _unit(key: str) -> str:
-    return "" if "_by_" in key else "s" if key == "solve" else "ms"
+    units = {key: "" if "_by_" in key else "s" if key == "solve" else "ms" for key in found}
+    return tuple(Metric(k, v, units[k], BOUNDS.get(k), TOLERANCES.get(k)) for k, v in found.items())

@@ -236,15 +236,9 @@ def scaling_figures(scaling: Scaling) -> tuple[tuple[str, ...], dict[str, list[t
     """Return the header, and the figures of each estimator with their standard errors, NaN where none."""
     settings, first = scaling.settings, scaling.estimators[0]
     header = (
-        "estimator",
-        f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})",
-        "slope, readings",
-        f"ms at {COMPARED_AT:g} cones",
-        f"{first} / this",
-        "most cones",
-        "ms, lap 2",
-        f"ms, lap {settings.laps}",
-        "peak MB",
+        *("estimator", f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})", "slope, readings"),
+        *(f"ms at {COMPARED_AT:g} cones", f"{first} / this", "most cones"),
+        *("ms, lap 2", f"ms, lap {settings.laps}", "peak MB"),
     )
     rows = {}
     for name in scaling.estimators:
@@ -325,9 +319,11 @@ def plot_scaling(scaling: Scaling) -> Figure:
                     axes.plot(last["at"], 1e3 * last["seconds"], "x", color=color, markersize=10.8)
             axes.set_xscale("log")
         cones.set_ylabel("mean update (ms)")
-        ticks = (50, 100, 200, 500, 1000, 2000)
-        _label_ticks(cones, tuple(tick for tick in ticks if tick <= scaling.settings.cones_max))
-        _label_ticks(detections, scaling.settings.readings)
+        ticks = [n for n in (50, 100, 200, 500, 1000, 2000) if n <= scaling.settings.cones_max]
+        for axes, labelled in ((cones, ticks), (detections, scaling.settings.readings)):
+            axes.xaxis.set_major_locator(FixedLocator(labelled))
+            axes.xaxis.set_major_formatter(ScalarFormatter())
+            axes.xaxis.set_minor_formatter(NullFormatter())
         style.shared_legend(figure, columns=min(len(scaling.estimators), 4))
     return figure
 
@@ -369,9 +365,3 @@ def _draw_power_law(axes: Axes, scaling: Scaling, sweep: Sweep, name: str, color
     at, seconds = np.exp(np.log(points[points["at"].between(*ends)]).mean())
     milliseconds = 1e3 * seconds * (ends / at) ** slope["slope"]
     axes.plot(ends, milliseconds, color=color, linewidth=0.9, alpha=0.8)
-
-
-def _label_ticks(axes: Axes, ticks: tuple[int, ...]) -> None:
-    axes.xaxis.set_major_locator(FixedLocator(ticks))
-    axes.xaxis.set_major_formatter(ScalarFormatter())
-    axes.xaxis.set_minor_formatter(NullFormatter())

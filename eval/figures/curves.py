@@ -123,9 +123,6 @@ def _draw_sigmas(axes: Axes, data: Uncertainty) -> None:
     axes.legend(loc="upper left", ncols=3)
 
 
-# --- simplification --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Simplified:
     """Curve on fewer knots and its distance from the old one."""
@@ -172,16 +169,12 @@ def plot_simplification() -> tuple[Figure, str]:
     with style.figure_context():
         points = data.old.evaluate(np.linspace(*data.old.domain, 400))
         low, high = points.min(axis=0) - 6.0, points.max(axis=0) + 6.0
-        width, height = high - low
-        panel_height = 0.5 * WIDTH * height / width
+        panel_height = 0.5 * WIDTH * (high - low)[1] / (high - low)[0]
         figure = Figure((WIDTH, panel_height + 3.0), layout="constrained")
         grid = figure.add_gridspec(3, 2, height_ratios=(panel_height, 1.1, 0.7))
         before, after = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
-        new = data.weighted.curve
-        for axes, spline, title, color in (
-            (before, data.old, "(a) before", BLUE),
-            (after, new, "(b) after", PURPLE),
-        ):
+        steps = (before, data.old, "(a) before", BLUE), (after, data.weighted.curve, "(b) after", PURPLE)
+        for axes, spline, title, color in steps:
             style.draw_curve(axes, spline, color)
             style.draw_control_points(axes, ring(spline.distinct_control_points), color)
             style.set_frame(axes, low, high)

@@ -32,9 +32,6 @@ _INVISIBLE: Final = 1e-3  # value of a basis function below which it can't be se
 _DIAMOND: Final = 0.8 * MARKER_SIZE
 
 
-# --- expansion -------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Expansion:
     """The three steps, on a curve with the joint covariance of its control points."""
@@ -103,19 +100,16 @@ def plot_expansion() -> tuple[Figure, str]:
     """Draw (a) classified detections, (b) the curve extended to the last of their chain, (c) the update."""
     data = expansion()
     interpolated = np.arange(len(data.detections)) == data.order[-1]
-    steps = (
-        ("(a) detections beyond the end expand the curve, the others update it", data.before, None),
-        (
-            "(b) the curve is extended to the last of their chain; the others update it too",
-            data.extended,
-            data.before,
-        ),
-        ("(c) the curve after the update", data.updated, data.extended),
+    titles = (
+        "(a) detections beyond the end expand the curve, the others update it",
+        "(b) the curve is extended to the last of their chain; the others update it too",
+        "(c) the curve after the update",
     )
+    curves = (data.before, data.extended, data.updated)
     with style.figure_context():
         figure = Figure((WIDTH, 7.4), layout="compressed")
         panels = figure.subplots(3, 1, sharex=True)
-        for axes, (title, boundary, before) in zip(panels, steps, strict=True):
+        for axes, title, boundary, before in zip(panels, titles, curves, (None, *curves[:2]), strict=True):
             _draw_step(axes, data, boundary, data.expands if before is None else interpolated)
             if before is None:
                 ends = (data.before.spline.control_points[-1:], data.detections[data.order])
@@ -150,9 +144,6 @@ def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: B
         style.draw_points(axes, points, "o", of, text)
     shown = np.concatenate([data.detections, data.updated.spline.control_points])
     style.set_frame(axes, shown.min(axis=0) - 1.0, shown.max(axis=0) + 0.8)
-
-
-# --- the fit of S_z --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,9 +259,6 @@ def _draw_basis(axes: Axes, data: Fit) -> None:
         axes.axvline(foot, color=ORANGE, linewidth=0.7, linestyle=":", zorder=1)
     axes.set(xlim=data.curve.domain, ylim=(0.0, 1.0), xlabel="parameter $u$ [m]", ylabel="basis $β_j(u)$")
     axes.set_title("(d) basis: how freely each control point moves")
-
-
-# --- all figures -----------------------------------------------------------------------------------------
 
 
 FIGURES: Final[Mapping[str, Callable[[], tuple[Figure, str]]]] = {  # each returns a figure and its caption

@@ -76,11 +76,10 @@ def plot_map(
             draw_truth(axes, log.truth, WHOLE_TRACK)
         if smoothed is not None and trajectory is not None and len(smoothed):
             thin = MapStyle(path_width=0.25)
-            draw_trajectory(axes, np.asarray(trajectory), thin, "poses as estimated at their time")
+            draw_trajectory(axes, np.asarray(trajectory), thin, label="poses as estimated at their time")
             trajectory = smoothed
         if trajectory is not None and len(trajectory):
-            draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK)
-            draw_unhealthy(axes, np.asarray(trajectory), health, WHOLE_TRACK)
+            draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK, health)
         draw_start(axes, WHOLE_TRACK)
         finish(figure, axes, title)
     return figure
@@ -123,21 +122,18 @@ def draw_orange(axes: Axes, points: Array, label: int, look: MapStyle) -> None:
     style.draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
 
 
-def draw_trajectory(axes: Axes, trajectory: Array, look: MapStyle, label: str = "trajectory") -> None:
-    """Draw poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
+def draw_trajectory(
+    axes: Axes, trajectory: Array, look: MapStyle, health: Sequence[str] = (), label: str = "trajectory"
+) -> None:
+    """Draw poses (n, 3) or positions (n, 2) as a line, map frame (m), and what wasn't healthy in colour."""
     line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": look.path_width, "zorder": 3}
     axes.plot(*trajectory[:, :2].T, label=label, **line)
-
-
-def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], look: MapStyle) -> None:
-    """Draw the parts of the trajectory again that were degraded or lost, each in its colour."""
     for condition, color in HEALTH_COLORS.items():
         chosen = np.array([word == condition for word in health], bool)
         if len(chosen) != len(trajectory) or not chosen.any():
             continue
-        line: dict[str, Any] = {"color": color, "linewidth": 2.0 * look.path_width, "zorder": 3.2}
-        x, y = np.where(chosen[:, None], trajectory[:, :2], np.nan).T
-        axes.plot(x, y, label=condition, **line)
+        line = {"color": color, "linewidth": 2.0 * look.path_width, "zorder": 3.2}
+        axes.plot(*np.where(chosen[:, None], trajectory[:, :2], np.nan).T, label=condition, **line)
 
 
 def draw_truth(axes: Axes, truth: Truth, look: MapStyle) -> None:

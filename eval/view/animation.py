@@ -144,9 +144,6 @@ class _FfmpegFilm:
             self.writer.grab_frame()
 
 
-# --- frames ----------------------------------------------------------------------------------------------
-
-
 class Animation:
     """Draws a frame of a film at equal steps of the log's time; it is an observer of `run.run_online`.
 
@@ -209,8 +206,6 @@ class Animation:
             self._notice, self._notice_until = "\n".join(told), film_time + 2.0
         self._was_closed, self._size = result.closed, sum(result.sizes)
 
-    # --- a frame -----------------------------------------------------------------------------------------
-
     def _draw(self, cycle: ObservedCycle, film_time: float) -> None:
         axes = self._axes
         with style.figure_context():
@@ -221,8 +216,7 @@ class Animation:
             for label, cones in sorted(cycle.map.points.items()):
                 map_plot.draw_orange(axes, cones.points, label, _STYLE)
             path = np.array(self._poses)
-            map_plot.draw_trajectory(axes, path, _STYLE)
-            map_plot.draw_unhealthy(axes, path, self._healths, _STYLE)
+            map_plot.draw_trajectory(axes, path, _STYLE, self._healths)
             _draw_readings(axes, cycle.readings, path[-1])
             _draw_vehicle(axes, path[-1], cycle.window)
             self._show(path[-1:, :2])

@@ -190,8 +190,6 @@ class Recorder:
         self._show_figures(cycle)
         self._show_messages(cycle)
 
-    # --- colours and sizes -------------------------------------------------------------------------------
-
     def _set_styles(self) -> None:
         rerun = self._rerun
         # the y axis of a two-dimensional view points down, as that of a picture does
@@ -224,8 +222,6 @@ class Recorder:
 
     def _log_static(self, path: str, what: Any) -> None:
         self._stream.log(path, what, static=True)
-
-    # --- what has a place --------------------------------------------------------------------------------
 
     def _lines(self, path: str, strips: list[Array]) -> None:
         self._stream.log(path, self._rerun.LineStrips2D.from_fields(strips=strips))
@@ -274,8 +270,6 @@ class Recorder:
         self._points(f"{READINGS}/used", readings.points[readings.used])
         self._points(f"{READINGS}/gated", readings.points[~readings.used])
         self._lines(FEET, list(np.stack([readings.points, readings.feet], axis=1)[readings.used]))
-
-    # --- what has none -----------------------------------------------------------------------------------
 
     def _show_figures(self, cycle: ObservedCycle) -> None:
         offered, used = len(cycle.detections.labels), cycle.result.readings
