@@ -1,6 +1,6 @@
 """`python -m pathspace_graph.eval.hints` measures how many spoiled logs are told and good ones accused.
 
-Good logs of all kinds are judged: what is unusual about them is no mistake, and none of them may be accused.
+Good logs of all kinds are judged: what is unusual about them is no mistake, and none may be accused.
 """
 
 import time
@@ -43,20 +43,23 @@ Row = dict[str, Any]
 MARKER: Final = "hints.csv"  # file of the results, by which their folder is recognized
 AS_SIMULATED: Final = "as simulated"  # kind of good logs with nothing unusual
 CONFIDENCE: Final = 0.95
-CAUSES: Final = {  # causes that tell a mistake, by the longest beginning of its name
-    "positions": ("positions",),
-    "speeds": ("speeds",),
+_SELF_NAMED: Final = (
+    "positions",
+    "speeds",
+    "yaw rate",
+    "y to the right",
+    "stamps",
+    "odometry",
+    "covariances",
+)
+CAUSES: Final[dict[str, tuple[str, ...]]] = {  # that tell a mistake, by the longest beginning of its name
+    **{name: (name,) for name in _SELF_NAMED},
     "all lengths": ("positions", "speeds"),
-    "yaw rate": ("yaw rate",),
     "bearings": ("unexplained",),
-    "y to the right": ("y to the right",),
-    "stamps": ("stamps",),
     "sensor frame": ("sensor frame", "mounting"),
-    "odometry": ("odometry",),
     "speeds in the map frame": ("odometry",),
     "detections in the map frame": ("map frame",),
     "detections 1 s late": ("clocks",),
-    "covariances": ("covariances",),
     "all labels": ("labels",),
 }
 
@@ -136,9 +139,7 @@ GOOD: Final = {
     AS_SIMULATED: Good(),
     "field of view of 180 degrees": Good({"sensor.fov": np.pi}),
     "field of view of 360 degrees": Good({"sensor.fov": 2.0 * np.pi}),
-    "range of 5 m": Good({"sensor.range_max": 5.0}),
-    "range of 8 m": Good({"sensor.range_max": 8.0}),
-    "range of 20 m": Good({"sensor.range_max": 20.0}),
+    **{f"range of {metres:g} m": Good({"sensor.range_max": metres}) for metres in (5.0, 8.0, 20.0)},
     "noise times 3": Good(
         {
             "sensor.range_sigma": 3.0 * _SENSOR.range_sigma,
@@ -149,9 +150,7 @@ GOOD: Final = {
             "odometry.gyro_bias": 3.0 * _ODOMETRY.gyro_bias,
         }
     ),
-    "2 cycles per second": Good({"sensor.rate": 2.0}),
-    "5 cycles per second": Good({"sensor.rate": 5.0}),
-    "20 cycles per second": Good({"sensor.rate": 20.0}),
+    **{f"{rate:g} cycles per second": Good({"sensor.rate": rate}) for rate in (2.0, 5.0, 20.0)},
     "30 % of the cones missed": Good({"sensor.detection_probability": 0.7, "sensor.blind_fraction": 0.15}),
     "5 false positives in a cycle": Good({"sensor.false_positives": 5.0}),
     "30 % wrong colours": Good({"sensor.wrong_colour": 0.3}),

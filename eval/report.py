@@ -66,7 +66,6 @@ COMPARED: Final = (  # metrics of the wider comparison
 )
 CLOSING: Final = ("rmse", "rmse_by_batch", "turn_from_batch", "turn_nees", "inside", "ate")
 """Metrics by which a closed map is held against that of the batch."""
-ENDURANCE: Final = ("rmse", "inside", "nees", "ate")
 REACH: Final = ("reach_median", "reach_p10", "reach_short", "reach_error", "rmse")
 PAPER: Final = ("rmse", "missed", "size", "ate", "inside")
 CENTRE_LINE: Final = (
@@ -89,10 +88,8 @@ class MeasuredTable:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
         """Return the table with the content of a file."""
-        rows = tuple(
-            (label, tuple(Figure(**figure) for figure in figures)) for label, figures in content["rows"]
-        )
-        return cls(**{**content, "header": tuple(content["header"]), "rows": rows})
+        rows = ((label, tuple(Figure(**figure) for figure in figures)) for label, figures in content["rows"])
+        return cls(**{**content, "header": tuple(content["header"]), "rows": tuple(rows)})
 
     def markdown(self, sources: str) -> str:
         """Return the table in Markdown; `sources` is the digest of the present sources."""
@@ -122,7 +119,6 @@ class Plan:
     on_cell: Callable[[int, int], None] | None = None  # observer of the progress of a study
 
     def accuracy(self, folder: Path) -> Views:
-        """Drive all estimators on all tracks."""
         tracks: tuple[Path | int, ...] = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
         estimators, seeds, laps = (ESTIMATORS[:3], (0, 1), 2) if self.quick else (ESTIMATORS, (0, 1), 5)
         base = Baseline(estimator=ONLINE)
@@ -141,10 +137,8 @@ class Plan:
         }
 
     def skidpad(self, folder: Path) -> Views:
-        """Drive the skidpad, which has no lap."""
-        seeds, estimators = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
-        tracks = (Path("skidpad"),)
-        study = Study(name="skidpad", tracks=tracks, estimators=estimators, seeds=seeds, laps=1)
+        seeds, names = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
+        study = Study(name="skidpad", tracks=(Path("skidpad"),), estimators=names, seeds=seeds, laps=1)
         return {"skidpad": views.skidpad_table(self._run(study, folder))}
 
     def camera(self, folder: Path) -> Views:
@@ -152,7 +146,6 @@ class Plan:
         return {"camera": views.camera_table(self._shipped("camera", folder, seeds=(0,))[1])}
 
     def hard(self, folder: Path) -> Views:
-        """Drive the study `hard`."""
         study, frame = self._shipped("hard", folder)
         return {"hard": views.lap_columns(frame, tuple(dict.fromkeys([1, 2, study.laps])), CLOSING)}
 
@@ -160,7 +153,7 @@ class Plan:
         """Drive a hundred laps on each track."""
         study, frame = self._shipped("endurance", folder)
         shown = [lap for lap in (3, 10, 30, 100) if lap <= study.laps] or [study.laps]
-        return {"endurance": views.lap_columns(frame, shown, ENDURANCE)}
+        return {"endurance": views.lap_columns(frame, shown, ("rmse", "inside", "nees", "ate"))}
 
     def centerline(self, folder: Path) -> Views:
         """Drive the estimators of a centre line with a width, and those of two boundaries."""
@@ -182,20 +175,16 @@ class Plan:
         if self.quick:
             study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
         frame = self._run(study, folder)
-        return {
-            "faults": views.faults_table(study, frame),
-            "recovery": views.faults_table(study, frame, views.RECOVERY),
-        }
+        recovery = views.faults_table(study, frame, views.RECOVERY)
+        return {"faults": views.faults_table(study, frame), "recovery": recovery}
 
     def hints(self, folder: Path) -> Views:
-        """Judge good and spoiled logs."""
         small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
         tracks = tuple(map(str, GENERATED[: 1 if self.quick else 3]))
         study = HintStudy(out=folder, tracks=tracks, seeds=(0,), jobs=self.jobs, **small)
         return {"hints": views.hints_table(study.measure(self.on_cell))}
 
     def speed(self, _: Path) -> Views:
-        """Time the benchmark's drives."""
         seeds, laps = (GENERATED[:1], 1) if self.quick else (GENERATED, 5)
         runs = [{m.key: m.value for m in metrics(measure_drive(seed, laps))} for seed in seeds]
         values = pd.DataFrame(runs).reindex(columns=[*SPEED])
@@ -203,11 +192,10 @@ class Plan:
             (label, (Figure.of(values[key], 2 if key.endswith(("isam2", "landmark")) else 1),))
             for key, label in SPEED.items()
         )
-        view = ("figure", "measured"), rows
-        return {"readme-speed": (view[0], rows[:6]), "results-speed": view}
+        header = ("figure", "measured")
+        return {"readme-speed": (header, rows[:6]), "results-speed": (header, rows)}
 
     def real_logs(self, folder: Path) -> Views:
-        """Map the logs of a real car."""
         if not self.real:
             raise SettingsError("--only real: expected logs in --real, found none")
         drives = [real.map_real_log(log, folder) for log in self.real]
@@ -222,10 +210,10 @@ class Plan:
         """Time updates against the size of the map, the detections and the laps."""
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
         header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
-        rows = tuple(
+        rows = (
             (f"`{name}`", tuple(Figure.known(value, 2) for value, _ in row)) for name, row in found.items()
         )
-        return {"results-scaling": (header, rows)}
+        return {"results-scaling": (header, tuple(rows))}
 
     def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:
         """Drive a shipped study, made smaller: with `quick` the first variant for one lap."""

@@ -16,7 +16,6 @@ from .metrics.metric import METRICS
 
 ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
 ONLINE, BATCH, LANDMARKS = ESTIMATORS[:3]
-STATED: Final = {DEFAULT: "stated"}  # name of the default noise, since a simulated log states its own
 TITLES: Final = {"ate": "trajectory error [m]", "nees": "NEES of the map"}
 TITLES_CAMERA: Final = TITLES | {"turn_nees": "NEES of the turn", "told_degraded": "degraded [%]"}
 """Headings in tables that are short of room."""
@@ -134,17 +133,15 @@ def camera_table(frame: pd.DataFrame) -> View:
     """Return the map of each estimator at stated and at measured noise, and the limit of its landmarks."""
     keys, last = ("rmse", "missed", "nees", "turn_nees", "told_degraded"), last_laps(frame)
     runs = last.groupby(["estimator", "variant"], sort=False)
-    parts = {f"`{estimator}`, {STATED.get(noise, noise)}": part for (estimator, noise), part in runs}
+    stated = {DEFAULT: "stated"}  # since a simulated log states its own noise
+    parts = {f"`{estimator}`, {stated.get(noise, noise)}": part for (estimator, noise), part in runs}
     oracle = (_figure("l", last.drop_duplicates([*RUN])), *[Figure(None)] * (len(keys) - 1))  # one a drive
     rows = (*_by_part(parts, keys), ("landmarks, told all", oracle))
     return _header("estimator, noise", keys, TITLES_CAMERA), rows
 
 
 def study_table(study: Study, frame: pd.DataFrame) -> View:
-    """Return each combination: the first metric of the study, its paired difference and p, and the others.
-
-    p is corrected over all comparisons of the study.
-    """
+    """Return each combination: the first metric of the study, its paired difference and p, and the others."""
     several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"]
     first, *others = (key for key in study.metrics if key in frame and key not in TIMES)
     last, rows = last_laps(frame), []

@@ -143,12 +143,11 @@ def baseline_table(compared: Sequence[Compared]) -> TextTable:
 
 
 class ToldLandmarks:
-    """GTSAM's ISAM2 over the cycles of a log whose associations are known.
+    """GTSAM's ISAM2 over the cycles of a log whose associations are known, as a user would write it.
 
-    It is what a user would write instead of the mapper: a pose for each cycle, a point for each cone,
-    odometry factors between poses, and a bearing-range factor for each detection. All factors are GTSAM's
-    own, in C++; its parameters are the defaults. `update` and the newest pose are timed; building the graph
-    is not.
+    A pose for each cycle, a point for each cone, odometry factors between poses, and a bearing-range factor
+    for each detection: all GTSAM's own, in C++, with default parameters. `update` and the newest pose are
+    timed; building the graph is not.
     """
 
     def __init__(self, log: Log) -> None:
@@ -179,11 +178,6 @@ class ToldLandmarks:
         self._pose = np.array([newest.x(), newest.y(), newest.theta()])
         self._count += 1
         return seconds
-
-    def landmarks(self) -> dict[int, Array]:
-        """Return the points (2,) of the landmarks (m), map frame, by the number of their cone."""
-        estimate = self.isam.calculateEstimate()
-        return {cone: estimate.atPoint2(gtsam.symbol("l", cone)) for cone in sorted(self._seen)}
 
     def _add_pose(self, graph: gtsam.NonlinearFactorGraph, odometry: Odometry, t: float) -> None:
         key = gtsam.symbol("x", self._count)

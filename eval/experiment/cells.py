@@ -225,10 +225,7 @@ def run_cell(cell: Cell[Any]) -> Outcome:
 
 
 def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
-    """Run an online estimator cycle by cycle, with its map at the end of each true lap, or a batch one.
-
-    The reach of an online one is measured where there is truth.
-    """
+    """Run an online estimator, with its reach and its map at the end of each true lap, or a batch one."""
     if name not in registry.ONLINE:
         return registry.make_batch(name, settings, log).solve(log)
     estimator, times = registry.make_online(name, settings, log), lap_times(log)

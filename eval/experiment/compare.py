@@ -97,10 +97,7 @@ class Comparison:
 
 
 def gap_columns(result: RunResult, batch: RunResult) -> dict[str, float]:
-    """Return the mean two-way distance of the curves (m) and the rms distance of the poses (m).
-
-    Landmarks are no curves, so a landmark map has the distance of the poses only.
-    """
+    """Return the mean two-way distance (m) of the curves, if any, and the rms distance (m) of the poses."""
     by = gap(result, batch)
     row = {"gap_trajectory": float(np.hypot(by.along, by.across))}
     if by.curves and all(isinstance(b, SplineBoundary) for b in result.map.boundaries.values()):
@@ -248,10 +245,7 @@ def _interval(metric: Metric, row: Any) -> str:
 
 
 def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
-    """Return the paper's Table 1 in the paper's form: a row per lap, the estimators beside each other.
-
-    The rmse, missed and size of an estimator share a column, so that its name stands above all three.
-    """
+    """Return Table 1 as in the paper: a row per lap, with rmse, missed and size under each estimator."""
     titles = "   ".join(metric.heading for metric in PAPER)
     header, rows = ("lap", *(f"{name}\n{titles}" for name in laps)), []
     for lap, beside in enumerate(zip_longest(*laps.values()), start=1):

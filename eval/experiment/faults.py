@@ -25,7 +25,6 @@ from .frame import RUN, last_laps, write_csv, write_results
 from .study import Study, find_study, read_study
 from .tables import TextTable, group_starts
 
-SUITE: Final = Path("faults")  # name of the shipped study that is the suite
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
 FAULT_COLUMNS: Final = 4  # panels side by side in the figure of faults
 Values = Mapping[str, Any]  # values of an outcome by name
@@ -60,7 +59,7 @@ def fault_of(noise: str) -> Fault:
 
 
 def suite() -> Study:
-    return read_study(find_study(SUITE))
+    return read_study(find_study(Path("faults")))
 
 
 def by_kind(study: Study) -> list[list[str]]:
@@ -98,10 +97,7 @@ def _with(study: Study, noises: Sequence[str]) -> Study:
 
 
 def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return plain values of every noise of a suite, in its order, at the end of the last lap.
-
-    `runs` that finished count, `failed` ones don't. What is not known is NaN.
-    """
+    """Return plain values of every noise of a suite at the end of the last lap; NaN is unknown."""
     every, failures = beside_clean(frame), frame.loc[frame["failure"] != "", "noise"].value_counts()
     of = ((fault_of(noise), every[every["noise"] == noise], failures.get(noise, 0)) for noise in study.noise)
     return [_outcome(fault, runs, int(failed)) for fault, runs, failed in of]
@@ -207,10 +203,7 @@ COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {  # columns after fault
 
 
 def plot_faults(study: Study, runs: pd.DataFrame) -> Figure:
-    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said.
-
-    The runs are those of `beside_clean`.
-    """
+    """Draw a panel for each kind of fault: the mean and the runs of `beside_clean`, filled if told."""
     panels = [noises for noises in by_kind(study) if noises != [CLEAN]]
     rows = max(1, -(-len(panels) // FAULT_COLUMNS))
     with style.figure_context():
@@ -264,10 +257,7 @@ def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool
 
 
 def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
-    """Write the results of every run, and the table, the values and the figure; return the table's text.
-
-    `faults.csv` has calibration and notices as JSON texts.
-    """
+    """Write the results of every run, and the table, the values and the figure; return the table's text."""
     faults = outcomes(study, frame)
     table = fault_table(study, faults)
     text = f"{table.title}\n\n{table.text()}\n"
@@ -277,7 +267,7 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
     about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
     write_json(out / "faults.json", {"format": "pathspace-faults/1", **about, "faults": faults}, indent=1)
     flat = pd.DataFrame(faults)
-    for key in ("calibration", "said"):
+    for key in ("calibration", "said"):  # as JSON texts
         flat[key] = [json.dumps(value, ensure_ascii=False) for value in flat[key]]
     write_csv(out / "faults.csv", flat)
     style.save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})

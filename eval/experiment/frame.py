@@ -30,10 +30,7 @@ LEVEL: Final = 0.95  # confidence level of intervals; a difference is significan
 
 
 def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -> pd.DataFrame:
-    """Return a row for each run and lap, and one without metrics for a run that failed.
-
-    Every varied setting is a column.
-    """
+    """Return a row for each run and lap, or one for a failed run; every varied setting is a column."""
     rows = []
     for cell, record in cells:
         assert record is not None, "every cell has been run by now"
@@ -170,10 +167,7 @@ class Contrast:
 
 
 def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
-    """Return every combination against the baseline of its noise, in the study's order.
-
-    p is corrected by Holm's method over all comparisons of the metric in the study.
-    """
+    """Return every combination against the baseline of its noise, in the study's order."""
     known = last_laps(frame).astype({metric: float}).dropna(subset=[metric])
     runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
     nothing, contrasted = pd.Series(dtype=float), []

@@ -45,10 +45,7 @@ class Expansion:
 
 
 def expansion() -> Expansion:
-    """Classify the detections, extend the curve to the last of their chain, update it with the others.
-
-    Detections lie on the curve and beyond its end.
-    """
+    """Classify the detections, extend the curve to the last of their chain, update it with the others."""
     # a curve along the bend that drifts to its outside and ends beside the origin
     along, settings = np.linspace(-18.0, 0.0, 13), CkfSettings(threshold=2.0, separation=2.0)
     spline = fit_spline(_on_bend(along, -0.03 * (along - along[0])), 6, periodic=False)
@@ -165,10 +162,7 @@ class Fit:
 
 
 def fit() -> Fit:
-    """Compute C = C_mu + (B' B + L)^-1 B' (y - B C_mu) of the detections and of their sigma points.
-
-    The curve swings to either side, and detections lie to its left, seen from the vehicle.
-    """
+    """Compute C = C_mu + (B' B + L)^-1 B' (y - B C_mu) of the detections and of their sigma points."""
     x = 3.5 * np.arange(9)
     points = np.stack([x, -3.0 * np.cos(2.0 * np.pi * x / x[-1])], axis=1)
     curve = BSpline.open_uniform(points, interval=3.5).clamp()

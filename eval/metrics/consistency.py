@@ -130,10 +130,7 @@ class NormalErrors:
         return mean_of(np.abs(self.errors) <= factor * self.sigmas)
 
     def mean_squared(self) -> float:
-        """Return mean (error / sigma)^2, which is 1 where the band is honest; NaN without cones.
-
-        In contrast to NEES, correlations between the cones don't count.
-        """
+        """Return mean (error / sigma)^2, without correlations: 1 is honest; NaN without cones."""
         return mean_of((self.errors / self.sigmas) ** 2)
 
 

@@ -197,10 +197,7 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
 
 
 def closes_falsely(run: RunResult, truth: Truth) -> bool:
-    """Return whether the loop closed before the true drive was back at the start.
-
-    An online run closes at a cycle, and a batch at the end of the log.
-    """
+    """Return whether the loop closed, a batch at its end, before the true drive was back at the start."""
     if not run.map.closed:
         return False
     t, ends = closing_stamp(run), lap_end_indices(truth.poses)

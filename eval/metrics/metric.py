@@ -194,10 +194,7 @@ class Column:
 
 
 def column_of(text: str) -> Column:
-    """Return a column such as `rmse`, `rmse@1`, `rmse@later`, `rmse@all` or `slope(bias, bias_true)`.
-
-    SettingsError where a metric or the laps are unknown.
-    """
+    """Return a column such as `rmse`, `rmse@1`, `rmse@later`, `rmse@all` or `slope(bias, bias_true)`."""
     slope = _SLOPE.fullmatch(text)
     if slope is not None:
         return Column(_metric(slope[1]), given=_metric(slope[2]))

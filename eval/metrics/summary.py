@@ -31,10 +31,7 @@ GATE: Final = ("dropped", "late", "refused")  # counts of the gate in each cycle
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
-    """Return the estimator, settings, versions, laps and timing, and with truth the paper's metrics.
-
-    Hints about the log are in it as well.
-    """
+    """Return the estimator, settings, versions, laps, timing, hints, and with truth the paper's metrics."""
     seconds = [record.seconds for record in result.cycles]
     summary: dict[str, Any] = {
         "estimator": result.estimator,

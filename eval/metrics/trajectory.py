@@ -27,10 +27,7 @@ STARTING: Final = 0.03  # share of lap 1 on which the map has only begun, and cy
 
 
 def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
-    """Return poses (n, 3) [x, y, theta] at the stamps t (n,), linear between poses (N, 3) at pose_t (N,).
-
-    Headings turn the shorter way.
-    """
+    """Return poses (n, 3) at t (n,), linear between poses (N, 3) at pose_t (N,), by the shorter turn."""
     columns = (poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2]))
     x, y, theta = (np.interp(t, pose_t, column) for column in columns)
     return np.stack([x, y, wrap_angle(theta)], axis=1)

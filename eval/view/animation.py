@@ -103,10 +103,7 @@ class GifFilm:
         self._time = 0.0
 
     def add(self, figure: Figure, seconds: float) -> None:
-        """Add a figure, of the same size as those before, as a frame that is shown for a time (s).
-
-        The format counts in hundredths of a second, whose rounding must not add up.
-        """
+        """Add a figure as a frame, whose time (s) is rounded to 0.01 s so that errors do not add up."""
         picture = Image.fromarray(pixels_of(figure))
         # one index of the palette is left for what does not change
         self._frames.append(picture.quantize(255, dither=Image.Dither.NONE))

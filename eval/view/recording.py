@@ -163,10 +163,7 @@ def blueprint(rerun: Any) -> Any:
 
 
 class Recorder:
-    """Shows each cycle to a stream of rerun; `recording` makes one, and `run.run_online` calls it.
-
-    Colours and sizes are logged once, for all times. Each cycle logs places and numbers.
-    """
+    """Shows each cycle to a stream of rerun: places and numbers; colours and sizes once, for all times."""
 
     def __init__(self, rerun: Any, stream: Any, settings: RecordingSettings, truth: Truth | None) -> None:
         self._rerun, self._stream, self._settings = rerun, stream, settings
