@@ -87,7 +87,6 @@ class MeasuredTable:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return the table with the content of a file."""
         rows = ((label, tuple(Figure(**figure) for figure in figures)) for label, figures in content["rows"])
         return cls(**{**content, "header": tuple(content["header"]), "rows": tuple(rows)})
 
@@ -150,7 +149,6 @@ class Plan:
         return {"hard": views.lap_columns(frame, tuple(dict.fromkeys([1, 2, study.laps])), CLOSING)}
 
     def endurance(self, folder: Path) -> Views:
-        """Drive a hundred laps on each track."""
         study, frame = self._shipped("endurance", folder)
         shown = [lap for lap in (3, 10, 30, 100) if lap <= study.laps] or [study.laps]
         return {"endurance": views.lap_columns(frame, shown, ("rmse", "inside", "nees", "ate"))}
@@ -207,7 +205,6 @@ class Plan:
         }
 
     def scale(self, _: Path) -> Views:
-        """Time updates against the size of the map, the detections and the laps."""
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
         header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
         rows = (
@@ -251,8 +248,7 @@ def measure_figures(
 ) -> Tables:
     """Run experiments, each in a folder of its own, and return the known tables with theirs in place.
 
-    `about` holds the command, the commit and the date of the run. `pages` is no experiment: only the pages
-    are written anew.
+    `about` holds command, commit and date of the run. `pages` is no experiment: only pages are written anew.
     """
     tables, sources = dict(known), sources_digest()
     for name in only:
@@ -266,7 +262,6 @@ def measure_figures(
 
 
 def to_json(tables: Tables) -> dict[str, Any]:
-    """Return the content of a file with the tables."""
     return {"format": FORMAT, "tables": {name: asdict(table) for name, table in sorted(tables.items())}}
 
 
@@ -282,7 +277,6 @@ def read_figures(file: Path) -> Tables:
 
 
 def sources_digest() -> str:
-    """Return the digest of the sources that the figures depend on."""
     return code_digest(ESTIMATOR_ROOMS)
 
 

@@ -59,7 +59,6 @@ class Figure:
 
     @property
     def text(self) -> str:
-        """Return the figure as a table shows it."""
         if self.value is None:
             return ""
         half = "" if self.half is None else f" ± {self.half:.{self.digits}f}"

@@ -93,7 +93,6 @@ class Drives:
 
 
 def make_drives(settings: ScalingSettings) -> Drives:
-    """Simulate the drives that the estimators are to be timed on."""
     seed = settings.seed
     long = drive_log(open_road(int(settings.cones_max), GAP), seed)
     seen = cones_seen(long)

@@ -1,7 +1,6 @@
 """Time of an update against the size of the map, its detections and the laps: points, power laws, figures.
 
-All estimators run in one process: every cycle goes to each in turn, so that whatever slows the machine down
-slows all alike.
+All estimators run in one process, every cycle in turn, so that what slows the machine down slows all alike.
 """
 
 import math
@@ -93,8 +92,7 @@ def run_lanes(
 ) -> None:
     """Give cycle k to every lane in turn; the lane that is first moves on by one with k.
 
-    So none always follows the same other. A lane is stopped where its last updates took more than `budget`
-    (s) on average. BLAS has one thread.
+    So none always follows the same other. A lane stops if its last updates took over `budget` s on average.
     """
     runners = [lane.updates(settings, budget) for lane in lanes]
     with threadpool_limits(limits=1):
@@ -152,8 +150,7 @@ class Scaling:
 def binned(sweep: Sweep, lane: Lane, edges: Array) -> pd.DataFrame:
     """Return a point for each interval between two `edges` that holds cycles of a lane.
 
-    It has the mean abscissa `at`, the mean `seconds` of an update and `size` of the map, and the number of
-    `cycles`.
+    It has the means of `at`, of `seconds` of an update and of the map's `size`, and the number of `cycles`.
     """
     at = lane.at[: len(lane.seconds)]
     frame = pd.DataFrame({"at": at, "seconds": lane.seconds, "size": lane.sizes})
@@ -169,8 +166,7 @@ def fit_slope(
 ) -> dict[str, Any]:
     """Return the power law `seconds ~ at^slope`, a line fitted to the logarithms from `fit_from` on.
 
-    The standard `error` is that of the exponent; both are NaN where there are too few `points`, which lie
-    from `low` to `high`.
+    `error` is the standard error of the exponent; both are NaN with too few `points`, from `low` to `high`.
     """
     kept = points[points["at"] >= fit_from].astype({"at": float, "seconds": float})
     slope = error = float("nan")

@@ -157,7 +157,6 @@ class NamedLog:
 
     @cached_property
     def id(self) -> str:
-        """Identity among the logs of one experiment."""
         return identity(log=self.name)
 
     def load(self) -> Log:

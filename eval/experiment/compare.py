@@ -272,8 +272,7 @@ def _cell(metric: Metric, row: dict[Any, Any]) -> str:
 def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
     """Write all files of a comparison (docs/formats.md), or on failure none.
 
-    Where there are several logs, each has a folder of its own. An earlier comparison in `out` is kept as a
-    numbered backup.
+    Each of several logs has a folder of its own. An earlier comparison in `out` becomes a numbered backup.
     """
     frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": comparison.times()}
     if comparison.paired:

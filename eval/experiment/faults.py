@@ -127,8 +127,7 @@ def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
 def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the last laps of the runs that finished, beside the clean run of the same track and seed.
 
-    `ratio` of the rmse and `size_ratio` are to those of that run, NaN where either has no map; `told` is
-    whether anything was said.
+    `ratio` (of rmse) and `size_ratio` are to that run, NaN without a map; `told` is whether anything was said.
     """
     last = last_laps(frame)
     last = last.reindex(columns=[*dict.fromkeys([*last, *_MEASURED])]).astype(dict.fromkeys(_MEASURED, float))

@@ -101,7 +101,6 @@ class Study:
             column_of(column)
 
     def simulation(self, noise: str) -> SimulationSettings:
-        """Return the settings of the drives under a named noise."""
         overrides = dict(self.noise[noise])
         if "laps" in overrides:
             raise SettingsError(f"noise.{noise}.laps: expected laps as a key of the study itself")
@@ -164,7 +163,6 @@ def _short(value: Any) -> str:
 
 
 def shipped_studies() -> list[str]:
-    """Return the names of the studies that ship with the package."""
     return sorted(file.stem for file in SHIPPED.glob("*.toml"))
 
 

@@ -67,7 +67,6 @@ class TextTable:
         return self._formatted("simple", self.rows)
 
     def markdown(self) -> str:
-        """Return the title and the table in Markdown."""
         rows = [[cell.replace("|", r"\|") for cell in row] for row in self.rows]
         title = f"{self.title}\n\n" if self.title else ""
         return f"{title}{self._formatted('pipe', rows)}\n"

@@ -152,9 +152,8 @@ def normal_errors(track: Map, truth: Truth) -> NormalErrors:
 def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
     """Return e' (B Sigma B' + diag(s^2))^-1 e, the errors of both curves at all true cones at once.
 
-    In contrast to the NEES of the map, Sigma is the joint covariance of both boundaries from the detections,
-    and s the scatter of the cones about a smooth curve: this judges whether the batch itself predicts the
-    true cones.
+    Unlike in the NEES of the map, Sigma is joint over both boundaries and of the detections, and s the
+    scatter of cones about a smooth curve: this judges whether the batch itself predicts the true cones.
     """
     errors, sigmas, designs, offset = [np.zeros(0)], [np.zeros(0)], [], 0
     size = len(result.map_covariance)
@@ -176,8 +175,7 @@ def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
 def with_marginals(track: Map) -> Map:
     """Return the splines of a map with their control points' own covariances and no cross terms.
 
-    It is the squared basis of the paper: `B blockdiag(Sigma) B' = sum_j beta_j(u)^2 Sigma_jj` (section State
-    Uncertainty).
+    The paper's squared basis (State Uncertainty): `B blockdiag(Sigma) B' = sum_j beta_j(u)^2 Sigma_jj`.
     """
     splines = {k: b for k, b in track.boundaries.items() if isinstance(b, SplineBoundary)}
     blocks = {label: np.kron(np.eye(b.size), np.ones((2, 2))) for label, b in splines.items()}

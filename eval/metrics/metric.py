@@ -52,7 +52,6 @@ class Metric:
         return root_mean_square(known) if self.average == "rms" else float(np.mean(known))
 
     def text(self, value: float) -> str:
-        """Return a value as tables show it."""
         return UNKNOWN if np.isnan(value) else f"{self.factor * value:.{self.digits}f}"
 
 

@@ -37,10 +37,9 @@ def limit(log: Log, track: Map) -> dict[str, float]:
 
 
 def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:
-    """Return the landmark batch with oracle association: each detection knows its true cone.
+    """Return the landmark batch with oracle association: each detection knows its true cone, the landmark.
 
-    It also knows the sensor's constant errors and the true noise, where the log has them. Numbers of
-    landmarks are indices of true cones.
+    It also knows the sensor's constant errors and the true noise, where the log has them.
     """
     truth = _truth(log)
     if truth.associations is None:
@@ -156,8 +155,7 @@ class Gap:
 def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
     """Return the turn (rad) of a map from that of the batch over the same log, and the rmse by the batch's.
 
-    Small turns about one point add up, so the turn from the batch is the difference of the turns from the
-    truth. Where either map lacks the metric, the result does too.
+    The turns are from the truth, since small turns add up. Empty where either map lacks a metric.
     """
     if not {"turn", "rmse"} <= set(values) & set(batch):
         return {}
@@ -166,7 +164,6 @@ def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str,
 
 
 def gap(run: RunResult, reference: RunResult) -> Gap:
-    """Return the gap of a run from a reference over the same log."""
     shared = sorted(set(run.map.boundaries) & set(reference.map.boundaries))
     own, others = run.map.boundaries, reference.map.boundaries
     curves = {NAMES[label]: accuracy.two_way_distance(own[label], others[label]) for label in shared}

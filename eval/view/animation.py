@@ -111,7 +111,6 @@ class GifFilm:
         self._durations.append(10 * (round(100.0 * self._time) - round(100.0 * before)))
 
     def write(self, file: Path) -> None:
-        """Write a film that is repeated for ever."""
         if not self._frames:
             raise OutputError(f"{file.name}: expected a film of at least one frame, found none")
         first, *others = self._frames
@@ -144,8 +143,7 @@ class _FfmpegFilm:
 class Animation:
     """Draws a frame of a film at equal steps of the log's time; it is an observer of `run.run_online`.
 
-    `finish` must be called at the end. The true cones are drawn, and held against the map, where there is
-    a truth.
+    Call `finish` at the end. The true cones are drawn, and held against the map, where there is a truth.
     """
 
     def __init__(
@@ -173,7 +171,6 @@ class Animation:
         self._text = self._figure.add_axes(_TEXT_PLACE)
 
     def __call__(self, cycle: ObservedCycle) -> None:
-        """Note what happened in a cycle, and draw a frame where one is due."""
         t, result = cycle.detections.t, cycle.result
         self._begin = t if self._begin is None else self._begin
         film_time = (t - self._begin) * self.settings.seconds_per_lap / self._lap

@@ -72,10 +72,9 @@ def recording(
     settings: RecordingSettings | None = None,
     truth: Truth | None = None,
 ) -> "Iterator[Recorder]":
-    """Yield an observer that records each cycle that it is shown, to a file, to a window, or to both.
+    """Yield an observer that records each cycle, and the true cones if known, to a file, a window, or both.
 
-    The file appears as a whole at the end, and an earlier one is kept as a numbered backup. The window stays
-    open afterwards. The true cones are shown where there is a truth.
+    The file appears as a whole at the end, with an earlier one as a numbered backup; the window stays open.
     """
     target = None if file is None else Path(file)
     check_recording(target, window)
