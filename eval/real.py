@@ -138,9 +138,6 @@ def _registered(start: list[Array], end: list[Array], pose: Array) -> tuple[int,
     return count, -distance, pose
 
 
-# --- tables ----------------------------------------------------------------------------------------------
-
-
 def ends_table(drives: Sequence[RealDrive]) -> View:
     """Return how far each last pose is off, and dead reckoning's, and how many loops are closed."""
     rows = []

@@ -104,9 +104,6 @@ Tables = dict[str, MeasuredTable]
 Views = dict[str, View]
 
 
-# --- experiments -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class Plan:
     """What is driven; each experiment keeps its runs in a folder, and returns the tables that it measures."""

@@ -60,9 +60,6 @@ TOLERANCES: Final = {  # share by which a ratio may be larger than its baseline
 }
 
 
-# --- figures and their baseline --------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Metric:
     """One figure of a run, of which less is better."""

@@ -179,13 +179,9 @@ class Cell(Generic[D]):
     @cached_property
     def id(self) -> str:
         """Identity of everything that the result depends on, also the code."""
-        return identity(
-            drive=self.drive.id,
-            estimator=self.estimator,
-            settings=asdict(self.settings),
-            yardsticks=self.measured.get("yardsticks", False),
-            code=code_digest(MEASURED),
-        )
+        yardsticks, code = self.measured.get("yardsticks", False), code_digest(MEASURED)
+        parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": asdict(self.settings)}
+        return identity(**parts, yardsticks=yardsticks, code=code)
 
     @property
     def names(self) -> dict[str, Any]:
@@ -233,9 +229,6 @@ def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
     observer = ReachObserver(log.truth)
     result = run_online(log, estimator, name=name, snapshot_times=times, observers=[observer])
     return replace(result, reach=observer.rows)
-
-
-# --- records ---------------------------------------------------------------------------------------------
 
 
 def record_cell(cell: Cell[Drive]) -> Record:

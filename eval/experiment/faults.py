@@ -127,15 +127,14 @@ def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
 def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the last laps of the runs that finished, beside the clean run of the same track and seed.
 
-    `ratio` (of rmse) and `size_ratio` are to that run, NaN without a map; `told` is whether anything was said.
+    `ratio` (of rmse) and `size_ratio` are to that run, NaN without a map; `told`: anything was said.
     """
     last = last_laps(frame)
     last = last.reindex(columns=[*dict.fromkeys([*last, *_MEASURED])]).astype(dict.fromkeys(_MEASURED, float))
     clean = last[last["noise"] == CLEAN].set_index([*RUN])
     own = pd.MultiIndex.from_frame(last[[*RUN]])
     for name, ratio in (("rmse", "ratio"), ("size", "size_ratio")):
-        reference = clean[name].where(clean[name] > 0.0).reindex(own)
-        last[ratio] = last[name] / reference.to_numpy()
+        last[ratio] = last[name] / clean[name].where(clean[name] > 0.0).reindex(own).to_numpy()
     return last.assign(told=(last["said"] != "") | (last["told_lost"] > 0.0))
 
 

@@ -85,9 +85,6 @@ def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
     return finished.groupby(list(RUN_OF), sort=False).tail(1)
 
 
-# --- statistics ------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """Mean and its 95 % interval by Student's t over runs."""

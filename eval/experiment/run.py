@@ -21,19 +21,8 @@ from pathspace_graph.io.parsing import read_json
 from pathspace_graph.loop.drive_record import end_with
 from pathspace_graph.sim.track import Track
 
-from .cells import (
-    CELLS,
-    Cell,
-    Drive,
-    Outcome,
-    Record,
-    load_tracks,
-    read_record,
-    record_cell,
-    record_of,
-    track_digest,
-    write_record,
-)
+from . import cells as store
+from .cells import CELLS, Cell, Drive, Outcome, Record, load_tracks, track_digest
 from .frame import frame_of
 from .study import Study
 
@@ -148,16 +137,16 @@ def run_plan(plan: Plan, out: Path, *, retry_failed: bool = False, **how: Any) -
     remove_manifest(out)  # of a study that goes on; the last step writes it again
 
     def kept(cell: Cell[Drive]) -> Record | None:
-        record = read_record(out, cell)
+        record = store.read_record(out, cell)
         return None if record is not None and retry_failed and record["failure"] else record
 
     records = run_cells(
         plan.cells,
-        record_cell,
-        lambda cell, error: record_of(cell, Outcome.failed(cell, error)),
+        store.record_cell,
+        lambda cell, error: store.record_of(cell, Outcome.failed(cell, error)),
         begin=lambda: write_json(out / STUDY_FILE, plan.resolved(), indent=1),
         read=kept,
-        write=lambda cell, record: write_record(out, cell, record),
+        write=lambda cell, record: store.write_record(out, cell, record),
         **how,
     )
     return frame_of(plan.study, list(zip(plan.cells, records, strict=True)))

@@ -69,7 +69,7 @@ class Study:
         self._check_lists()
         if not isinstance(self.yardsticks, bool):
             raise SettingsError(f"yardsticks: expected true or false, found {shown(self.yardsticks)}")
-        if isinstance(self.laps, bool) or not isinstance(self.laps, int):
+        if type(self.laps) is not int:
             raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
         if DEFAULT in self.variants:
             raise SettingsError(f"variants.{DEFAULT}: that name is kept for the settings as they are")
@@ -91,7 +91,7 @@ class Study:
         generated = [track for track in self.tracks if not isinstance(track, Path)]
         for name, values in {"seeds": self.seeds, "tracks": generated}.items():
             for value in values:
-                if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+                if type(value) is not int or value < 0:
                     raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
         for name in self.estimators:
             check_name(name, known_estimators(), "estimators: expected a known estimator")
@@ -157,9 +157,6 @@ def _short(value: Any) -> str:
     if isinstance(value, int | float) and float(f"{value:g}") == value and not isinstance(value, bool):
         return f"{value:g}"
     return str(value)
-
-
-# --- files -----------------------------------------------------------------------------------------------
 
 
 def shipped_studies() -> list[str]:

@@ -213,6 +213,5 @@ def _draw_curvature(axes: Axes, data: Simplification) -> None:
     knots = data.old.arc_length(data.weighted.curve.breaks)
     on_axis = np.stack([knots, np.zeros(len(knots))], axis=1)
     style.draw_points(axes, on_axis, "|", PURPLE, markersize=9.0, clip_on=False)
-    axes.set_ylim(0.0)
-    axes.set(xlabel="length along the curve [m]", ylabel="curvature\n[1/m]")
+    axes.set(ylim=(0.0, None), xlabel="length along the curve [m]", ylabel="curvature\n[1/m]")
     axes.set_title("(d) curvature, and the knots that follow it")

@@ -80,7 +80,6 @@ def plot_map(
             trajectory = smoothed
         if trajectory is not None and len(trajectory):
             draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK, health)
-        draw_start(axes, WHOLE_TRACK)
         finish(figure, axes, title)
     return figure
 
@@ -153,7 +152,8 @@ def draw_start(axes: Axes, look: MapStyle) -> None:
 
 
 def finish(figure: Figure, axes: Axes, title: str | None) -> None:
-    """Add frame, axis titles and legend, and give the figure the map's shape."""
+    """Mark the start, add frame, axis titles and legend, and give the figure the map's shape."""
+    draw_start(axes, WHOLE_TRACK)
     axes.margins(0.0)
     axes.autoscale_view()
     drawn = np.array([axes.get_xlim(), axes.get_ylim()])
@@ -189,6 +189,5 @@ def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
         axes.plot(*poses[:, :2].T, label="odometry alone", **line)
         if log.truth is not None:
             draw_truth(axes, log.truth, WHOLE_TRACK)
-        draw_start(axes, WHOLE_TRACK)
         finish(figure, axes, title)
     return figure

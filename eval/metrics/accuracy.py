@@ -131,11 +131,7 @@ def driving_order(truth: Truth, label: int) -> Array:
     samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / 0.1)) + 1)  # every 0.1 m
     nearest = np.asarray(KDTree(along_polyline(samples, length, path)).query(cones)[1])
     by_path: Array = cones[np.argsort(nearest, kind="stable")]
-    return by_path if _perimeter(by_path) < _perimeter(cones) else cones
-
-
-def _perimeter(points: Array) -> float:
-    return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
+    return min(cones, by_path, key=lambda of: np.linalg.norm(of - np.roll(of, 1, axis=0), axis=1).sum())
 
 
 def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:

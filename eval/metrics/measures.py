@@ -131,12 +131,8 @@ def _map_values(
     track: Map, truth: Truth | None, ghost_settings: GhostSettings | None, marginals: bool
 ) -> dict[str, float]:
     """Return the metrics of a map as it stands; without true cones only those that need none."""
-    values: dict[str, float] = {
-        "size": track.size,
-        "closed": bool(track.closed),
-        "bytes": map_bytes(track),
-        "bytes_covariance": covariance_bytes(track),
-    }
+    values: dict[str, float] = {"size": track.size, "closed": bool(track.closed)}
+    values |= {"bytes": map_bytes(track), "bytes_covariance": covariance_bytes(track)}
     if truth is None or not has_cones(truth):
         return values
     distances = accuracy.cone_distances(track, truth)
@@ -181,8 +177,7 @@ def _centre_values(track: Map, truth: Truth) -> dict[str, float]:
 
 
 def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
-    """Return what is known of the vehicle at the end of the log, how far its pose jumped where the map was
-    replaced (m), and whether the loop has closed falsely."""
+    """Return errors of the vehicle at the log's end, its largest jump (m), and whether it closed falsely."""
     values: dict[str, float] = {}
     if truth is None or len(run.trajectory) == 0:
         return values

@@ -195,17 +195,13 @@ class Column:
 def column_of(text: str) -> Column:
     """Return a column such as `rmse`, `rmse@1`, `rmse@later`, `rmse@all` or `slope(bias, bias_true)`."""
     slope = _SLOPE.fullmatch(text)
-    if slope is not None:
-        return Column(_metric(slope[1]), given=_metric(slope[2]))
     key, _, laps = text.partition("@")
-    metric = _metric(key)
+    for name in slope.groups() if slope else (key,):
+        check_name(name, METRICS, "columns: expected a known metric")
+    if slope is not None:
+        return Column(METRICS[slope[1]], given=METRICS[slope[2]])
     if laps and laps not in (EVERY_LAP, LATER_LAPS) and not laps.isdecimal():
         raise SettingsError(
             f"columns: expected a lap's number, '{LATER_LAPS}' or '{EVERY_LAP}' after @, found '{text}'"
         )
-    return Column(metric, laps)
-
-
-def _metric(key: str) -> Metric:
-    check_name(key, METRICS, "columns: expected a known metric")
-    return METRICS[key]
+    return Column(METRICS[key], laps)

@@ -74,10 +74,8 @@ def longest_astray(t: Array, poses: Array, truth: Truth, since: float) -> dict[s
     astray = np.append(errors > ASTRAY, False).astype(int)
     begins = np.flatnonzero(np.diff(astray, prepend=0) == 1)
     ends = np.minimum(np.flatnonzero(np.diff(astray, prepend=0) == -1), len(stamps) - 1)
-    return {
-        "astray_time": float((stamps[ends] - stamps[begins]).max(initial=0.0)),
-        "astray_way": float((driven[ends] - driven[begins]).max(initial=0.0)),
-    }
+    time, way = (float((of[ends] - of[begins]).max(initial=0.0)) for of in (stamps, driven))
+    return {"astray_time": time, "astray_way": way}
 
 
 def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, float]:

@@ -150,11 +150,11 @@ class Animation:
         self,
         film: Film,
         lap_seconds: float,
-        settings: FilmSettings | None = None,
+        settings: FilmSettings,
         truth: Truth | None = None,
         title: str = "",
     ) -> None:
-        self.settings = settings or FilmSettings()
+        self.settings = settings
         self._film, self._lap, self._truth, self._title = film, lap_seconds, truth, title
         self._begin: float | None = None
         self._frames = 0

@@ -312,9 +312,6 @@ def _rgb(color: str) -> tuple[int, ...]:
     return tuple(bytes.fromhex(color.removeprefix("#")))
 
 
-# --- all that watches a run ------------------------------------------------------------------------------
-
-
 class Watched(Protocol):
     """Options of a command by which a run is watched."""
 
