@@ -1,7 +1,4 @@
-"""Logs of a real car, without truth: mapped online, as a batch and by landmarks, and held against each other.
-
-docs/real.md explains the tables.
-"""
+"""Logs of a real car without truth, mapped in three ways and held against each other (docs/real.md)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

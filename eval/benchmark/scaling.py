@@ -104,10 +104,7 @@ def run_lanes(
 
 
 def peak_memory(lane: Lane, settings: MapperSettings) -> float:
-    """Return the most memory (MB) that Python and numpy held at a time while the lane ran.
-
-    By tracemalloc, which sees nothing of what GTSAM and LAPACK allocate, and slows everything down.
-    """
+    """Return the peak (MB) of Python and numpy, not GTSAM, as the lane ran, by (slow) tracemalloc."""
     tracemalloc.start()
     try:
         before, _ = tracemalloc.get_traced_memory()

@@ -129,10 +129,7 @@ def run_study(study: Study, out: Path | str | None = None, **how: Any) -> pd.Dat
 
 
 def run_plan(plan: Plan, out: Path, *, retry_failed: bool = False, **how: Any) -> pd.DataFrame:
-    """Run a study; `how` holds `jobs`, `cluster` and `on_cell` of `run_cells`.
-
-    OutputError if the folder belongs to another study.
-    """
+    """Run a study, OutputError in another's folder; `how`: `jobs`, `cluster`, `on_cell` of `run_cells`."""
     check_folder(out, plan)
     remove_manifest(out)  # of a study that goes on; the last step writes it again
 

@@ -199,10 +199,7 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
 
 
 def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
-    """Draw every pair, their mean and its interval: a row for each combination, a panel for each metric.
-
-    Only the first metrics of the study have a panel, and there is none where no run differs.
-    """
+    """Draw pairs, mean and interval of each combination for the first metrics; None where no run differs."""
     every = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
     panels = [p for p in every if any(d != 0.0 for contrast in p for d in contrast.differences)][:MAX_PANELS]
     if not panels:

@@ -146,10 +146,7 @@ def normals(spline: BSpline, u: Array) -> Array:
 def uncertainty_band(
     boundary: SplineBoundary, u: Array, scale: float = 1.0, widest: float = np.inf
 ) -> tuple[Array, Array]:
-    """Return S(u) +- 2 scale sigma(u) n(u), the band's left and right edge (k, 2), m, at u (k,).
-
-    The edges are at most `widest` (m) away from the curve.
-    """
+    """Return the left and right edge (k, 2), S(u) +- 2 scale sigma(u) n(u), at most `widest` m off."""
     spline = boundary.spline
     half = np.minimum(SIGMAS * scale * spline.normal_sigma(u, boundary.covariance), widest)
     offsets = half[:, None] * normals(spline, u)
