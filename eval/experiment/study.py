@@ -32,30 +32,38 @@ class Baseline:
     """Combination that every other one is compared with, on the same track, seed and noise."""
 
     variant: str = DEFAULT
-    estimator: str | None = None  # without one, each estimator is compared with itself
+    estimator: str | None = None
+    """Estimator of the baseline; without one, each estimator is compared with itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
     """Grid of tracks x seeds x noise x estimators x settings, checked when it is made."""
 
-    tracks: tuple[Path | int, ...]  # track files, and seeds of generated tracks
+    tracks: tuple[Path | int, ...]
+    """Track files, and seeds of generated tracks."""
     seeds: tuple[int, ...] = (0,)
     laps: int = 5
     name: str = "study"
     question: str = ""
-    estimators: tuple[str, ...] = (registry.DEFAULT,)  # online or batch ones; `all` for every one
+    estimators: tuple[str, ...] = (registry.DEFAULT,)
+    """Estimators to run, online and batch ones; `all` stands for every one."""
     # overrides of the simulation by the name of a noise, and of the settings by that of a variant
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
-    variants: Mapping[str, Overrides] = field(default_factory=dict)  # beside `default`, always there
+    """Overrides of the simulation by the name of a noise."""
+    variants: Mapping[str, Overrides] = field(default_factory=dict)
+    """Overrides of the settings by the name of a variant; `default` is always there."""
     grids: tuple[Mapping[str, Sequence[Any]], ...] = ()
     """Values by dotted field; every combination is a variant with a name such as `lag=1, steps=2`."""
-    baseline: Baseline = field(default_factory=Baseline)  # combination that the others are compared with
-    metrics: tuple[str, ...] = ("rmse", "missed", "size", "ms_mean")  # compared with the baseline
+    baseline: Baseline = field(default_factory=Baseline)
+    """Combination that the others are compared with."""
+    metrics: tuple[str, ...] = ("rmse", "missed", "size", "ms_mean")
+    """Metrics that the summary compares with the baseline."""
     columns: tuple[str, ...] = ()
     """Columns of the table by track: `rmse` is the last lap's, `rmse@1` that of lap 1, and
     `slope(bias, bias_true)` says how much of the truth an estimate has found."""
-    yardsticks: bool = False  # whether to compute the limit of every run by a batch with oracle associations
+    yardsticks: bool = False
+    """Whether to compute the limit of every run, which takes a landmark batch with oracle associations."""
 
     def __post_init__(self) -> None:
         """Raise SettingsError if anything is unknown, empty, named twice or out of its range."""
