@@ -1,6 +1,6 @@
 """`python -m pathspace_graph.eval.hints` measures how many spoiled logs are told and good ones accused.
 
-Good logs of all kinds are judged: what is unusual about them is no mistake, and none of them may be accused.
+Good logs of all kinds are judged: what is unusual about them is no mistake, and none may be accused.
 """
 
 import time
@@ -40,28 +40,28 @@ from pathspace_graph.sim.track import Track
 
 Row = dict[str, Any]
 
-MARKER: Final = "hints.csv"
-"""File of the results, by which their folder is recognized."""
-AS_SIMULATED: Final = "as simulated"
-"""Kind of good logs with nothing unusual."""
+MARKER: Final = "hints.csv"  # file of the results, by which their folder is recognized
+AS_SIMULATED: Final = "as simulated"  # kind of good logs with nothing unusual
 CONFIDENCE: Final = 0.95
-CAUSES: Final = {
-    "positions": ("positions",),
-    "speeds": ("speeds",),
+_SELF_NAMED: Final = (
+    "positions",
+    "speeds",
+    "yaw rate",
+    "y to the right",
+    "stamps",
+    "odometry",
+    "covariances",
+)
+CAUSES: Final[dict[str, tuple[str, ...]]] = {  # that tell a mistake, by the longest beginning of its name
+    **{name: (name,) for name in _SELF_NAMED},
     "all lengths": ("positions", "speeds"),
-    "yaw rate": ("yaw rate",),
     "bearings": ("unexplained",),
-    "y to the right": ("y to the right",),
-    "stamps": ("stamps",),
     "sensor frame": ("sensor frame", "mounting"),
-    "odometry": ("odometry",),
     "speeds in the map frame": ("odometry",),
     "detections in the map frame": ("map frame",),
     "detections 1 s late": ("clocks",),
-    "covariances": ("covariances",),
     "all labels": ("labels",),
 }
-"""A mistake whose name begins so is told if one of these causes is named; the longest beginning counts."""
 
 
 # --- good logs -------------------------------------------------------------------------------------------
@@ -124,10 +124,6 @@ def backs_up(log: Log) -> Log:
     return replace(log, odometry=odometry, cycles=tuple(cycles), truth=None)
 
 
-def slow_odometry(log: Log) -> Log:
-    return replace(log, odometry=Odometry(log.odometry.t[::5], log.odometry.twist[::5]))
-
-
 def in_unix_time(log: Log) -> Log:
     odometry = replace(log.odometry, t=log.odometry.t + 1.7e9)
     cycles = tuple(replace(cycle, t=cycle.t + 1.7e9) for cycle in log.cycles)
@@ -139,9 +135,7 @@ GOOD: Final = {
     AS_SIMULATED: Good(),
     "field of view of 180 degrees": Good({"sensor.fov": np.pi}),
     "field of view of 360 degrees": Good({"sensor.fov": 2.0 * np.pi}),
-    "range of 5 m": Good({"sensor.range_max": 5.0}),
-    "range of 8 m": Good({"sensor.range_max": 8.0}),
-    "range of 20 m": Good({"sensor.range_max": 20.0}),
+    **{f"range of {metres:g} m": Good({"sensor.range_max": metres}) for metres in (5.0, 8.0, 20.0)},
     "noise times 3": Good(
         {
             "sensor.range_sigma": 3.0 * _SENSOR.range_sigma,
@@ -152,9 +146,7 @@ GOOD: Final = {
             "odometry.gyro_bias": 3.0 * _ODOMETRY.gyro_bias,
         }
     ),
-    "2 cycles per second": Good({"sensor.rate": 2.0}),
-    "5 cycles per second": Good({"sensor.rate": 5.0}),
-    "20 cycles per second": Good({"sensor.rate": 20.0}),
+    **{f"{rate:g} cycles per second": Good({"sensor.rate": rate}) for rate in (2.0, 5.0, 20.0)},
     "30 % of the cones missed": Good({"sensor.detection_probability": 0.7, "sensor.blind_fraction": 0.15}),
     "5 false positives in a cycle": Good({"sensor.false_positives": 5.0}),
     "30 % wrong colours": Good({"sensor.wrong_colour": 0.3}),
@@ -172,7 +164,9 @@ GOOD: Final = {
     "three cones in a cycle": Good(edit=few_cones),
     "stands for 10 s first": Good(edit=stands_first),
     "backs up": Good(edit=backs_up),
-    "odometry at 10 Hz": Good(edit=slow_odometry),
+    "odometry at 10 Hz": Good(
+        edit=lambda log: replace(log, odometry=Odometry(log.odometry.t[::5], log.odometry.twist[::5]))
+    ),
     "stamps since 1970": Good(edit=in_unix_time),
     "open road": Good(road=open_road),
 }
@@ -217,7 +211,6 @@ class HintStudy:
         return pd.DataFrame([row for of in rows for row in of])
 
     def run(self) -> TextTable:
-        """Judge every log, write the results and return the table."""
         check_target(self.out, MARKER)
         with progress("judging") as advance:
             frame = self.measure(advance)
@@ -228,8 +221,7 @@ class HintStudy:
         return table
 
 
-HintCell = tuple[HintStudy, Track, int, str]
-"""Logs of one kind of one drive: the study, the track, the seed and the kind."""
+HintCell = tuple[HintStudy, Track, int, str]  # study, track, seed and kind of good log
 
 
 def judge(cell: HintCell) -> list[Row]:

@@ -1,7 +1,4 @@
-"""Logs of a real car, without truth: mapped online, as a batch and by landmarks, and held against each other.
-
-docs/real.md explains the tables.
-"""
+"""Logs of a real car without truth, mapped in three ways and held against each other (docs/real.md)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,22 +28,18 @@ from .metrics.reference import aligned_distance
 from .metrics.summary import summarize
 from .views import Figure, View
 
-RUNS: Final = {
+RUNS: Final = {  # estimator of each run
     "online": registry.DEFAULT,
     "batch": registry.DEFAULT_BATCH,
     "landmarks": "landmark-fixed-lag",
 }
-"""Estimator of each run."""
-FIRST, LAST = 25.0, 14.0
-"""Lengths of the beginning of a drive, and of its end that is registered on it (m)."""
-LEAST: Final = 6
-"""Least number of cones of a registration."""
-ERRORS: Final = {
+FIRST, LAST = 25.0, 14.0  # lengths of the beginning of a drive, and of its end that is registered on it (m)
+LEAST: Final = 6  # least number of cones of a registration
+ERRORS: Final = {  # errors of the sensor in the table, with titles and units
     "latency": ("latency [ms]", 1e3),
     "yaw": ("yaw [°]", 180.0 / np.pi),
     "range_scale": ("scale [%]", 100.0),
 }
-"""Errors of the sensor in the table, in these units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +49,8 @@ class RealDrive:
     name: str
     log: Log
     runs: dict[str, RunResult]
-    dead_reckoned: Array
-    """Last pose (3,) by odometry alone."""
-    registered: Array | None
-    """Last pose (3,) by registration, where the drive comes back to its beginning."""
+    dead_reckoned: Array  # last pose (3,) by odometry alone
+    registered: Array | None  # last pose (3,) by registration, where the drive comes back to its beginning
 
     def off(self, pose: Array) -> tuple[float, float]:
         """Return how far (m) and by what angle (degrees) a last pose (3,) is from that by registration."""
@@ -79,9 +70,6 @@ def map_real_log(folder: Path, out: Path) -> RealDrive:
     cycles, _ = seen_cycles(log)
     end = None if log.measured is None else end_by_registration(cycles, log.measured)
     return RealDrive(folder.name, log, runs, cycles[-1].pose, end)
-
-
-# --- the pose at the end ---------------------------------------------------------------------------------
 
 
 def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Array | None:
@@ -145,9 +133,6 @@ def _registered(start: list[Array], end: list[Array], pose: Array) -> tuple[int,
         pose = np.append(target - moved, turn)
         distance = float(np.hypot(*(move_points(pose, points) - targets).T).mean())
     return count, -distance, pose
-
-
-# --- tables ----------------------------------------------------------------------------------------------
 
 
 def ends_table(drives: Sequence[RealDrive]) -> View:

@@ -36,9 +36,8 @@ FORMAT: Final = "pathspace-figures/1"
 FILE: Final = "figures.json"
 ABLATIONS: Final = ("gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
 """Studies of parts of the method, driven by one estimator on the generated tracks for two laps."""
-ONE_SEED: Final = ("gauge", "robust")
-"""Those with so many variants that they are driven with one seed."""
-PAGES: Final = {
+ONE_SEED: Final = ("gauge", "robust")  # those with so many variants that they are driven with one seed
+PAGES: Final = {  # tables of each page, from the root of the project
     "README.md": ("readme-accuracy", "readme-compared", "readme-speed", "readme-real"),
     "docs/results.md": (
         *("results-speed", "results-tracks", "results-laps", "results-compared", "results-scaling"),
@@ -49,10 +48,8 @@ PAGES: Final = {
     "docs/reliability.md": ("faults", "recovery", "hints"),
     "docs/ablations.md": ("centerline", *ABLATIONS),
 }
-"""Tables of each page, from the root of the project."""
-GENERATED: Final = (0, 1, 2)
-"""Seeds of the generated tracks, also of the benchmark."""
-SPEED: Final = {
+GENERATED: Final = (0, 1, 2)  # seeds of the generated tracks, also of the benchmark
+SPEED: Final = {  # figures of the benchmark, each with its label
     "mean_by_isam2": "mean update by that of GTSAM's `ISAM2` on landmarks, given every association",
     "p99_by_isam2": "99th percentile by that of `ISAM2`",
     "mean_by_landmark": "mean update by that of `landmark-fixed-lag`",
@@ -62,16 +59,13 @@ SPEED: Final = {
     "swap": "the update that swaps the map [ms]",
     "solve": "the batch of the open lap, in its own process [s]",
 }
-"""Figures of the benchmark, each with its label."""
 README: Final = ("rmse", "missed", "reach_median")
-COMPARED: Final = (
+COMPARED: Final = (  # metrics of the wider comparison
     *("missed_2m", "missed_1m", "rmse_capped", "mapped_to_truth", "truth_to_mapped", "ghost_landmarks"),
     *("ghost_metres", "along", "across", "nees", "inside", "closed", "bytes", "bytes_covariance"),
 )
-"""Metrics of the wider comparison."""
 CLOSING: Final = ("rmse", "rmse_by_batch", "turn_from_batch", "turn_nees", "inside", "ate")
 """Metrics by which a closed map is held against that of the batch."""
-ENDURANCE: Final = ("rmse", "inside", "nees", "ate")
 REACH: Final = ("reach_median", "reach_p10", "reach_short", "reach_error", "rmse")
 PAPER: Final = ("rmse", "missed", "size", "ate", "inside")
 CENTRE_LINE: Final = (
@@ -85,21 +79,16 @@ class MeasuredTable:
     """A table of figures, and how they were measured."""
 
     command: str
-    commit: str
-    """Commit of the sources, where that was known."""
+    commit: str  # commit of the sources, where that was known
     date: str
-    sources: str
-    """Digest of the sources of the estimators."""
+    sources: str  # digest of the sources of the estimators
     header: tuple[str, ...]
     rows: Rows
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return the table with the content of a file."""
-        rows = tuple(
-            (label, tuple(Figure(**figure) for figure in figures)) for label, figures in content["rows"]
-        )
-        return cls(**{**content, "header": tuple(content["header"]), "rows": rows})
+        rows = ((label, tuple(Figure(**figure) for figure in figures)) for label, figures in content["rows"])
+        return cls(**{**content, "header": tuple(content["header"]), "rows": tuple(rows)})
 
     def markdown(self, sources: str) -> str:
         """Return the table in Markdown; `sources` is the digest of the present sources."""
@@ -115,25 +104,17 @@ Tables = dict[str, MeasuredTable]
 Views = dict[str, View]
 
 
-# --- experiments -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class Plan:
     """What is driven; each experiment keeps its runs in a folder, and returns the tables that it measures."""
 
-    quick: bool = False
-    """Drive little, to see that everything works."""
-    tracks: tuple[Path, ...] = ()
-    """Folders of track files that are driven beside the generated tracks."""
-    real: tuple[Path, ...] = ()
-    """Folders of logs of a real car."""
+    quick: bool = False  # drive little, to see that everything works
+    tracks: tuple[Path, ...] = ()  # folders of track files that are driven beside the generated tracks
+    real: tuple[Path, ...] = ()  # folders of logs of a real car
     jobs: int = 1
-    on_cell: Callable[[int, int], None] | None = None
-    """Observer of the progress of a study."""
+    on_cell: Callable[[int, int], None] | None = None  # observer of the progress of a study
 
     def accuracy(self, folder: Path) -> Views:
-        """Drive all estimators on all tracks."""
         tracks: tuple[Path | int, ...] = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
         estimators, seeds, laps = (ESTIMATORS[:3], (0, 1), 2) if self.quick else (ESTIMATORS, (0, 1), 5)
         base = Baseline(estimator=ONLINE)
@@ -152,10 +133,8 @@ class Plan:
         }
 
     def skidpad(self, folder: Path) -> Views:
-        """Drive the skidpad, which has no lap."""
-        seeds, estimators = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
-        tracks = (Path("skidpad"),)
-        study = Study(name="skidpad", tracks=tracks, estimators=estimators, seeds=seeds, laps=1)
+        seeds, names = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
+        study = Study(name="skidpad", tracks=(Path("skidpad"),), estimators=names, seeds=seeds, laps=1)
         return {"skidpad": views.skidpad_table(self._run(study, folder))}
 
     def camera(self, folder: Path) -> Views:
@@ -163,15 +142,13 @@ class Plan:
         return {"camera": views.camera_table(self._shipped("camera", folder, seeds=(0,))[1])}
 
     def hard(self, folder: Path) -> Views:
-        """Drive the study `hard`."""
         study, frame = self._shipped("hard", folder)
         return {"hard": views.lap_columns(frame, tuple(dict.fromkeys([1, 2, study.laps])), CLOSING)}
 
     def endurance(self, folder: Path) -> Views:
-        """Drive a hundred laps on each track."""
         study, frame = self._shipped("endurance", folder)
         shown = [lap for lap in (3, 10, 30, 100) if lap <= study.laps] or [study.laps]
-        return {"endurance": views.lap_columns(frame, shown, ENDURANCE)}
+        return {"endurance": views.lap_columns(frame, shown, ("rmse", "inside", "nees", "ate"))}
 
     def centerline(self, folder: Path) -> Views:
         """Drive the estimators of a centre line with a width, and those of two boundaries."""
@@ -193,20 +170,16 @@ class Plan:
         if self.quick:
             study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
         frame = self._run(study, folder)
-        return {
-            "faults": views.faults_table(study, frame),
-            "recovery": views.faults_table(study, frame, views.RECOVERY),
-        }
+        recovery = views.faults_table(study, frame, views.RECOVERY)
+        return {"faults": views.faults_table(study, frame), "recovery": recovery}
 
     def hints(self, folder: Path) -> Views:
-        """Judge good and spoiled logs."""
         small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
         tracks = tuple(map(str, GENERATED[: 1 if self.quick else 3]))
         study = HintStudy(out=folder, tracks=tracks, seeds=(0,), jobs=self.jobs, **small)
         return {"hints": views.hints_table(study.measure(self.on_cell))}
 
     def speed(self, _: Path) -> Views:
-        """Time the benchmark's drives."""
         seeds, laps = (GENERATED[:1], 1) if self.quick else (GENERATED, 5)
         runs = [{m.key: m.value for m in metrics(measure_drive(seed, laps))} for seed in seeds]
         values = pd.DataFrame(runs).reindex(columns=[*SPEED])
@@ -214,11 +187,10 @@ class Plan:
             (label, (Figure.of(values[key], 2 if key.endswith(("isam2", "landmark")) else 1),))
             for key, label in SPEED.items()
         )
-        view = ("figure", "measured"), rows
-        return {"readme-speed": (view[0], rows[:6]), "results-speed": view}
+        header = ("figure", "measured")
+        return {"readme-speed": (header, rows[:6]), "results-speed": (header, rows)}
 
     def real_logs(self, folder: Path) -> Views:
-        """Map the logs of a real car."""
         if not self.real:
             raise SettingsError("--only real: expected logs in --real, found none")
         drives = [real.map_real_log(log, folder) for log in self.real]
@@ -230,13 +202,12 @@ class Plan:
         }
 
     def scale(self, _: Path) -> Views:
-        """Time updates against the size of the map, the detections and the laps."""
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
         header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
-        rows = tuple(
+        rows = (
             (f"`{name}`", tuple(Figure.known(value, 2) for value, _ in row)) for name, row in found.items()
         )
-        return {"results-scaling": (header, rows)}
+        return {"results-scaling": (header, tuple(rows))}
 
     def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:
         """Drive a shipped study, made smaller: with `quick` the first variant for one lap."""
@@ -269,16 +240,12 @@ QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "hints",
 """Experiments of a quick report: the others have no view of their own."""
 
 
-# --- files -----------------------------------------------------------------------------------------------
-
-
 def measure_figures(
     plan: Plan, folder: Path, only: Sequence[str], about: Mapping[str, str], known: Tables
 ) -> Tables:
     """Run experiments, each in a folder of its own, and return the known tables with theirs in place.
 
-    `about` holds the command, the commit and the date of the run. `pages` is no experiment: only the pages
-    are written anew.
+    `about` holds command, commit and date of the run. `pages` is no experiment: only pages are written anew.
     """
     tables, sources = dict(known), sources_digest()
     for name in only:
@@ -292,7 +259,6 @@ def measure_figures(
 
 
 def to_json(tables: Tables) -> dict[str, Any]:
-    """Return the content of a file with the tables."""
     return {"format": FORMAT, "tables": {name: asdict(table) for name, table in sorted(tables.items())}}
 
 
@@ -308,7 +274,6 @@ def read_figures(file: Path) -> Tables:
 
 
 def sources_digest() -> str:
-    """Return the digest of the sources that the figures depend on."""
     return code_digest(ESTIMATOR_ROOMS)
 
 

@@ -16,12 +16,10 @@ from .metrics.metric import METRICS
 
 ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
 ONLINE, BATCH, LANDMARKS = ESTIMATORS[:3]
-STATED: Final = {DEFAULT: "stated"}
-"""Name of the default noise, since a simulated log states its own."""
 TITLES: Final = {"ate": "trajectory error [m]", "nees": "NEES of the map"}
 TITLES_CAMERA: Final = TITLES | {"turn_nees": "NEES of the turn", "told_degraded": "degraded [%]"}
 """Headings in tables that are short of room."""
-FAULTS: Final = {
+FAULTS: Final = {  # columns of the table of faults: value and digits
     "rmse by clean": ("ratio_mean", 2),
     "least": ("ratio_min", 2),
     "most": ("ratio_max", 2),
@@ -32,20 +30,17 @@ FAULTS: Final = {
     "called degraded [%]": ("told_degraded", 1),
     "said so [%]": ("told", 0),
 }
-"""Columns of the table of faults, each with its value and digits."""
-RECOVERY: Final = {
+RECOVERY: Final = {  # how long a vehicle is over a metre off after closing: value and digits
     "longest time [s]": ("astray_time", 1),
     "longest way [m]": ("astray_way", 0),
 }
-"""Columns of the table of how long a vehicle is over a metre off, once the loop has closed."""
 
 
 @dataclass(frozen=True)
 class Figure:
     """A measured value, with half the width of its 95 % interval over drives or runs."""
 
-    value: float | None
-    """Value in the table's unit; None where there is none."""
+    value: float | None  # value in the table's unit; None where there is none
     half: float | None = None
     digits: int = 3
 
@@ -64,17 +59,14 @@ class Figure:
 
     @property
     def text(self) -> str:
-        """Return the figure as a table shows it."""
         if self.value is None:
             return ""
         half = "" if self.half is None else f" ± {self.half:.{self.digits}f}"
         return f"{self.value:.{self.digits}f}{half}"
 
 
-Rows = tuple[tuple[str, tuple[Figure, ...]], ...]
-"""Label and figures of each row."""
-View = tuple[tuple[str, ...], Rows]
-"""Header and rows of a table."""
+Rows = tuple[tuple[str, tuple[Figure, ...]], ...]  # label and figures of each row
+View = tuple[tuple[str, ...], Rows]  # header and rows of a table
 
 
 def lap_columns(frame: pd.DataFrame, laps: Sequence[int], keys: Sequence[str]) -> View:
@@ -140,17 +132,15 @@ def camera_table(frame: pd.DataFrame) -> View:
     """Return the map of each estimator at stated and at measured noise, and the limit of its landmarks."""
     keys, last = ("rmse", "missed", "nees", "turn_nees", "told_degraded"), last_laps(frame)
     runs = last.groupby(["estimator", "variant"], sort=False)
-    parts = {f"`{estimator}`, {STATED.get(noise, noise)}": part for (estimator, noise), part in runs}
+    stated = {DEFAULT: "stated"}  # since a simulated log states its own noise
+    parts = {f"`{estimator}`, {stated.get(noise, noise)}": part for (estimator, noise), part in runs}
     oracle = (_figure("l", last.drop_duplicates([*RUN])), *[Figure(None)] * (len(keys) - 1))  # one a drive
     rows = (*_by_part(parts, keys), ("landmarks, told all", oracle))
     return _header("estimator, noise", keys, TITLES_CAMERA), rows
 
 
 def study_table(study: Study, frame: pd.DataFrame) -> View:
-    """Return each combination: the first metric of the study, its paired difference and p, and the others.
-
-    p is corrected over all comparisons of the study.
-    """
+    """Return each combination: the first metric of the study, its paired difference and p, and the others."""
     several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"]
     first, *others = (key for key in study.metrics if key in frame and key not in TIMES)
     last, rows = last_laps(frame), []

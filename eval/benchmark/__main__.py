@@ -14,20 +14,9 @@ from pathspace_graph.console import note, output, say
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import atomic_file, check_file_target, write_json
 
-from .measurement import (
-    BASELINE,
-    Measurement,
-    baseline_table,
-    compare,
-    measure_drive,
-    metrics,
-    metrics_table,
-    read_baseline,
-    write_baseline,
-)
+from . import measurement
 
-WORSE, BAD_INPUT = 1, 2
-"""Exit codes where a figure is worse than the baseline, and where a file can't be read or written."""
+WORSE, BAD_INPUT = 1, 2  # exit codes: a figure is worse than the baseline, a bad file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +33,8 @@ class Benchmark:
     """Mark what is worse than the baseline by more than its tolerance; the exit code is 1 then."""
     write_baseline: bool = False
     """Make the ratios of this run the baseline."""
-    baseline: Path = BASELINE
+    baseline: Path = measurement.BASELINE
     """File of the baseline; by default the one that comes with the package."""
-
-    def measure(self) -> Measurement:
-        """Simulate the drive and measure a run on it."""
-        return measure_drive(self.seed, self.laps)
 
 
 def main() -> None:
@@ -67,20 +52,20 @@ def _is_worse(benchmark: Benchmark) -> bool:
     for file in (benchmark.json, benchmark.baseline if benchmark.write_baseline else None):
         if file is not None:
             check_file_target(file)
-    baseline = read_baseline(benchmark.baseline) if benchmark.compare else {}
-    figures = metrics(benchmark.measure())
+    baseline = measurement.read_baseline(benchmark.baseline) if benchmark.compare else {}
+    figures = measurement.metrics(measurement.measure_drive(benchmark.seed, benchmark.laps))
     if benchmark.json is not None:
         with atomic_file(benchmark.json) as temporary:
             write_json(temporary, [asdict(metric) for metric in figures])
     console = output()
-    console.print(metrics_table(figures).rich())
-    found = compare(figures, baseline) if benchmark.compare else []
+    console.print(measurement.metrics_table(figures).rich())
+    found = measurement.compare(figures, baseline) if benchmark.compare else []
     if benchmark.compare:
-        table = baseline_table(found)
+        table = measurement.baseline_table(found)
         console.print(table.title)
         console.print(table.rich())
     if benchmark.write_baseline:
-        write_baseline(benchmark.baseline, figures)
+        measurement.write_baseline(benchmark.baseline, figures)
         say(f"baseline written to {benchmark.baseline}")
     return any(metric.worse_than(before) for metric, before in found)
 

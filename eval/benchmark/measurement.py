@@ -39,13 +39,10 @@ from pathspace_graph.sim.track_generator import generate_track
 
 FORMAT: Final = "pathspace-benchmark-baseline/1"
 BASELINE: Final = Path(__file__).with_name("baseline.json")
-AHEAD: Final = 20.0
-"""Distance ahead (m) at which the track is looked at after every cycle, as a controller does."""
-RIVAL: Final = "landmark-fixed-lag"
-"""Estimator that gets the same cycles in turn."""
-WARM_UP: Final = 50
-"""Number of cycles after which the window is full, before which the means do not begin."""
-BOUNDS: Final = {
+AHEAD: Final = 20.0  # distance ahead (m) at which the track is looked at each cycle, as a controller does
+RIVAL: Final = "landmark-fixed-lag"  # estimator that gets the same cycles in turn
+WARM_UP: Final = 50  # number of cycles after which the window is full, before which the means do not begin
+BOUNDS: Final = {  # largest value allowed of a figure, in its unit
     "p99": 10.0,  # a mean cycle of 3 ms was measured when it was chosen
     "last_lap_by_lap_2": 1.1,
     "closing": 100.0,
@@ -55,17 +52,12 @@ BOUNDS: Final = {
     "ahead_open": 1.0,
     "ahead_closed": 1.0,
 }
-"""Largest value allowed of a figure, in its unit."""
-TOLERANCES: Final = {
+TOLERANCES: Final = {  # share by which a ratio may be larger than its baseline
     # two means over the whole run
     **dict.fromkeys(("mean_by_landmark", "mean_by_isam2"), 0.2),
     "last_lap_by_lap_2": 0.15,
     **dict.fromkeys(("p99_by_mean", "closing_by_mean"), 0.5),  # tails, single cycles
 }
-"""Share by which a ratio may be larger than its baseline; those of the solver's delay have none."""
-
-
-# --- figures and their baseline --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -73,14 +65,10 @@ class Metric:
     """One figure of a run, of which less is better."""
 
     key: str
-    value: float
-    """Value; NaN where the run was too short for the figure."""
-    unit: str
-    """Unit of the value; empty for a ratio."""
-    bound: float | None = None
-    """Largest value allowed, if any value is not."""
-    tolerance: float | None = None
-    """Share by which the figure may be larger than its baseline, if there is one."""
+    value: float  # value; NaN where the run was too short for the figure
+    unit: str  # unit of the value; empty for a ratio
+    bound: float | None = None  # largest value allowed, if any value is not
+    tolerance: float | None = None  # share by which it may be larger than its baseline, if there is one
 
     @property
     def holds(self) -> bool:
@@ -92,8 +80,7 @@ class Metric:
         return baseline is not None and not self.value <= baseline * (1.0 + (self.tolerance or 0.0))
 
 
-Compared = tuple[Metric, float | None]
-"""A figure of this run, and that of the baseline."""
+Compared = tuple[Metric, float | None]  # a figure of this run, and that of the baseline
 
 
 def ratios(figures: Iterable[Metric]) -> dict[str, Metric]:
@@ -104,10 +91,8 @@ def ratios(figures: Iterable[Metric]) -> dict[str, Metric]:
 def compare(figures: Iterable[Metric], baseline: Mapping[str, float]) -> list[Compared]:
     """Return every figure that has a baseline or should; one that the run lacks is unknown."""
     known = ratios(figures)
-    return [
-        (known.get(key, Metric(key, math.nan, "")), baseline.get(key))
-        for key in dict.fromkeys([*known, *baseline])
-    ]
+    keys = dict.fromkeys([*known, *baseline])
+    return [(known.get(key, Metric(key, math.nan, "")), baseline.get(key)) for key in keys]
 
 
 def write_baseline(file: Path, figures: Iterable[Metric]) -> None:
@@ -154,16 +139,12 @@ def baseline_table(compared: Sequence[Compared]) -> TextTable:
     return TextTable("against the baseline", header, tuple(rows))
 
 
-# --- ISAM2 on landmarks ----------------------------------------------------------------------------------
-
-
 class ToldLandmarks:
-    """GTSAM's ISAM2 over the cycles of a log whose associations are known.
+    """GTSAM's ISAM2 over the cycles of a log whose associations are known, as a user would write it.
 
-    It is what a user would write instead of the mapper: a pose for each cycle, a point for each cone,
-    odometry factors between poses, and a bearing-range factor for each detection. All factors are GTSAM's
-    own, in C++; its parameters are the defaults. `update` and the newest pose are timed; building the graph
-    is not.
+    A pose for each cycle, a point for each cone, odometry factors between poses, and a bearing-range factor
+    for each detection: all GTSAM's own, in C++, with default parameters. `update` and the newest pose are
+    timed; building the graph is not.
     """
 
     def __init__(self, log: Log) -> None:
@@ -194,11 +175,6 @@ class ToldLandmarks:
         self._pose = np.array([newest.x(), newest.y(), newest.theta()])
         self._count += 1
         return seconds
-
-    def landmarks(self) -> dict[int, Array]:
-        """Return the points (2,) of the landmarks (m), map frame, by the number of their cone."""
-        estimate = self.isam.calculateEstimate()
-        return {cone: estimate.atPoint2(gtsam.symbol("l", cone)) for cone in sorted(self._seen)}
 
     def _add_pose(self, graph: gtsam.NonlinearFactorGraph, odometry: Odometry, t: float) -> None:
         key = gtsam.symbol("x", self._count)
@@ -231,25 +207,16 @@ class ToldLandmarks:
             graph.add(gtsam.BearingRangeFactor2D(key, landmark, bearing, ranges[i], noise))
 
 
-# --- a run ---------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """Result of one run."""
 
-    cycles: Sequence[CycleRecord]
-    """Cycles, with processor times in place of wall times."""
-    laps: int
-    """Number of complete laps."""
-    rival: Sequence[float]
-    """Time of each update of the landmark graph (s)."""
-    isam2: Sequence[float]
-    """Time of each update of ISAM2 (s)."""
-    solve: float = math.nan
-    """Time of the batch of the open lap in its own process (s)."""
-    ahead: Sequence[float] = ()
-    """Time of each look at the track ahead (s), after each cycle."""
+    cycles: Sequence[CycleRecord]  # cycles, with processor times in place of wall times
+    laps: int  # number of complete laps
+    rival: Sequence[float]  # time of each update of the landmark graph (s)
+    isam2: Sequence[float]  # time of each update of ISAM2 (s)
+    solve: float = math.nan  # time of the batch of the open lap in its own process (s)
+    ahead: Sequence[float] = ()  # time of each look at the track ahead (s), after each cycle
 
     @property
     def closing(self) -> int | None:
@@ -328,10 +295,5 @@ def metrics(run: Measurement) -> tuple[Metric, ...]:
     found |= {"landmark": rival, "isam2": isam2, "isam2_p99": isam2_p99}
     found |= {f"mean_lap_{number}": value for number, value in enumerate(laps, start=1)}
     found |= {f"mean_{stage['stage']}": 1e3 * stage["mean"] for stage in stage_times(cycles)[1:]}
-    return tuple(
-        Metric(key, value, _unit(key), BOUNDS.get(key), TOLERANCES.get(key)) for key, value in found.items()
-    )
-
-
-def _unit(key: str) -> str:
-    return "" if "_by_" in key else "s" if key == "solve" else "ms"
+    units = {key: "" if "_by_" in key else "s" if key == "solve" else "ms" for key in found}
+    return tuple(Metric(k, v, units[k], BOUNDS.get(k), TOLERANCES.get(k)) for k, v in found.items())

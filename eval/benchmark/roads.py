@@ -17,20 +17,13 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
-GAP, DENSE_GAP, DENSE_RANGE = 5.0, 1.0, 30.0
-"""Distances of the cones of a row on a road, and on the dense one with its range of the sensor (m)."""
-WIDTH: Final = 4.0
-"""Distance of the rows (m)."""
-SWING, WAVELENGTH = 0.9, 300.0
-"""Largest turn of an open road from its general direction (rad), and the distance of its swings (m)."""
-DENT, DENTS = 0.12, 3
-"""Share of the radius by which a closed road leaves its circle, and how often it does."""
-SPEED, LATERAL = 20.0, 9.0
-"""Speed of the vehicle (m/s) and its largest lateral acceleration (m/s^2)."""
-STEP: Final = 0.25
-"""Distance of the samples of a road's middle (m)."""
-SPARE: Final = 1.1
-"""Factor by which an open road has more cones than are to be seen, since some are never detected."""
+GAP, DENSE_GAP, DENSE_RANGE = 5.0, 1.0, 30.0  # distances of cones in a row, and dense with its range (m)
+WIDTH: Final = 4.0  # distance of the rows (m)
+SWING, WAVELENGTH = 0.9, 300.0  # largest turn from a road's direction (rad), and length of a swing (m)
+DENT, DENTS = 0.12, 3  # share of the radius by which a closed road leaves its circle, and how often it does
+SPEED, LATERAL = 20.0, 9.0  # speed of the vehicle (m/s) and its largest lateral acceleration (m/s^2)
+STEP: Final = 0.25  # distance of the samples of a road's middle (m)
+SPARE: Final = 1.1  # cones of an open road by those to be seen, since some are never detected
 
 
 @dataclass(frozen=True)
@@ -69,7 +62,7 @@ class ScalingSettings(Positive):
             raise SettingsError(f"readings: expected numbers of at least 1, found {self.readings}")
 
 
-QUICK: Final = ScalingSettings(
+QUICK: Final = ScalingSettings(  # takes less than a minute; its slopes mean little
     cones_max=200.0,
     bins=8,
     fit_from=50.0,
@@ -80,21 +73,17 @@ QUICK: Final = ScalingSettings(
     laps_cones=60,
     budget=0.1,
 )
-"""Preset that takes less than a minute and shows that everything works; its slopes mean little."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drives:
     """Logs of the three sweeps."""
 
-    cones: Log
-    seen: Array
-    """Long road up to the last cone asked for, and number of cones seen by the end of each cycle (n,)."""
-    readings: dict[int, Log]
-    """A short dense road, by the number of detections in a cycle."""
-    laps: Log
-    lap_ends: Array
-    """Closed road, and stamps at which the laps end (m,), s."""
+    cones: Log  # long road up to the last cone asked for
+    seen: Array  # (n,) number of cones seen by the end of each cycle
+    readings: dict[int, Log]  # a short dense road, by the number of detections in a cycle
+    laps: Log  # closed road
+    lap_ends: Array  # (m,) stamps at which its laps end (s)
 
     @property
     def cycles(self) -> int:
@@ -104,7 +93,6 @@ class Drives:
 
 
 def make_drives(settings: ScalingSettings) -> Drives:
-    """Simulate the drives that the estimators are to be timed on."""
     seed = settings.seed
     long = drive_log(open_road(int(settings.cones_max), GAP), seed)
     seen = cones_seen(long)
@@ -114,9 +102,6 @@ def make_drives(settings: ScalingSettings) -> Drives:
     laps = drive_log(closed_road(settings.laps_cones), seed, settings.laps)
     readings = {k: thinned(dense, k, rng) for k in settings.readings}
     return Drives(first_cycles(long, count), seen[:count].astype(float), readings, laps, lap_times(laps))
-
-
-# --- roads -----------------------------------------------------------------------------------------------
 
 
 def open_road(cones: int, gap: float) -> Track:
@@ -151,9 +136,6 @@ def _with_rows(middle: Array, gap: float, closed: bool) -> Track:
         rows.append(along_polyline(at, s, row))
     start = np.append(middle[0], np.arctan2(tangents[0, 1], tangents[0, 0]))
     return Track(rows[0], rows[1], np.zeros((0, 2)), closed, start, "road")
-
-
-# --- logs ------------------------------------------------------------------------------------------------
 
 
 def drive_log(track: Track, seed: int, laps: int = 1, dense: bool = False) -> Log:

@@ -1,7 +1,6 @@
 """Time of an update against the size of the map, its detections and the laps: points, power laws, figures.
 
-All estimators run in one process: every cycle goes to each in turn, so that whatever slows the machine down
-slows all alike.
+All estimators run in one process, every cycle in turn, so that what slows the machine down slows all alike.
 """
 
 import math
@@ -39,30 +38,20 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .roads import Drives, ScalingSettings, first_cycles
 
-MARKER: Final = "scaling.json"
-"""File by which a folder of results is known."""
-COMPARED_AT: Final = 200.0
-"""Number of cones at which estimators are compared, that of an ordinary track."""
-Sweep = Literal["cones", "readings", "laps"]
-"""What is varied: the cones seen, the detections of an update (readings), or the lap."""
+MARKER: Final = "scaling.json"  # file by which a folder of results is known
+COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track
+Sweep = Literal["cones", "readings", "laps"]  # cones seen, detections of an update, or lap
 CONES: Final[Sweep] = "cones"
 READINGS: Final[Sweep] = "readings"
 LAPS: Final[Sweep] = "laps"
-Logs = Sequence[tuple[Log, int, Array]]
-"""Log, number of detections where that is varied, and the abscissa of each cycle; NaN doesn't count."""
-_HEIGHT: Final = 3.1
-"""Height of a figure (in)."""
-_TITLES: Final[dict[Sweep, tuple[str, str]]] = {
+Logs = Sequence[tuple[Log, int, Array]]  # log, number of detections if varied, abscissae (NaN doesn't count)
+_HEIGHT: Final = 3.1  # height of a figure (in)
+_TITLES: Final[dict[Sweep, tuple[str, str]]] = {  # axis title and title of each panel
     CONES: ("cones seen", "(a) map size"),
     READINGS: ("detections per update", "(b) detections"),
     LAPS: ("lap", "time per lap on a closed road"),
 }
-"""Axis title and title of each panel."""
-JUDGED: Final = 10
-"""Number of updates whose mean is compared with the budget."""
-
-
-# --- lanes -----------------------------------------------------------------------------------------------
+JUDGED: Final = 10  # number of updates whose mean is compared with the budget
 
 
 @dataclass(eq=False)
@@ -71,15 +60,11 @@ class Lane:
 
     estimator: str
     log: Log
-    at: Array = field(default_factory=lambda: np.zeros(0))
-    """Abscissa (n,) of each cycle of the log; NaN doesn't count."""
-    readings: int = 0
-    """Number of detections in each cycle of the log, where they are varied."""
-    seconds: list[float] = field(default_factory=list)
-    sizes: list[int] = field(default_factory=list)
-    """Processor time of each update (s), and size of the map after it."""
-    stopped: str = ""
-    """Why it did not reach the log's end; empty where it did."""
+    at: Array = field(default_factory=lambda: np.zeros(0))  # (n,) abscissa of each cycle; NaN doesn't count
+    readings: int = 0  # number of detections in each cycle of the log, where they are varied
+    seconds: list[float] = field(default_factory=list)  # processor time of each update (s)
+    sizes: list[int] = field(default_factory=list)  # size of the map after each update
+    stopped: str = ""  # why it did not reach the log's end; empty where it did
 
     def updates(self, settings: MapperSettings, budget: float) -> Iterator[None]:
         """Do an update at each step, until the log ends or the lane is stopped."""
@@ -107,8 +92,7 @@ def run_lanes(
 ) -> None:
     """Give cycle k to every lane in turn; the lane that is first moves on by one with k.
 
-    So none always follows the same other. A lane is stopped where its last updates took more than `budget`
-    (s) on average. BLAS has one thread.
+    So none always follows the same other. A lane stops if its last updates took over `budget` s on average.
     """
     runners = [lane.updates(settings, budget) for lane in lanes]
     with threadpool_limits(limits=1):
@@ -120,10 +104,7 @@ def run_lanes(
 
 
 def peak_memory(lane: Lane, settings: MapperSettings) -> float:
-    """Return the most memory (MB) that Python and numpy held at a time while the lane ran.
-
-    By tracemalloc, which sees nothing of what GTSAM and LAPACK allocate, and slows everything down.
-    """
+    """Return the peak (MB) of Python and numpy, not GTSAM, as the lane ran, by (slow) tracemalloc."""
     tracemalloc.start()
     try:
         before, _ = tracemalloc.get_traced_memory()
@@ -134,21 +115,15 @@ def peak_memory(lane: Lane, settings: MapperSettings) -> float:
         tracemalloc.stop()
 
 
-# --- points and slopes -----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Scaling:
     """All results of the measurement."""
 
     settings: ScalingSettings
     mapper: dict[str, Any]
-    points: pd.DataFrame
-    """Row for each mean of some updates, as `binned` returns them."""
-    slopes: pd.DataFrame
-    """Row for each sweep and estimator, as `fit_slope` returns it."""
-    memory: dict[str, float]
-    """Most memory (MB) that Python and numpy held while each estimator mapped the first lap."""
+    points: pd.DataFrame  # row for each mean of some updates, as `binned` returns them
+    slopes: pd.DataFrame  # row for each sweep and estimator, as `fit_slope` returns it
+    memory: dict[str, float]  # peak (MB) of Python and numpy, by each estimator's first lap
 
     def of(self, sweep: Sweep, estimator: str) -> pd.DataFrame:
         return self.points[(self.points["sweep"] == sweep) & (self.points["estimator"] == estimator)]
@@ -172,8 +147,7 @@ class Scaling:
 def binned(sweep: Sweep, lane: Lane, edges: Array) -> pd.DataFrame:
     """Return a point for each interval between two `edges` that holds cycles of a lane.
 
-    It has the mean abscissa `at`, the mean `seconds` of an update and `size` of the map, and the number of
-    `cycles`.
+    It has the means of `at`, of `seconds` of an update and of the map's `size`, and the number of `cycles`.
     """
     at = lane.at[: len(lane.seconds)]
     frame = pd.DataFrame({"at": at, "seconds": lane.seconds, "size": lane.sizes})
@@ -189,8 +163,7 @@ def fit_slope(
 ) -> dict[str, Any]:
     """Return the power law `seconds ~ at^slope`, a line fitted to the logarithms from `fit_from` on.
 
-    The standard `error` is that of the exponent; both are NaN where there are too few `points`, which lie
-    from `low` to `high`.
+    `error` is the standard error of the exponent; both are NaN with too few `points`, from `low` to `high`.
     """
     kept = points[points["at"] >= fit_from].astype({"at": float, "seconds": float})
     slope = error = float("nan")
@@ -200,9 +173,6 @@ def fit_slope(
     fitted = {"slope": slope, "error": error, "points": len(kept)}
     ends = {"low": float(kept["at"].min()), "high": float(kept["at"].max())}
     return {"sweep": sweep, "estimator": estimator, **fitted, **ends, "stopped": stopped}
-
-
-# --- the measurement -------------------------------------------------------------------------------------
 
 
 def sweeps(drives: Drives, settings: ScalingSettings) -> dict[Sweep, tuple[Logs, Array, float]]:
@@ -259,15 +229,9 @@ def scaling_figures(scaling: Scaling) -> tuple[tuple[str, ...], dict[str, list[t
     """Return the header, and the figures of each estimator with their standard errors, NaN where none."""
     settings, first = scaling.settings, scaling.estimators[0]
     header = (
-        "estimator",
-        f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})",
-        "slope, readings",
-        f"ms at {COMPARED_AT:g} cones",
-        f"{first} / this",
-        "most cones",
-        "ms, lap 2",
-        f"ms, lap {settings.laps}",
-        "peak MB",
+        *("estimator", f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})", "slope, readings"),
+        *(f"ms at {COMPARED_AT:g} cones", f"{first} / this", "most cones"),
+        *("ms, lap 2", f"ms, lap {settings.laps}", "peak MB"),
     )
     rows = {}
     for name in scaling.estimators:
@@ -348,9 +312,11 @@ def plot_scaling(scaling: Scaling) -> Figure:
                     axes.plot(last["at"], 1e3 * last["seconds"], "x", color=color, markersize=10.8)
             axes.set_xscale("log")
         cones.set_ylabel("mean update (ms)")
-        ticks = (50, 100, 200, 500, 1000, 2000)
-        _label_ticks(cones, tuple(tick for tick in ticks if tick <= scaling.settings.cones_max))
-        _label_ticks(detections, scaling.settings.readings)
+        ticks = [n for n in (50, 100, 200, 500, 1000, 2000) if n <= scaling.settings.cones_max]
+        for axes, labelled in ((cones, ticks), (detections, scaling.settings.readings)):
+            axes.xaxis.set_major_locator(FixedLocator(labelled))
+            axes.xaxis.set_major_formatter(ScalarFormatter())
+            axes.xaxis.set_minor_formatter(NullFormatter())
         style.shared_legend(figure, columns=min(len(scaling.estimators), 4))
     return figure
 
@@ -392,9 +358,3 @@ def _draw_power_law(axes: Axes, scaling: Scaling, sweep: Sweep, name: str, color
     at, seconds = np.exp(np.log(points[points["at"].between(*ends)]).mean())
     milliseconds = 1e3 * seconds * (ends / at) ** slope["slope"]
     axes.plot(ends, milliseconds, color=color, linewidth=0.9, alpha=0.8)
-
-
-def _label_ticks(axes: Axes, ticks: tuple[int, ...]) -> None:
-    axes.xaxis.set_major_locator(FixedLocator(ticks))
-    axes.xaxis.set_major_formatter(ScalarFormatter())
-    axes.xaxis.set_minor_formatter(NullFormatter())

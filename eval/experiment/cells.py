@@ -34,26 +34,19 @@ from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import generate_track
 
 TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
-ESTIMATORS: Final = (
+ESTIMATORS: Final = (  # rooms on whose sources an estimate on a simulated log depends
     *("baselines", "batch", "factors", "front_end", "graph", "loop", "mapping", "online"),
     *("scale", "settings", "sim", "spline"),
 )
-"""Rooms whose sources an estimate on a simulated log depends on."""
+# rooms on whose sources the metrics of a run depend
 MEASURED: Final = (*ESTIMATORS, "health", "laps", "run", "plausibility", "eval.metrics")
-"""Rooms whose sources the metrics of a run depend on."""
-CELLS: Final = "cells"
-"""Folder of the kept cells."""
+CELLS: Final = "cells"  # folder of the kept cells
 FORMAT: Final = "pathspace-cell/3"
-DIGEST: Final = "digest"
-"""Key of a record's digest in its file."""
-RESOLUTION: Final = 1e-3
-"""Length (m) and angle (rad) to which the geometry of a track identifies it."""
-ROUNDING: Final = 1.0 / np.pi
-"""Shift by which no coordinate with few decimals lies on the edge between two whole millimetres."""
-Record = dict[str, Any]
-"""What is kept of a cell, in the types of JSON only."""
-_latest: dict[str, Log] = {}
-"""The log that was simulated last, by its drive."""
+DIGEST: Final = "digest"  # key of a record's digest in its file
+RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
+ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
+Record = dict[str, Any]  # what is kept of a cell, in the types of JSON only
+_latest: dict[str, Log] = {}  # the log that was simulated last, by its drive
 
 
 def track_digest(track: Track) -> str:
@@ -72,8 +65,7 @@ class Drive:
     """One lap or more on a track."""
 
     track: Track
-    seed: int
-    """Number of the drive on its track."""
+    seed: int  # number of the drive on its track
     noise: str
     simulation: SimulationSettings
 
@@ -96,17 +88,13 @@ class Drive:
         """Return the log; the last one is kept, since cells are in the order of their logs."""
         if self.id not in _latest:
             _latest.clear()
-            _latest[self.id] = self.simulate()
+            _latest[self.id] = simulate(self.track, self.simulation, self.own_seed)
         return _latest[self.id]
-
-    def simulate(self) -> Log:
-        return simulate(self.track, self.simulation, self.own_seed)
 
 
 def identity(**parts: Any) -> str:
     """Return a text that is the same for the same values, which are JSON's types only."""
-    text = json.dumps(parts, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:20]
 
 
 @cache
@@ -130,12 +118,12 @@ def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:
     """
     every = list[Path | int]()
     for entry in tracks:
-        files = [entry]
-        if isinstance(entry, Path) and entry.is_dir():
-            files = [*sorted(file for file in entry.iterdir() if file.suffix in TRACK_SUFFIXES)]
-            if not files:
-                raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
-        every += files
+        if not isinstance(entry, Path) or not entry.is_dir():
+            every.append(entry)
+        elif files := sorted(file for file in entry.iterdir() if file.suffix in TRACK_SUFFIXES):
+            every += files
+        else:
+            raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
     stems = [track.stem for track in every if isinstance(track, Path)]
     return [_load(track, stems) for track in every]
 
@@ -155,9 +143,6 @@ def _load(track: Path | int, stems: list[str]) -> Track:
     return replace(read_track(track), name=f"{folder}{track.stem}")
 
 
-# --- runs ------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class NamedLog:
     """A log with the name of its folder, and the mistakes that are likely in it."""
@@ -172,7 +157,6 @@ class NamedLog:
 
     @cached_property
     def id(self) -> str:
-        """Identity among the logs of one experiment."""
         return identity(log=self.name)
 
     def load(self) -> Log:
@@ -189,21 +173,15 @@ class Cell(Generic[D]):
     drive: D
     estimator: str
     settings: MapperSettings
-    variant: str | None = None
-    """Name of the settings, where there are several."""
-    measured: Mapping[str, Any] = field(default_factory=dict)
-    """Keyword arguments of `measure`."""
+    variant: str | None = None  # name of the settings, where there are several
+    measured: Mapping[str, Any] = field(default_factory=dict)  # keyword arguments of `measure`
 
     @cached_property
     def id(self) -> str:
         """Identity of everything that the result depends on, also the code."""
-        return identity(
-            drive=self.drive.id,
-            estimator=self.estimator,
-            settings=asdict(self.settings),
-            yardsticks=self.measured.get("yardsticks", False),
-            code=code_digest(MEASURED),
-        )
+        yardsticks, code = self.measured.get("yardsticks", False), code_digest(MEASURED)
+        parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": asdict(self.settings)}
+        return identity(**parts, yardsticks=yardsticks, code=code)
 
     @property
     def names(self) -> dict[str, Any]:
@@ -216,18 +194,10 @@ class Outcome:
     """What came of a cell; a failure is a result as well."""
 
     names: Mapping[str, Any]
-    rows: Sequence[Row] = ()
-    """Metrics of each lap and, as the last row, of the whole run; none where the cell failed."""
-    result: RunResult | None = None
-    """Result of the run; None where the cell failed."""
-    failure: str = ""
-    """Line that names the error, if there was one."""
+    rows: Sequence[Row] = ()  # metrics of each lap and, as the last row, of the run; none if it failed
+    result: RunResult | None = None  # result of the run; None where the cell failed
+    failure: str = ""  # line that names the error, if there was one
     trace: str = ""
-
-    @property
-    def laps(self) -> int:
-        """Number of laps that the estimator counted."""
-        return 0 if self.result is None else self.result.laps
 
     @classmethod
     def failed(cls, cell: Cell[Any], error: BaseException) -> Self:
@@ -250,10 +220,7 @@ def run_cell(cell: Cell[Any]) -> Outcome:
 
 
 def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
-    """Run an online estimator cycle by cycle, with its map at the end of each true lap, or a batch one.
-
-    The reach of an online one is measured where there is truth.
-    """
+    """Run an online estimator, with its reach and its map at the end of each true lap, or a batch one."""
     if name not in registry.ONLINE:
         return registry.make_batch(name, settings, log).solve(log)
     estimator, times = registry.make_online(name, settings, log), lap_times(log)
@@ -262,9 +229,6 @@ def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
     observer = ReachObserver(log.truth)
     result = run_online(log, estimator, name=name, snapshot_times=times, observers=[observer])
     return replace(result, reach=observer.rows)
-
-
-# --- records ---------------------------------------------------------------------------------------------
 
 
 def record_cell(cell: Cell[Drive]) -> Record:
@@ -276,16 +240,9 @@ def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
     if run is not None:
         said += [record.notice for record in run.cycles if record.notice]
         said += [] if run.vehicle is None else diagnose(run.vehicle, run.settings)
-    record: Record = {
-        "format": FORMAT,
-        "id": cell.id,
-        "cell": cell.names,
-        "versions": versions(),
-        "failure": outcome.failure,
-        "traceback": outcome.trace,
-        "said": "; ".join(dict.fromkeys(said)),
-        "laps": lap_rows(outcome.rows),
-    }
+    record: Record = {"format": FORMAT, "id": cell.id, "cell": cell.names, "versions": versions()}
+    record |= {"failure": outcome.failure, "traceback": outcome.trace}
+    record |= {"said": "; ".join(dict.fromkeys(said)), "laps": lap_rows(outcome.rows)}
     return dict(to_plain(record))
 
 

@@ -33,16 +33,13 @@ from .run import OnCell, run_cells
 from .study import known_estimators
 from .tables import TextTable, group_starts
 
-MARKER: Final = "comparison.json"
-"""File by which a comparison's folder is recognized."""
+MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
 RUN: Final = ("log", "estimator")
-_PRINTED: Final = (
-    *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "two_way", "ghost_share", "size", "ate"),
-    "ms_mean",
+_PRINTED: Final = (  # metrics whose differences are in the table; the file has all
+    *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m"),
+    *("two_way", "ghost_share", "size", "ate", "ms_mean"),
 )
-"""Metrics whose differences are in the table; the file has those of all."""
-_NOT_PAIRED: Final = ("nees_low", "nees_high")
-"""Metrics whose differences mean nothing."""
+_NOT_PAIRED: Final = ("nees_low", "nees_high")  # metrics whose differences mean nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +57,9 @@ class Comparison:
         results = {tuple(outcome.names.values()): outcome.result for outcome in self.outcomes}
         rows: list[dict[str, Any]] = []
         for outcome in self.outcomes:
+            laps = 0 if outcome.result is None else outcome.result.laps
             for row in outcome.rows:
-                about = {"scope": "lap" if row.lap else "log", "lap": row.lap or outcome.laps}
+                about = {"scope": "lap" if row.lap else "log", "lap": row.lap or laps}
                 rows.append({**outcome.names, **about, **row.values})
             batch = results.get((outcome.names["log"], registry.DEFAULT_BATCH))
             if outcome.result is not None and batch is not None and outcome.result is not batch:
@@ -75,16 +73,9 @@ class Comparison:
 
     def times(self) -> pd.DataFrame:
         """Return a tidy row per run and stage, in s."""
-        rows = [
-            {**outcome.names, **stage}
-            for outcome in self.outcomes
-            if outcome.result is not None
-            for stage in stage_times(online_cycles(outcome.result))
-        ]
+        ran = [(outcome.names, outcome.result) for outcome in self.outcomes if outcome.result is not None]
+        rows = [{**names, **stage} for names, run in ran for stage in stage_times(online_cycles(run))]
         return pd.DataFrame(rows, columns=[*RUN, "stage", "mean", "median", "p99", "share"])
-
-    def of(self, log: str) -> list[Outcome]:
-        return [outcome for outcome in self.outcomes if outcome.names["log"] == log]
 
     @property
     def has_truth(self) -> bool:
@@ -106,10 +97,7 @@ class Comparison:
 
 
 def gap_columns(result: RunResult, batch: RunResult) -> dict[str, float]:
-    """Return the mean two-way distance of the curves (m) and the rms distance of the poses (m).
-
-    Landmarks are no curves, so a landmark map has the distance of the poses only.
-    """
+    """Return the mean two-way distance (m) of the curves, if any, and the rms distance (m) of the poses."""
     by = gap(result, batch)
     row = {"gap_trajectory": float(np.hypot(by.along, by.across))}
     if by.curves and all(isinstance(b, SplineBoundary) for b in result.map.boundaries.values()):
@@ -257,10 +245,7 @@ def _interval(metric: Metric, row: Any) -> str:
 
 
 def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
-    """Return the paper's Table 1 in the paper's form: a row per lap, the estimators beside each other.
-
-    The rmse, missed and size of an estimator share a column, so that its name stands above all three.
-    """
+    """Return Table 1 as in the paper: a row per lap, with rmse, missed and size under each estimator."""
     titles = "   ".join(metric.heading for metric in PAPER)
     header, rows = ("lap", *(f"{name}\n{titles}" for name in laps)), []
     for lap, beside in enumerate(zip_longest(*laps.values()), start=1):
@@ -287,8 +272,7 @@ def _cell(metric: Metric, row: dict[Any, Any]) -> str:
 def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
     """Write all files of a comparison (docs/formats.md), or on failure none.
 
-    Where there are several logs, each has a folder of its own. An earlier comparison in `out` is kept as a
-    numbered backup.
+    Each of several logs has a folder of its own. An earlier comparison in `out` becomes a numbered backup.
     """
     frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": comparison.times()}
     if comparison.paired:
@@ -316,7 +300,7 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
 
 def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
     folder.mkdir(exist_ok=True)
-    found = comparison.of(named.name)
+    found = [outcome for outcome in comparison.outcomes if outcome.names["log"] == named.name]
     maps = {str(o.names["estimator"]): o.result.map for o in found if o.result is not None}
     for outcome in found:
         if outcome.result is not None:

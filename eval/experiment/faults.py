@@ -21,18 +21,13 @@ from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN
 from pathspace_graph.io.files import write_json, write_text
 from pathspace_graph.plausibility.diagnosis import LIMIT
 
-from .frame import RUN, last_laps
+from .frame import RUN, last_laps, write_csv, write_results
 from .study import Study, find_study, read_study
-from .tables import TextTable, group_starts, write_csv, write_results
+from .tables import TextTable, group_starts
 
-SUITE: Final = Path("faults")
-"""Name of the shipped study that is the suite."""
-CLEAN: Final = "clean"
-"""Name of the noise without a fault, which every other one is compared with."""
-FAULT_COLUMNS: Final = 4
-"""Panels side by side in the figure of faults."""
-Values = Mapping[str, Any]
-"""Values of an outcome by name."""
+CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
+FAULT_COLUMNS: Final = 4  # panels side by side in the figure of faults
+Values = Mapping[str, Any]  # values of an outcome by name
 _WORST: Final = ("error_max", "error_end", "astray_time", "astray_way")
 _MEASURED: Final = (
     *("rmse", "size", "missed", "closed_at_end", "lost_at_end", "told_degraded", "told_lost", *_WORST),
@@ -40,16 +35,12 @@ _MEASURED: Final = (
 _NAME: Final = re.compile(r"(?P<kind>.+): (?P<strength>(?P<value>[-+.\d]+)(?: (?P<unit>\S+))?)")
 
 
-# --- the suite -------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Fault:
     """A fault of a kind and a strength."""
 
     kind: str
-    strength: str
-    """Strength as it is written, a number and a unit."""
+    strength: str  # as it is written, a number and a unit
     value: float
     unit: str
 
@@ -68,7 +59,7 @@ def fault_of(noise: str) -> Fault:
 
 
 def suite() -> Study:
-    return read_study(find_study(SUITE))
+    return read_study(find_study(Path("faults")))
 
 
 def by_kind(study: Study) -> list[list[str]]:
@@ -106,15 +97,10 @@ def _with(study: Study, noises: Sequence[str]) -> Study:
 
 
 def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return plain values of every noise of a suite, in its order, at the end of the last lap.
-
-    `runs` that finished count, `failed` ones don't. What is not known is NaN.
-    """
+    """Return plain values of every noise of a suite at the end of the last lap; NaN is unknown."""
     every, failures = beside_clean(frame), frame.loc[frame["failure"] != "", "noise"].value_counts()
-    return [
-        _outcome(fault_of(noise), every[every["noise"] == noise], int(failures.get(noise, 0)))
-        for noise in study.noise
-    ]
+    of = ((fault_of(noise), every[every["noise"] == noise], failures.get(noise, 0)) for noise in study.noise)
+    return [_outcome(fault, runs, int(failed)) for fault, runs, failed in of]
 
 
 def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
@@ -122,15 +108,9 @@ def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
     sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith("_by_prior")}
     titles = {key: METRICS[key].title.removesuffix(" by its prior's sigma") for key in sigmas}
     return {
-        "fault": fault.kind,
-        "strength": fault.value,
-        "unit": fault.unit,
-        "runs": len(runs),
-        "failed": failed,
-        "with_map": len(ratios),
-        "ratio_mean": float(ratios.mean()),
-        "ratio_min": float(ratios.min()),
-        "ratio_max": float(ratios.max()),
+        **{"fault": fault.kind, "strength": fault.value, "unit": fault.unit},
+        **{"runs": len(runs), "failed": failed, "with_map": len(ratios)},
+        **{f"ratio_{name}": float(ratios.agg(name)) for name in ("mean", "min", "max")},
         "size_ratio": float(runs["size_ratio"].mean()),
         "missed": float(runs["missed"].mean()),
         "closed": int((runs["closed_at_end"] == 1.0).sum()),
@@ -147,16 +127,14 @@ def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
 def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the last laps of the runs that finished, beside the clean run of the same track and seed.
 
-    `ratio` of the rmse and `size_ratio` are to those of that run, NaN where either has no map; `told` is
-    whether anything was said.
+    `ratio` (of rmse) and `size_ratio` are to that run, NaN without a map; `told`: anything was said.
     """
     last = last_laps(frame)
     last = last.reindex(columns=[*dict.fromkeys([*last, *_MEASURED])]).astype(dict.fromkeys(_MEASURED, float))
     clean = last[last["noise"] == CLEAN].set_index([*RUN])
     own = pd.MultiIndex.from_frame(last[[*RUN]])
     for name, ratio in (("rmse", "ratio"), ("size", "size_ratio")):
-        reference = clean[name].where(clean[name] > 0.0).reindex(own)
-        last[ratio] = last[name] / reference.to_numpy()
+        last[ratio] = last[name] / clean[name].where(clean[name] > 0.0).reindex(own).to_numpy()
     return last.assign(told=(last["said"] != "") | (last["told_lost"] > 0.0))
 
 
@@ -200,7 +178,7 @@ def _form(form: str, *names: str, factor: float = 1.0) -> Callable[[Values], str
     )
 
 
-COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
+COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {  # columns after fault and strength
     "rmse by clean": _ratio,
     "range": _form("{:.1f} to {:.1f}", "ratio_min", "ratio_max"),
     "size by clean": _form("{:.2f}", "size_ratio"),
@@ -217,17 +195,13 @@ COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {
     ),
     "said": _said,
 }
-"""Columns of the table after the fault and its strength, each made of the values of an outcome."""
 
 
 # --- figure and files ------------------------------------------------------------------------------------
 
 
 def plot_faults(study: Study, runs: pd.DataFrame) -> Figure:
-    """Draw a panel for each kind of fault: the mean, and every run, filled where anything was said.
-
-    The runs are those of `beside_clean`.
-    """
+    """Draw a panel for each kind of fault: the mean and the runs of `beside_clean`, filled if told."""
     panels = [noises for noises in by_kind(study) if noises != [CLEAN]]
     rows = max(1, -(-len(panels) // FAULT_COLUMNS))
     with style.figure_context():
@@ -281,10 +255,7 @@ def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool
 
 
 def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
-    """Write the results of every run, and the table, the values and the figure; return the table's text.
-
-    `faults.csv` has calibration and notices as JSON texts.
-    """
+    """Write the results of every run, and the table, the values and the figure; return the table's text."""
     faults = outcomes(study, frame)
     table = fault_table(study, faults)
     text = f"{table.title}\n\n{table.text()}\n"
@@ -294,7 +265,7 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
     about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
     write_json(out / "faults.json", {"format": "pathspace-faults/1", **about, "faults": faults}, indent=1)
     flat = pd.DataFrame(faults)
-    for key in ("calibration", "said"):
+    for key in ("calibration", "said"):  # as JSON texts
         flat[key] = [json.dumps(value, ensure_ascii=False) for value in flat[key]]
     write_csv(out / "faults.csv", flat)
     style.save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -15,27 +16,21 @@ from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.reference import from_batch
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.files import replacing
 from pathspace_graph.io.overrides import leaves
 
 from .cells import Cell, Drive, Record
 from .study import Study
 
-COMBINATION: Final = ("noise", "estimator", "variant")
-"""Columns that name a combination, which is compared with others."""
-RUN: Final = ("track", "seed")
-"""Columns that name a drive; combinations are paired on the same drive and noise."""
+COMBINATION: Final = ("noise", "estimator", "variant")  # columns of a combination, which is compared
+RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on the same drive and noise
 RUN_OF: Final = (*RUN, *COMBINATION)
-TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
-"""Columns of wall times, all that differs when a study is run again."""
-LEVEL: Final = 0.95
-"""Confidence level of intervals; a difference is significant where its p is below 1 - LEVEL."""
+TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)  # wall times
+LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
 
 
 def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -> pd.DataFrame:
-    """Return a row for each run and lap, and one without metrics for a run that failed.
-
-    Every varied setting is a column.
-    """
+    """Return a row for each run and lap, or one for a failed run; every varied setting is a column."""
     rows = []
     for cell, record in cells:
         assert record is not None, "every cell has been run by now"
@@ -72,9 +67,16 @@ def without_times(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.drop(columns=[*TIMES], errors="ignore")
 
 
-def times_of(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the wall times, in the same rows."""
-    return frame[["study", *RUN_OF, "lap", *(name for name in TIMES if name in frame)]]
+def write_results(frame: pd.DataFrame, out: Path) -> None:
+    write_csv(out / "results.csv", without_times(frame))
+    times = [name for name in TIMES if name in frame]
+    write_csv(out / "times.csv", frame[["study", *RUN_OF, "lap", *times]])
+
+
+def write_csv(file: Path, frame: pd.DataFrame) -> None:
+    """Write a frame without its index, whole or not at all."""
+    with replacing(file) as temporary:
+        frame.to_csv(temporary, index=False, lineterminator="\n")
 
 
 def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
@@ -83,19 +85,13 @@ def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
     return finished.groupby(list(RUN_OF), sort=False).tail(1)
 
 
-# --- statistics ------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """Mean and its 95 % interval by Student's t over runs."""
 
-    mean: float
-    """NaN without runs."""
-    half: float
-    """Half the width of the interval; NaN for fewer than two runs."""
-    count: int
-    """Number of runs, or of pairs of runs."""
+    mean: float  # NaN without runs
+    half: float  # half the width of the interval; NaN for fewer than two runs
+    count: int  # number of runs, or of pairs of runs
 
     @property
     def low(self) -> float:
@@ -155,15 +151,11 @@ class Contrast:
     noise: str
     estimator: str
     variant: str
-    metric: str
-    """Key of the metric."""
-    value: Estimate
-    """Mean over all runs, each at the end of its last lap."""
-    difference: Estimate | None
-    """Mean over the pairs; None for the baseline itself."""
+    metric: str  # key of the metric
+    value: Estimate  # mean over all runs, each at the end of its last lap
+    difference: Estimate | None  # mean over the pairs; None for the baseline itself
     differences: tuple[float, ...] = ()
-    p: float = float("nan")
-    """P of the paired t-test, corrected for all comparisons of the metric."""
+    p: float = float("nan")  # p of the paired t-test, corrected for all comparisons of the metric
 
     @property
     def significant(self) -> bool:
@@ -172,10 +164,7 @@ class Contrast:
 
 
 def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
-    """Return every combination against the baseline of its noise, in the study's order.
-
-    p is corrected by Holm's method over all comparisons of the metric in the study.
-    """
+    """Return every combination against the baseline of its noise, in the study's order."""
     known = last_laps(frame).astype({metric: float}).dropna(subset=[metric])
     runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
     nothing, contrasted = pd.Series(dtype=float), []

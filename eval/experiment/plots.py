@@ -21,28 +21,22 @@ from pathspace_graph.labels import BOUNDARIES
 
 from .cells import Outcome
 
-COLUMNS: Final = (2, 3, 4)
-"""Numbers of maps side by side; the first with which the figure fits a page is taken."""
-MAX_HEIGHT: Final = 10.0
-"""Height of a page (in)."""
-DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)
-"""Distances (m) within which nothing is mapped at a missed cone, in the order in which they are tried."""
+COLUMNS: Final = (2, 3, 4)  # maps side by side; the first with which the figure fits a page is taken
+MAX_HEIGHT: Final = 10.0  # height of a page (in)
+DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)  # distances (m) of a missed cone, as they are tried
+# style of a panel that shows a short stretch of a track
 CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
-"""Style of a panel that shows a short stretch of a track."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlindSpot:
     """Stretch of the track, and the true cones in it that maps miss."""
 
-    centre: Array
-    half_size: tuple[float, float]
-    """Centre (2,), half width and half height of the stretch in m, map frame."""
-    distance: float
-    """Distance (m) within which nothing is mapped at a missed cone."""
+    centre: Array  # (2,) centre of the stretch, map frame (m)
+    half_size: tuple[float, float]  # its half width and half height (m)
+    distance: float  # distance (m) within which nothing is mapped at a missed cone
     cones: int
-    missed: tuple[Array, ...]
-    """Positions (k, 2) of the cones that each map misses in the stretch."""
+    missed: tuple[Array, ...]  # positions (k, 2) of the cones that each map misses in the stretch
 
 
 def find_blind_spot(
@@ -74,11 +68,8 @@ def find_blind_spot(
 
 def blind_spot_figure(maps: Mapping[str, Map], reference: str, truth: Truth) -> Figure | None:
     """Return the reference beside the first landmark map that misses cones that it passes, or None."""
-    points = [
-        name
-        for name, track in maps.items()
-        if any(isinstance(boundary, PointBoundary) for boundary in track.boundaries.values())
-    ]
+    kinds = {name: {type(boundary) for boundary in track.boundaries.values()} for name, track in maps.items()}
+    points = [name for name, own in kinds.items() if PointBoundary in own]
     for name in points if reference not in points else ():
         spot = find_blind_spot(truth, maps[reference], maps[name])
         if spot is not None:
@@ -108,12 +99,11 @@ def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:
 def plot_blind_spot(spot: BlindSpot, maps: Sequence[tuple[str, Map]], truth: Truth) -> Figure:
     """Draw the same area of several maps side by side, with rings around the cones that a map misses."""
     half_size = np.array(spot.half_size)
-    shows_start = bool((np.abs(spot.centre) < half_size).all())
     with style.figure_context():
         figure, panels, columns = _panels(len(maps), half_size)
         for axes, (name, track), missed in zip(panels, maps, spot.missed, strict=False):
             _draw_map(axes, track, truth, CLOSE_UP)
-            if shows_start:
+            if (np.abs(spot.centre) < half_size).all():
                 map_plot.draw_start(axes, CLOSE_UP)
             ring = {"markersize": 8.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "zorder": 8}
             text = f"missed: nothing within {spot.distance:g} m"

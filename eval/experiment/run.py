@@ -21,19 +21,8 @@ from pathspace_graph.io.parsing import read_json
 from pathspace_graph.loop.drive_record import end_with
 from pathspace_graph.sim.track import Track
 
-from .cells import (
-    CELLS,
-    Cell,
-    Drive,
-    Outcome,
-    Record,
-    load_tracks,
-    read_record,
-    record_cell,
-    record_of,
-    track_digest,
-    write_record,
-)
+from . import cells as store
+from .cells import CELLS, Cell, Drive, Outcome, Record, load_tracks, track_digest
 from .frame import frame_of
 from .study import Study
 
@@ -42,13 +31,10 @@ R = TypeVar("R")
 
 FORMAT: Final = "pathspace-study/1"
 STUDY_FILE: Final = "study.json"
-CONNECT_SECONDS: Final = 20.0
-"""Time (s) within which a cluster has to answer."""
-_PRESENTATION: Final = ("question", "metrics", "columns")
-"""Keys that may change without making another study, since no cell depends on them."""
+CONNECT_SECONDS: Final = 20.0  # time (s) within which a cluster has to answer
+_PRESENTATION: Final = ("question", "metrics", "columns")  # keys on which no cell depends
 
-OnCell = Callable[[int, int], None]
-"""Called with the number of cells that are done, and with the number of all cells."""
+OnCell = Callable[[int, int], None]  # called with the numbers of cells that are done, and of all
 
 
 class WorkerDiedError(RuntimeError):
@@ -77,7 +63,7 @@ def run_cells(
     known = {cell: read(cell) for cell in cells}
     results = {cell: result for cell, result in known.items() if result is not None}
     remaining = [cell for cell in cells if cell not in results]
-    told = on_cell or (lambda done, total: None)
+    told = on_cell or (lambda *_: None)
     with workers(jobs, cluster) if remaining else nullcontext():
         begin()
         told(0, len(remaining))
@@ -143,24 +129,21 @@ def run_study(study: Study, out: Path | str | None = None, **how: Any) -> pd.Dat
 
 
 def run_plan(plan: Plan, out: Path, *, retry_failed: bool = False, **how: Any) -> pd.DataFrame:
-    """Run a study; `how` holds `jobs`, `cluster` and `on_cell` of `run_cells`.
-
-    OutputError if the folder belongs to another study.
-    """
+    """Run a study, OutputError in another's folder; `how`: `jobs`, `cluster`, `on_cell` of `run_cells`."""
     check_folder(out, plan)
     remove_manifest(out)  # of a study that goes on; the last step writes it again
 
     def kept(cell: Cell[Drive]) -> Record | None:
-        record = read_record(out, cell)
+        record = store.read_record(out, cell)
         return None if record is not None and retry_failed and record["failure"] else record
 
     records = run_cells(
         plan.cells,
-        record_cell,
-        lambda cell, error: record_of(cell, Outcome.failed(cell, error)),
+        store.record_cell,
+        lambda cell, error: store.record_of(cell, Outcome.failed(cell, error)),
         begin=lambda: write_json(out / STUDY_FILE, plan.resolved(), indent=1),
         read=kept,
-        write=lambda cell, record: write_record(out, cell, record),
+        write=lambda cell, record: store.write_record(out, cell, record),
         **how,
     )
     return frame_of(plan.study, list(zip(plan.cells, records, strict=True)))

@@ -16,12 +16,9 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
 
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
-DEFAULT: Final = "default"
-"""Variant that overrides nothing, part of every study."""
-PRESET: Final = "preset"
-"""Entry by which a noise names the preset of a group, as in `sensor.preset = "camera"`."""
-ALL: Final = "all"
-"""Name that stands for all known estimators."""
+DEFAULT: Final = "default"  # variant that overrides nothing, part of every study
+PRESET: Final = "preset"  # entry of a noise that names a preset, as in `sensor.preset = "camera"`
+ALL: Final = "all"  # name that stands for all known estimators
 _LISTS: Final = ("tracks", "seeds", "estimators", "metrics", "columns")
 
 
@@ -51,6 +48,7 @@ class Study:
     question: str = ""
     estimators: tuple[str, ...] = (registry.DEFAULT,)
     """Estimators to run, online and batch ones; `all` stands for every one."""
+    # overrides of the simulation by the name of a noise, and of the settings by that of a variant
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
     """Overrides of the simulation by the name of a noise."""
     variants: Mapping[str, Overrides] = field(default_factory=dict)
@@ -79,7 +77,7 @@ class Study:
         self._check_lists()
         if not isinstance(self.yardsticks, bool):
             raise SettingsError(f"yardsticks: expected true or false, found {shown(self.yardsticks)}")
-        if isinstance(self.laps, bool) or not isinstance(self.laps, int):
+        if type(self.laps) is not int:
             raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
         if DEFAULT in self.variants:
             raise SettingsError(f"variants.{DEFAULT}: that name is kept for the settings as they are")
@@ -101,7 +99,7 @@ class Study:
         generated = [track for track in self.tracks if not isinstance(track, Path)]
         for name, values in {"seeds": self.seeds, "tracks": generated}.items():
             for value in values:
-                if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+                if type(value) is not int or value < 0:
                     raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
         for name in self.estimators:
             check_name(name, known_estimators(), "estimators: expected a known estimator")
@@ -111,7 +109,6 @@ class Study:
             column_of(column)
 
     def simulation(self, noise: str) -> SimulationSettings:
-        """Return the settings of the drives under a named noise."""
         overrides = dict(self.noise[noise])
         if "laps" in overrides:
             raise SettingsError(f"noise.{noise}.laps: expected laps as a key of the study itself")
@@ -170,11 +167,7 @@ def _short(value: Any) -> str:
     return str(value)
 
 
-# --- files -----------------------------------------------------------------------------------------------
-
-
 def shipped_studies() -> list[str]:
-    """Return the names of the studies that ship with the package."""
     return sorted(file.stem for file in SHIPPED.glob("*.toml"))
 
 

@@ -15,43 +15,27 @@ from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
 
 from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, figure_context, save_figures
 from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, Metric, column_of
-from pathspace_graph.io.files import replacing, write_text
+from pathspace_graph.io.files import write_text
 
-from .frame import (
-    COMBINATION,
-    LEVEL,
-    RUN,
-    RUN_OF,
-    Contrast,
-    Estimate,
-    contrasts,
-    last_laps,
-    times_of,
-    without_times,
-)
+from .frame import COMBINATION, LEVEL, RUN, RUN_OF, Contrast, Estimate, contrasts, last_laps, write_results
 from .study import Study
 
-MAX_PANELS: Final = 3
-"""Most metrics side by side in the figure of differences."""
+MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
 
-_UNICODE: Final = str.maketrans(
+_UNICODE: Final = str.maketrans(  # LaTeX for characters that not every font has
     {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
 )
-"""LaTeX commands in place of characters that not every font has."""
 
 
 @dataclass(frozen=True)
 class TextTable:
     """Rows of text under a header: first names, left-aligned, then numbers, right-aligned."""
 
-    title: str
-    """Sentence above the table, which may be empty."""
+    title: str  # sentence above the table, which may be empty
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    groups: tuple[int, ...] = ()
-    """Row numbers at which a new group of rows begins."""
-    names: int = 1
-    """Number of first columns that are names."""
+    groups: tuple[int, ...] = ()  # row numbers at which a new group of rows begins
+    names: int = 1  # number of first columns that are names
 
     def parts(self, width: int) -> list[Self]:
         """Return tables of at most `width` characters, each with the names and some of the other columns."""
@@ -83,7 +67,6 @@ class TextTable:
         return self._formatted("simple", self.rows)
 
     def markdown(self) -> str:
-        """Return the title and the table in Markdown."""
         rows = [[cell.replace("|", r"\|") for cell in row] for row in self.rows]
         title = f"{self.title}\n\n" if self.title else ""
         return f"{title}{self._formatted('pipe', rows)}\n"
@@ -94,16 +77,9 @@ class TextTable:
         for number, row in enumerate(self.rows):
             rows += [SEPARATING_LINE, row] if number in self.groups else [row]
         caption = "".join(LATEX_ESCAPE_RULES.get(character, character) for character in self.title)
-        lines = [
-            r"% \usepackage{booktabs}",
-            r"\begin{table}",
-            r"\centering",
-            rf"\caption{{{caption}}}",
-            self._formatted("latex_booktabs", rows),
-            r"\end{table}",
-            "",
-        ]
-        return "\n".join(lines).translate(_UNICODE)
+        begin = ("% \\usepackage{booktabs}", r"\begin{table}", r"\centering", rf"\caption{{{caption}}}")
+        table = self._formatted("latex_booktabs", rows)
+        return "\n".join([*begin, table, r"\end{table}", ""]).translate(_UNICODE)
 
     def _formatted(self, style: str, rows: Sequence[Sequence[str] | str]) -> str:
         sides = ["left"] * self.names + ["right"] * (len(self.header) - self.names)
@@ -212,40 +188,20 @@ def _values(column: Column, frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
-    """Write the tables and the figures of a study, and return the text of its summary."""
-    summary, figure = write_tables(study, frame, out), plot_differences(study, frame)
-    save_figures(out / "figures", {} if figure is None else {"differences": figure})
-    return summary
-
-
-def write_tables(study: Study, frame: pd.DataFrame, out: Path) -> str:
-    """Write `results.csv`, `times.csv` and the summary in three forms, and return its text."""
+    """Write results, times, figures and the summary in three forms, and return the text of the summary."""
     write_results(frame, out)
     tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
     for suffix, form in (("txt", as_text), ("md", as_markdown), ("tex", as_latex)):
         write_text(out / f"summary.{suffix}", form(tables, note))
+    figure = plot_differences(study, frame)
+    save_figures(out / "figures", {} if figure is None else {"differences": figure})
     return as_text(tables, note)
 
 
-def write_results(frame: pd.DataFrame, out: Path) -> None:
-    write_csv(out / "results.csv", without_times(frame))
-    write_csv(out / "times.csv", times_of(frame))
-
-
-def write_csv(file: Path, frame: pd.DataFrame) -> None:
-    """Write a frame without its index, whole or not at all."""
-    with replacing(file) as temporary:
-        frame.to_csv(temporary, index=False, lineterminator="\n")
-
-
 def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
-    """Draw every pair, their mean and its interval: a row for each combination, a panel for each metric.
-
-    Only the first metrics of the study have a panel, and there is none where no run differs.
-    """
-    panels = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
-    panels = [p for p in panels if any(d != 0.0 for contrast in p for d in contrast.differences)]
-    panels = panels[:MAX_PANELS]
+    """Draw pairs, mean and interval of each combination for the first metrics; None where no run differs."""
+    every = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
+    panels = [p for p in every if any(d != 0.0 for contrast in p for d in contrast.differences)][:MAX_PANELS]
     if not panels:
         return None
     rows = [i for i in range(len(panels[0])) if any(panel[i].differences for panel in panels)]

@@ -19,8 +19,7 @@ from pathspace_graph.spline.knots import BASELINE, curvature_weighted_breaks, fi
 from . import style
 from .style import BLUE, DARK, LIGHT, ORANGE, PURPLE, THIN_WIDTH, WIDTH
 
-BLIND: Final = (0.52, 0.74)
-"""Shares of the length of the curve between which no cone was seen."""
+BLIND: Final = (0.52, 0.74)  # shares of the length of the curve between which no cone was seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,17 +27,13 @@ class Uncertainty:
     """Curve with its standard deviation (m) across itself at n places, computed in three ways."""
 
     boundary: SplineBoundary
-    cones: Array
-    """(k, 2) Positions of the seen cones (m)."""
-    u: Array
-    length: Array
-    """Parameters (n,) of the places, and lengths along the curve (m)."""
-    joint: Array
-    marginals: Array
-    sampled: Array
-    """Sigmas (n,): B Sigma B', the paper's sum of beta_j^2 Sigma_j, and of splines drawn at random."""
-    curves: Array
-    """Points (s, n, 2) of the splines drawn at random (m)."""
+    cones: Array  # (k, 2) positions of the seen cones (m)
+    u: Array  # (n,) parameters of the places
+    length: Array  # (n,) lengths along the curve (m)
+    joint: Array  # (n,) sigmas by B Sigma B'
+    marginals: Array  # (n,) sigmas by the paper's sum of beta_j^2 Sigma_j
+    sampled: Array  # (n,) sigmas of splines drawn at random
+    curves: Array  # (s, n, 2) points of the splines drawn at random (m)
 
 
 def uncertainty(rng: np.random.Generator, samples: int = 2000) -> Uncertainty:
@@ -128,16 +123,12 @@ def _draw_sigmas(axes: Axes, data: Uncertainty) -> None:
     axes.legend(loc="upper left", ncols=3)
 
 
-# --- simplification --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Simplified:
     """Curve on fewer knots and its distance from the old one."""
 
     curve: BSpline
-    errors: Array
-    """Distances (n,) of points of the old curve, at equal lengths, from the new one (m)."""
+    errors: Array  # distances (n,) of points of the old curve, at equal lengths, from the new one (m)
 
     @property
     def rms(self) -> float:
@@ -149,12 +140,10 @@ class Simplification:
     """The paper's simplification beside one that ignores curvature."""
 
     old: BSpline
-    length: Array
-    curvature: Array
-    """Lengths (n,) along the old curve at which the errors are taken (m), and its curvature there (1/m)."""
+    length: Array  # (n,) lengths along the curve (m)
+    curvature: Array  # (n,) curvature of the old curve there (1/m)
     weighted: Simplified
-    uniform: Simplified
-    """Curve on as many knots at equal lengths."""
+    uniform: Simplified  # curve on as many knots at equal lengths
 
 
 def simplification() -> Simplification:
@@ -180,16 +169,12 @@ def plot_simplification() -> tuple[Figure, str]:
     with style.figure_context():
         points = data.old.evaluate(np.linspace(*data.old.domain, 400))
         low, high = points.min(axis=0) - 6.0, points.max(axis=0) + 6.0
-        width, height = high - low
-        panel_height = 0.5 * WIDTH * height / width
+        panel_height = 0.5 * WIDTH * (high - low)[1] / (high - low)[0]
         figure = Figure((WIDTH, panel_height + 3.0), layout="constrained")
         grid = figure.add_gridspec(3, 2, height_ratios=(panel_height, 1.1, 0.7))
         before, after = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
-        new = data.weighted.curve
-        for axes, spline, title, color in (
-            (before, data.old, "(a) before", BLUE),
-            (after, new, "(b) after", PURPLE),
-        ):
+        steps = (before, data.old, "(a) before", BLUE), (after, data.weighted.curve, "(b) after", PURPLE)
+        for axes, spline, title, color in steps:
             style.draw_curve(axes, spline, color)
             style.draw_control_points(axes, ring(spline.distinct_control_points), color)
             style.set_frame(axes, low, high)
@@ -228,6 +213,5 @@ def _draw_curvature(axes: Axes, data: Simplification) -> None:
     knots = data.old.arc_length(data.weighted.curve.breaks)
     on_axis = np.stack([knots, np.zeros(len(knots))], axis=1)
     style.draw_points(axes, on_axis, "|", PURPLE, markersize=9.0, clip_on=False)
-    axes.set_ylim(0.0)
-    axes.set(xlabel="length along the curve [m]", ylabel="curvature\n[1/m]")
+    axes.set(ylim=(0.0, None), xlabel="length along the curve [m]", ylabel="curvature\n[1/m]")
     axes.set_title("(d) curvature, and the knots that follow it")

@@ -27,35 +27,25 @@ from .style import BLUE, DARK, GREEN, LIGHT, MARKER_SIZE, ORANGE, PURPLE, RED, T
 
 SIGMA_DETECTION: Final = 0.2
 RIDGE: Final = 0.05
-MARKER: Final = "captions.md"
-"""File by which a folder of these figures is known."""
-_INVISIBLE: Final = 1e-3
-"""Value of a basis function below which it can't be seen."""
+MARKER: Final = "captions.md"  # file by which a folder of these figures is known
+_INVISIBLE: Final = 1e-3  # value of a basis function below which it can't be seen
 _DIAMOND: Final = 0.8 * MARKER_SIZE
-
-
-# --- expansion -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
     """The three steps, on a curve with the joint covariance of its control points."""
 
-    detections: Array
-    expands: BoolArray
-    """Positions (m, 2) of the detections (m), and which mark an expansion of the curve in step (a)."""
-    order: IntArray
-    """Proximity chain of those; the curve is extended to the last one."""
+    detections: Array  # (m, 2) positions (m)
+    expands: BoolArray  # (m,) which mark an expansion in step (a)
+    order: IntArray  # proximity chain of those; the curve is extended to the last one
     before: SplineBoundary
     extended: SplineBoundary
     updated: SplineBoundary
 
 
 def expansion() -> Expansion:
-    """Classify the detections, extend the curve to the last of their chain, update it with the others.
-
-    Detections lie on the curve and beyond its end.
-    """
+    """Classify the detections, extend the curve to the last of their chain, update it with the others."""
     # a curve along the bend that drifts to its outside and ends beside the origin
     along, settings = np.linspace(-18.0, 0.0, 13), CkfSettings(threshold=2.0, separation=2.0)
     spline = fit_spline(_on_bend(along, -0.03 * (along - along[0])), 6, periodic=False)
@@ -107,19 +97,16 @@ def plot_expansion() -> tuple[Figure, str]:
     """Draw (a) classified detections, (b) the curve extended to the last of their chain, (c) the update."""
     data = expansion()
     interpolated = np.arange(len(data.detections)) == data.order[-1]
-    steps = (
-        ("(a) detections beyond the end expand the curve, the others update it", data.before, None),
-        (
-            "(b) the curve is extended to the last of their chain; the others update it too",
-            data.extended,
-            data.before,
-        ),
-        ("(c) the curve after the update", data.updated, data.extended),
+    titles = (
+        "(a) detections beyond the end expand the curve, the others update it",
+        "(b) the curve is extended to the last of their chain; the others update it too",
+        "(c) the curve after the update",
     )
+    curves = (data.before, data.extended, data.updated)
     with style.figure_context():
         figure = Figure((WIDTH, 7.4), layout="compressed")
         panels = figure.subplots(3, 1, sharex=True)
-        for axes, (title, boundary, before) in zip(panels, steps, strict=True):
+        for axes, title, boundary, before in zip(panels, titles, curves, (None, *curves[:2]), strict=True):
             _draw_step(axes, data, boundary, data.expands if before is None else interpolated)
             if before is None:
                 ends = (data.before.spline.control_points[-1:], data.detections[data.order])
@@ -156,27 +143,18 @@ def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: B
     style.set_frame(axes, shown.min(axis=0) - 1.0, shown.max(axis=0) + 0.8)
 
 
-# --- the fit of S_z --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The four steps."""
 
-    curve: BSpline
-    """S_mu, the state's curve."""
-    detections: Array
-    covariances: Array
-    """Positions z (m, 2) in m, and their covariances (m, 2, 2), m^2."""
-    foot_u: Array
-    basis: Array
-    """Parameters (m,) of the closest points, and the basis functions B (m, n) there."""
-    sigma_points: Array
-    """Sigma points X (4 m, m, 2) of the detections (m)."""
-    fitted_points: Array
-    """Control points Z (4 m, n, 2) fitted to each sigma point (m)."""
-    measurement: SplineMeasurement
-    """S_z."""
+    curve: BSpline  # S_mu, the state's curve
+    detections: Array  # (m, 2) positions (m)
+    covariances: Array  # (m, 2, 2) their covariances (m^2)
+    foot_u: Array  # (m,) parameters of the closest points
+    basis: Array  # (m, n) basis functions B there
+    sigma_points: Array  # (4 m, m, 2) sigma points X of the detections (m)
+    fitted_points: Array  # (4 m, n, 2) control points Z fitted to each sigma point (m)
+    measurement: SplineMeasurement  # S_z
 
     @property
     def fitted(self) -> BSpline:
@@ -184,10 +162,7 @@ class Fit:
 
 
 def fit() -> Fit:
-    """Compute C = C_mu + (B' B + L)^-1 B' (y - B C_mu) of the detections and of their sigma points.
-
-    The curve swings to either side, and detections lie to its left, seen from the vehicle.
-    """
+    """Compute C = C_mu + (B' B + L)^-1 B' (y - B C_mu) of the detections and of their sigma points."""
     x = 3.5 * np.arange(9)
     points = np.stack([x, -3.0 * np.cos(2.0 * np.pi * x / x[-1])], axis=1)
     curve = BSpline.open_uniform(points, interval=3.5).clamp()
@@ -280,16 +255,12 @@ def _draw_basis(axes: Axes, data: Fit) -> None:
     axes.set_title("(d) basis: how freely each control point moves")
 
 
-# --- all figures -----------------------------------------------------------------------------------------
-
-
-FIGURES: Final[Mapping[str, Callable[[], tuple[Figure, str]]]] = {
+FIGURES: Final[Mapping[str, Callable[[], tuple[Figure, str]]]] = {  # each returns a figure and its caption
     "uncertainty": plot_uncertainty,
     "expansion": plot_expansion,
     "fit": plot_fit,
     "simplification": plot_simplification,
 }
-"""Functions that compute and draw a figure, and return it with its caption."""
 
 
 def write_figures(out: Path, on_figure: Callable[[], None] = lambda: None) -> None:

@@ -22,16 +22,13 @@ from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, POINTS, RIGHT, UNKNO
 from . import style
 from .style import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, RED, WIDTH, Picture
 
-MARGIN: Final = 3.0
-"""Free space around what is drawn (m)."""
-BOUNDARY_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}
-"""Colours of the boundaries, those of their cones; yellow is amber, which can be seen on white paper."""
+MARGIN: Final = 3.0  # free space around what is drawn (m)
+BOUNDARY_COLORS: Final = {LEFT: BLUE, RIGHT: ORANGE}  # those of their cones; yellow is amber, seen on white
 TRAJECTORY_COLOR: Final = GREEN
 HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
 LABEL_COLORS: Final = {**BOUNDARY_COLORS, UNKNOWN: GREY, **dict.fromkeys(POINTS, RED)}
 BAND_ALPHA: Final = 0.35
-TENTATIVE_DASHES: Final = (0, (4, 2))
-"""Dashes of the stretch of a curve that is not confirmed."""
+TENTATIVE_DASHES: Final = (0, (4, 2))  # dashes of the stretch of a curve that is not confirmed
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,17 +36,13 @@ class MapStyle:
     """Line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
 
     curve_width: float = 0.7
-    path_width: float = 0.6
-    """Width of the trajectory; the true path is thinner."""
+    path_width: float = 0.6  # width of the trajectory; the true path is thinner
     marker_size: float = 2.6
-    landmark_size: float = 1.4
-    """Size of landmarks, small enough for their ellipses to be seen."""
-    widest_band: float = np.inf
-    """Greatest width of a band on either side of its curve (m)."""
+    landmark_size: float = 1.4  # size of landmarks, small enough for their ellipses to be seen
+    widest_band: float = np.inf  # greatest width of a band on either side of its curve (m)
 
 
-WHOLE_TRACK: Final = MapStyle()
-"""Style of a panel that shows a whole track."""
+WHOLE_TRACK: Final = MapStyle()  # style of a panel that shows a whole track
 
 
 def plot_map(
@@ -83,12 +76,10 @@ def plot_map(
             draw_truth(axes, log.truth, WHOLE_TRACK)
         if smoothed is not None and trajectory is not None and len(smoothed):
             thin = MapStyle(path_width=0.25)
-            draw_trajectory(axes, np.asarray(trajectory), thin, "poses as estimated at their time")
+            draw_trajectory(axes, np.asarray(trajectory), thin, label="poses as estimated at their time")
             trajectory = smoothed
         if trajectory is not None and len(trajectory):
-            draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK)
-            draw_unhealthy(axes, np.asarray(trajectory), health, WHOLE_TRACK)
-        draw_start(axes, WHOLE_TRACK)
+            draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK, health)
         finish(figure, axes, title)
     return figure
 
@@ -130,21 +121,18 @@ def draw_orange(axes: Axes, points: Array, label: int, look: MapStyle) -> None:
     style.draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
 
 
-def draw_trajectory(axes: Axes, trajectory: Array, look: MapStyle, label: str = "trajectory") -> None:
-    """Draw poses (n, 3) or positions (n, 2) as a line, map frame (m)."""
+def draw_trajectory(
+    axes: Axes, trajectory: Array, look: MapStyle, health: Sequence[str] = (), label: str = "trajectory"
+) -> None:
+    """Draw poses (n, 3) or positions (n, 2) as a line, map frame (m), and what wasn't healthy in colour."""
     line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": look.path_width, "zorder": 3}
     axes.plot(*trajectory[:, :2].T, label=label, **line)
-
-
-def draw_unhealthy(axes: Axes, trajectory: Array, health: Sequence[str], look: MapStyle) -> None:
-    """Draw the parts of the trajectory again that were degraded or lost, each in its colour."""
     for condition, color in HEALTH_COLORS.items():
         chosen = np.array([word == condition for word in health], bool)
         if len(chosen) != len(trajectory) or not chosen.any():
             continue
-        line: dict[str, Any] = {"color": color, "linewidth": 2.0 * look.path_width, "zorder": 3.2}
-        x, y = np.where(chosen[:, None], trajectory[:, :2], np.nan).T
-        axes.plot(x, y, label=condition, **line)
+        line = {"color": color, "linewidth": 2.0 * look.path_width, "zorder": 3.2}
+        axes.plot(*np.where(chosen[:, None], trajectory[:, :2], np.nan).T, label=condition, **line)
 
 
 def draw_truth(axes: Axes, truth: Truth, look: MapStyle) -> None:
@@ -164,7 +152,8 @@ def draw_start(axes: Axes, look: MapStyle) -> None:
 
 
 def finish(figure: Figure, axes: Axes, title: str | None) -> None:
-    """Add frame, axis titles and legend, and give the figure the map's shape."""
+    """Mark the start, add frame, axis titles and legend, and give the figure the map's shape."""
+    draw_start(axes, WHOLE_TRACK)
     axes.margins(0.0)
     axes.autoscale_view()
     drawn = np.array([axes.get_xlim(), axes.get_ylim()])
@@ -200,6 +189,5 @@ def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
         axes.plot(*poses[:, :2].T, label="odometry alone", **line)
         if log.truth is not None:
             draw_truth(axes, log.truth, WHOLE_TRACK)
-        draw_start(axes, WHOLE_TRACK)
         finish(figure, axes, title)
     return figure

@@ -25,12 +25,9 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.sim.curves import left_normals
 from pathspace_graph.spline.bspline import BSpline
 
-WIDTH: Final = 7.0
-"""Width of a figure (in): two columns of a paper."""
-CURVE_WIDTH, THIN_WIDTH = 1.3, 0.5
-"""Widths of a curve, and of the line of one sample among many (pt)."""
-MARKER_SIZE: Final = 4.0
-"""Size of a control point or a detection (pt)."""
+WIDTH: Final = 7.0  # width of a figure (in): two columns of a paper
+CURVE_WIDTH, THIN_WIDTH = 1.3, 0.5  # widths of a curve, and of the line of one sample among many (pt)
+MARKER_SIZE: Final = 4.0  # size of a control point or a detection (pt)
 ALPHA: Final = 0.25
 
 BLUE: Final = "#0067A9"
@@ -58,14 +55,10 @@ _RC: Final = {
     "legend.handlelength": 1.8,
     "legend.columnspacing": 1.4,
 }
-SIGMAS: Final = 2.0
-"""Standard deviations to the edge of a band across its curve, and of an ellipse along its axes."""
-FORMATS: Final = (".png", ".pdf", ".svg")
-"""Suffixes under which a figure can be saved."""
-SUFFIXES: Final = (".png", ".pdf")
-"""Formats of each figure of commands that write several, to look at and to print."""
-DPI: Final = 200.0
-"""Resolution of a png (dots per inch)."""
+SIGMAS: Final = 2.0  # standard deviations to the edge of a band or an ellipse
+FORMATS: Final = (".png", ".pdf", ".svg")  # suffixes under which a figure can be saved
+SUFFIXES: Final = (".png", ".pdf")  # formats of commands that write several figures: to look at, to print
+DPI: Final = 200.0  # resolution of a png (dots per inch)
 # what would differ from one run to the next is left out, and text stays text in vector formats
 _METADATA: Final = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 _FILE_RC: Final = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "pathspace"}
@@ -153,10 +146,7 @@ def normals(spline: BSpline, u: Array) -> Array:
 def uncertainty_band(
     boundary: SplineBoundary, u: Array, scale: float = 1.0, widest: float = np.inf
 ) -> tuple[Array, Array]:
-    """Return S(u) +- 2 scale sigma(u) n(u), the band's left and right edge (k, 2), m, at u (k,).
-
-    The edges are at most `widest` (m) away from the curve.
-    """
+    """Return the left and right edge (k, 2), S(u) +- 2 scale sigma(u) n(u), at most `widest` m off."""
     spline = boundary.spline
     half = np.minimum(SIGMAS * scale * spline.normal_sigma(u, boundary.covariance), widest)
     offsets = half[:, None] * normals(spline, u)

@@ -19,30 +19,21 @@ from pathspace_graph.settings.checked import Positive
 from pathspace_graph.sim.curves import along_polyline, arc_lengths
 from pathspace_graph.spline.bspline import BSpline
 
-MISSED_DISTANCE: Final = 3.0
-"""Distance from its mapped boundary beyond which a true cone is missed (m; paper, Table 1)."""
-TRUE_STEP: Final = 0.02
-"""Largest distance of points of a true curve (m): a distance of 0.1 m is at most 0.5 mm too long."""
-MAPPED_STEP: Final = 0.1
-"""Largest distance of the points of a mapped curve from which distances are measured (m)."""
-GRID_PER_SPAN: Final = 64
-"""Grid points on each span from which closest points are searched, about every 0.1 m of a track."""
-_OVERLAP: Final = 3
-"""Cones beyond the seam that Akima's tangents of a closed curve need."""
+MISSED_DISTANCE: Final = 3.0  # distance from its boundary beyond which a cone is missed (m; Table 1)
+TRUE_STEP: Final = 0.02  # largest step on a true curve (m): 0.1 m is at most 0.5 mm too long
+MAPPED_STEP: Final = 0.1  # largest step on a mapped curve (m)
+GRID_PER_SPAN: Final = 64  # grid points of a span for closest points, about every 0.1 m
+_OVERLAP: Final = 3  # cones beyond the seam that Akima's tangents of a closed curve need
 
 
 @dataclass(frozen=True, slots=True)
 class LapMetrics:
     """One row of the paper's Table 1."""
 
-    lap: int
-    """Number of the lap, from 1; the map is taken as it stood at its end."""
-    rmse: float
-    """Rmse (m) over the cones that aren't missed; NaN where all are."""
-    missed: float
-    """Share (0 to 1) of all true cones that is missed; NaN without true cones."""
-    size: int
-    """Number of control points or landmarks of both boundaries."""
+    lap: int  # number of the lap, from 1; the map is taken as it stood at its end
+    rmse: float  # rmse (m) over the cones that aren't missed; NaN where all are
+    missed: float  # share (0 to 1) of all true cones that is missed; NaN without true cones
+    size: int  # number of control points or landmarks of both boundaries
 
 
 def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
@@ -105,9 +96,6 @@ def root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-# --- points on curves ------------------------------------------------------------------------------------
-
-
 @lru_cache(maxsize=16)  # every map of a log is compared with the same ones
 def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     """Return points (k, 2) in m, at most `step` apart, on the curve through the true cones of a boundary.
@@ -143,11 +131,7 @@ def driving_order(truth: Truth, label: int) -> Array:
     samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / 0.1)) + 1)  # every 0.1 m
     nearest = np.asarray(KDTree(along_polyline(samples, length, path)).query(cones)[1])
     by_path: Array = cones[np.argsort(nearest, kind="stable")]
-    return by_path if _perimeter(by_path) < _perimeter(cones) else cones
-
-
-def _perimeter(points: Array) -> float:
-    return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
+    return min(cones, by_path, key=lambda of: np.linalg.norm(of - np.roll(of, 1, axis=0), axis=1).sum())
 
 
 def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
@@ -158,9 +142,6 @@ def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
     length = spline.length()
     count = max(int(np.ceil(length / step - 1e-9)), 1)  # round-off makes no further one
     return spline.evaluate(spline.parameters_at((np.arange(count) + 0.5) * length / count))
-
-
-# --- distances -------------------------------------------------------------------------------------------
 
 
 def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
@@ -183,8 +164,8 @@ def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
             forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
             back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
     to_truth, to_mapped = mean_of(np.concatenate(forth)), mean_of(np.concatenate(back))
-    both = 0.5 * (to_truth + to_mapped)
-    return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped, "two_way": both}
+    two_way = 0.5 * (to_truth + to_mapped)
+    return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped, "two_way": two_way}
 
 
 def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
@@ -296,6 +277,5 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> d
             distances, nearest = KDTree(cones).query(boundary.points)
             matched = np.asarray(nearest)[np.asarray(distances) <= settings.distance]
             duplicates += len(matched) - len(np.unique(matched))
-    share = mean_of(np.concatenate(all_ghosts))
-    found = {"ghost_landmarks": landmarks, "ghost_metres": metres, "ghost_share": share}
-    return {**found, "duplicates": duplicates}
+    found = {"ghost_landmarks": landmarks, "ghost_metres": metres}
+    return found | {"ghost_share": mean_of(np.concatenate(all_ghosts)), "duplicates": duplicates}

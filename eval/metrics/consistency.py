@@ -20,11 +20,7 @@ from pathspace_graph.labels import BOUNDARIES
 
 from .accuracy import MISSED_DISTANCE, closest_points, mean_of, true_curve
 
-LEVEL: Final = 0.95
-"""Probability with which an honest map's NEES lies in the interval."""
-
-
-# --- squared errors --------------------------------------------------------------------------------------
+LEVEL: Final = 0.95  # probability with which an honest map's NEES lies in the interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +31,8 @@ class NormalizedError:
     Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4).
     """
 
-    value: float
-    """`e' P^-1 e`; NaN where P is singular."""
-    dof: int
-    """Degrees of freedom of the chi-squared distribution."""
+    value: float  # `e' P^-1 e`; NaN where P is singular
+    dof: int  # degrees of freedom of the chi-squared distribution
 
     @property
     def ratio(self) -> float:
@@ -67,9 +61,6 @@ def _squared(error: Array, covariance: Array) -> float:
         return float(error @ cho_solve(cho_factor(covariance), error))
     except np.linalg.LinAlgError:
         return float("nan")
-
-
-# --- the whole map ---------------------------------------------------------------------------------------
 
 
 def map_nees(track: Map, truth: Truth) -> NormalizedError:
@@ -127,26 +118,19 @@ def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array
     return error, boundary.covariance[np.ix_(columns, columns)]
 
 
-# --- at the true cones -----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class NormalErrors:
     """Errors of a map's curves at k true cones along the normals at their foot points, left positive."""
 
-    errors: Array
-    sigmas: Array
-    """Errors and their claimed standard deviations (k,) in m."""
+    errors: Array  # (k,) in m
+    sigmas: Array  # (k,) their claimed standard deviations (m)
 
     def share_inside(self, factor: float = 2.0) -> float:
         """Return the share of the cones with |error| <= factor * sigma; NaN without cones."""
         return mean_of(np.abs(self.errors) <= factor * self.sigmas)
 
     def mean_squared(self) -> float:
-        """Return mean (error / sigma)^2, which is 1 where the band is honest; NaN without cones.
-
-        In contrast to NEES, correlations between the cones don't count.
-        """
+        """Return mean (error / sigma)^2, without correlations: 1 is honest; NaN without cones."""
         return mean_of((self.errors / self.sigmas) ** 2)
 
 
@@ -168,9 +152,8 @@ def normal_errors(track: Map, truth: Truth) -> NormalErrors:
 def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
     """Return e' (B Sigma B' + diag(s^2))^-1 e, the errors of both curves at all true cones at once.
 
-    In contrast to the NEES of the map, Sigma is the joint covariance of both boundaries from the detections,
-    and s the scatter of the cones about a smooth curve: this judges whether the batch itself predicts the
-    true cones.
+    Unlike in the NEES of the map, Sigma is joint over both boundaries and of the detections, and s the
+    scatter of cones about a smooth curve: this judges whether the batch itself predicts the true cones.
     """
     errors, sigmas, designs, offset = [np.zeros(0)], [np.zeros(0)], [], 0
     size = len(result.map_covariance)
@@ -192,25 +175,19 @@ def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
 def with_marginals(track: Map) -> Map:
     """Return the splines of a map with their control points' own covariances and no cross terms.
 
-    It is the squared basis of the paper: `B blockdiag(Sigma) B' = sum_j beta_j(u)^2 Sigma_jj` (section State
-    Uncertainty).
+    The paper's squared basis (State Uncertainty): `B blockdiag(Sigma) B' = sum_j beta_j(u)^2 Sigma_jj`.
     """
     splines = {k: b for k, b in track.boundaries.items() if isinstance(b, SplineBoundary)}
     blocks = {label: np.kron(np.eye(b.size), np.ones((2, 2))) for label, b in splines.items()}
     return Map(track.closed, {k: replace(b, covariance=b.covariance * blocks[k]) for k, b in splines.items()})
 
 
-# --- the turn about the start ----------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Turn:
     """Rotation of a map about the start."""
 
-    angle: float
-    """Angle by which the map is turned to the left (rad); NaN where nothing of it can be compared."""
-    sigma: float
-    """Its standard deviation by the map's joint covariance (rad); NaN where the map has none."""
+    angle: float  # angle to the left (rad); NaN where nothing can be compared
+    sigma: float  # its standard deviation by the map's joint covariance (rad); NaN where the map has none
 
     @property
     def nees(self) -> float:
@@ -242,7 +219,6 @@ def turn(track: Map, points: Mapping[int, Array]) -> Turn:
             break
     joint = track.joint_covariance
     variance = float("nan") if joint is None else float(gradient @ joint @ gradient)
-    # of sum lever n . S / sum lever^2
     return Turn(angle, float(np.sqrt(variance)) / float(lever @ lever))
 
 

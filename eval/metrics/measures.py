@@ -22,10 +22,8 @@ from .consistency import joint_cone_error, map_nees, normal_errors, turn_from_tr
 from .reference import limit
 from .summary import has_cones, lap_times
 
-WHOLE: Final = "whole"
-"""Name of the whole cycle among its stages."""
-EARLY: Final = 30.0
-"""How far before the true drive is back at the start a loop may close (m), as the sensor sees ahead."""
+WHOLE: Final = "whole"  # name of the whole cycle among its stages
+EARLY: Final = 30.0  # how far before the start a loop may close (m), as the sensor sees ahead
 
 
 def stage_times(cycles: Sequence[CycleRecord]) -> list[dict[str, Any]]:
@@ -56,16 +54,14 @@ def map_bytes(track: Map) -> int:
 
 def covariance_bytes(track: Map) -> int:
     """Return 8 n (n + 1) / 2 bytes for each boundary's symmetric joint covariance, n = 2 m."""
-    sizes = [2 * boundary.size for boundary in track.boundaries.values()]
-    return 8 * sum(n * (n + 1) // 2 for n in sizes)
+    return 8 * sum(boundary.size * (2 * boundary.size + 1) for boundary in track.boundaries.values())
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
     """Metrics of one lap, or of a whole run."""
 
-    lap: int | None
-    """Number of the lap, from 1; None for the whole run."""
+    lap: int | None  # number of the lap, from 1; None for the whole run
     values: dict[str, float]
     """Values by the metric's key, counts as whole numbers and `closed` as a truth value. Unknown ones, for
     example without truth, are absent."""
@@ -135,12 +131,8 @@ def _map_values(
     track: Map, truth: Truth | None, ghost_settings: GhostSettings | None, marginals: bool
 ) -> dict[str, float]:
     """Return the metrics of a map as it stands; without true cones only those that need none."""
-    values: dict[str, float] = {
-        "size": track.size,
-        "closed": bool(track.closed),
-        "bytes": map_bytes(track),
-        "bytes_covariance": covariance_bytes(track),
-    }
+    values: dict[str, float] = {"size": track.size, "closed": bool(track.closed)}
+    values |= {"bytes": map_bytes(track), "bytes_covariance": covariance_bytes(track)}
     if truth is None or not has_cones(truth):
         return values
     distances = accuracy.cone_distances(track, truth)
@@ -159,9 +151,8 @@ def _map_values(
     turns = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
     values |= {key: value for key, value in turns.items() if not np.isnan(value)}
     if marginals:
-        by_marginals = _consistency_values(with_marginals(track), truth)
-        keys = ("nees", "inside", "normalized_error")
-        values |= {f"{key}_marginals": by_marginals[key] for key in keys}
+        found = _consistency_values(with_marginals(track), truth)
+        values |= {f"{key}_marginals": found[key] for key in ("nees", "inside", "normalized_error")}
     return values
 
 
@@ -186,8 +177,7 @@ def _centre_values(track: Map, truth: Truth) -> dict[str, float]:
 
 
 def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
-    """Return what is known of the vehicle at the end of the log, how far its pose jumped where the map was
-    replaced (m), and whether the loop has closed falsely."""
+    """Return errors of the vehicle at the log's end, its largest jump (m), and whether it closed falsely."""
     values: dict[str, float] = {}
     if truth is None or len(run.trajectory) == 0:
         return values
@@ -202,10 +192,7 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
 
 
 def closes_falsely(run: RunResult, truth: Truth) -> bool:
-    """Return whether the loop closed before the true drive was back at the start.
-
-    An online run closes at a cycle, and a batch at the end of the log.
-    """
+    """Return whether the loop closed, a batch at its end, before the true drive was back at the start."""
     if not run.map.closed:
         return False
     t, ends = closing_stamp(run), lap_end_indices(truth.poses)

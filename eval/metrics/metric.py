@@ -15,13 +15,10 @@ from .accuracy import root_mean_square
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.rad2deg(1.0)), "mrad/s": 1e3}
 """Factors from the shares, bytes and radians of the columns to the units of the tables."""
-MEAN_DIGITS: Final = 2
-"""Least number of digits after the decimal point of a mean with its interval."""
+MEAN_DIGITS: Final = 2  # least number of digits after the decimal point of a mean with its interval
 UNKNOWN: Final = "–"
-EVERY_LAP: Final = "all"
-"""Suffix of a column that is the average over all laps, such as `rmse@all`."""
-LATER_LAPS: Final = "later"
-"""Suffix of a column that is the average over the laps from the second on, such as `rmse@later`."""
+EVERY_LAP: Final = "all"  # suffix of the average over all laps, as in `rmse@all`
+LATER_LAPS: Final = "later"  # suffix of the average over the laps from the second on, as in `rmse@later`
 _SLOPE: Final = re.compile(r"slope\((\w+), (\w+)\)")
 
 
@@ -29,20 +26,13 @@ _SLOPE: Final = re.compile(r"slope\((\w+), (\w+)\)")
 class Metric:
     """A number that is measured of every lap or of every run."""
 
-    key: str
-    """Name of its column in every file."""
-    title: str
-    """Name in tables."""
-    unit: str = ""
-    """Unit in tables; empty for pure numbers and counts."""
-    digits: int = 3
-    """Number of digits after the decimal point in tables."""
-    scope: Literal["lap", "run"] = "lap"
-    """`lap`: measured of every lap and of the whole run; `run`: of the whole run only."""
-    time: bool = False
-    """Whether it is a wall time, all that differs when the same run is repeated."""
-    average: Literal["mean", "rms"] = "mean"
-    """Average over several runs: a root mean square for errors with a sign."""
+    key: str  # name of its column in every file
+    title: str  # name in tables
+    unit: str = ""  # unit in tables; empty for pure numbers and counts
+    digits: int = 3  # number of digits after the decimal point in tables
+    scope: Literal["lap", "run"] = "lap"  # of laps and the whole run, or of the whole run only
+    time: bool = False  # whether it is a wall time, all that differs when the same run is repeated
+    average: Literal["mean", "rms"] = "mean"  # over runs: a root mean square for errors with a sign
 
     @property
     def heading(self) -> str:
@@ -62,7 +52,6 @@ class Metric:
         return root_mean_square(known) if self.average == "rms" else float(np.mean(known))
 
     def text(self, value: float) -> str:
-        """Return a value as tables show it."""
         return UNKNOWN if np.isnan(value) else f"{self.factor * value:.{self.digits}f}"
 
 
@@ -153,9 +142,7 @@ _ALL: Final = (
     Metric("range_bias_by_prior", "bias of ranges by its prior's sigma", "", 1, "run"),
     Metric("heading_sigma", "last heading, claimed sigma", "°", 2, "run", average="rms"),
     Metric("heading_error", "error of the last heading", "°", 2, "run", average="rms"),
-    Metric(
-        "heading_by_sigma", "error of the last heading by claimed sigma", digits=2, scope="run", average="rms"
-    ),
+    Metric("heading_by_sigma", "error of the last heading by claimed sigma", "", 2, "run", average="rms"),
     Metric("converged", "batch converged", "%", 0, "run"),
     Metric("cost", "cost of the batch", "", 1, "run"),
     Metric("bytes", "map", "kB", 2),
@@ -165,8 +152,7 @@ _ALL: Final = (
     Metric("ms_p99", "update, 99th percentile", "ms", 2, time=True),
     Metric("seconds", "whole run", "s", 1, "run", time=True),
 )
-METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}
-"""All metrics by key, in the order of the tables."""
+METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}  # in the order of tables
 
 
 @dataclass(frozen=True)
@@ -174,10 +160,8 @@ class Column:
     """A figure of several runs: a metric of one lap or several, or a slope of one metric on another."""
 
     metric: Metric
-    laps: str = ""
-    """Number of a lap, `later` or `all`; empty for the last lap."""
-    given: Metric | None = None
-    """Metric on which the slope is taken, if it is a slope."""
+    laps: str = ""  # number of a lap, `later` or `all`; empty for the last lap
+    given: Metric | None = None  # metric on which the slope is taken, if it is a slope
 
     @property
     def title(self) -> str:
@@ -194,45 +178,30 @@ class Column:
     def text(self, values: pd.DataFrame, over: str = "mean") -> str:
         """Return the text of the average over runs, whose metrics are columns by key, or of the slope.
 
-        `median` and `max` are of magnitudes where there are signs; a slope has none.
+        `median` and `max` are of magnitudes where there are signs; a slope, `sum e t / sum t^2`, has none. It
+        leads through the origin, as estimator and simulator both expect zero.
         """
         of = values[self.metric.key].astype(float)
         if self.given is not None:
-            given = values[self.given.key].astype(float)
-            slope = slope_of(of.to_numpy(), given.to_numpy()) if over == "mean" else np.nan
-            return UNKNOWN if np.isnan(slope) else f"{slope:.2f}"
+            known = values.astype(float).dropna(subset=[self.metric.key, self.given.key])
+            t = known[self.given.key].to_numpy()
+            moment = float(t @ t) if over == "mean" else 0.0
+            return f"{float(known[self.metric.key].to_numpy() @ t) / moment:.2f}" if moment > 0.0 else UNKNOWN
         if over == "mean":
             return self.metric.text(self.metric.over(of))
         return self.metric.text(float((of.abs() if self.metric.average == "rms" else of).agg(over)))
 
 
 def column_of(text: str) -> Column:
-    """Return a column such as `rmse`, `rmse@1`, `rmse@later`, `rmse@all` or `slope(bias, bias_true)`.
-
-    SettingsError where a metric or the laps are unknown.
-    """
+    """Return a column such as `rmse`, `rmse@1`, `rmse@later`, `rmse@all` or `slope(bias, bias_true)`."""
     slope = _SLOPE.fullmatch(text)
-    if slope is not None:
-        return Column(_metric(slope[1]), given=_metric(slope[2]))
     key, _, laps = text.partition("@")
-    metric = _metric(key)
+    for name in slope.groups() if slope else (key,):
+        check_name(name, METRICS, "columns: expected a known metric")
+    if slope is not None:
+        return Column(METRICS[slope[1]], given=METRICS[slope[2]])
     if laps and laps not in (EVERY_LAP, LATER_LAPS) and not laps.isdecimal():
         raise SettingsError(
             f"columns: expected a lap's number, '{LATER_LAPS}' or '{EVERY_LAP}' after @, found '{text}'"
         )
-    return Column(metric, laps)
-
-
-def slope_of(estimates: np.ndarray, truths: np.ndarray) -> float:
-    """Return `sum e t / sum t^2` over the runs (n,) whose estimate and truth are known; NaN without any.
-
-    The line leads through the origin, as estimator and simulator both expect zero.
-    """
-    known = ~(np.isnan(estimates) | np.isnan(truths))
-    moment = float(truths[known] @ truths[known])
-    return float(estimates[known] @ truths[known]) / moment if moment > 0.0 else float("nan")
-
-
-def _metric(key: str) -> Metric:
-    check_name(key, METRICS, "columns: expected a known metric")
-    return METRICS[key]
+    return Column(METRICS[key], laps)

@@ -19,14 +19,8 @@ from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.knots import fit_spline
 
-from .accuracy import (
-    boundary_distances,
-    closest_points,
-    driving_order,
-    mapped_points,
-    root_mean_square,
-    two_way_distance,
-)
+from . import accuracy
+from .accuracy import boundary_distances, closest_points, mapped_points, root_mean_square
 from .consistency import near_pairs
 from .trajectory import pose_errors
 
@@ -43,20 +37,16 @@ def limit(log: Log, track: Map) -> dict[str, float]:
 
 
 def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:
-    """Return the landmark batch with oracle association: each detection knows its true cone.
+    """Return the landmark batch with oracle association: each detection knows its true cone, the landmark.
 
-    It also knows the sensor's constant errors and the true noise, where the log has them. Numbers of
-    landmarks are indices of true cones.
+    It also knows the sensor's constant errors and the true noise, where the log has them.
     """
     truth = _truth(log)
     if truth.associations is None:
         raise ValueError("expected a simulated log, whose associations are known, found one without")
-    if truth.sensor is None and truth.noise is None:
-        return solve_landmarks(log, truth.associations)
     settings = MapperSettings(calibration=CalibrationSettings(sensor=truth.sensor is None))
     told, associations = without_sensor_errors(log, truth.associations)
-    told = with_true_noise(told, associations)
-    return solve_landmarks(told, associations, settings)
+    return solve_landmarks(with_true_noise(told, associations), associations, settings)
 
 
 def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArray]:
@@ -79,8 +69,7 @@ def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArr
         measured = cycle.points_vehicle
         distance, radial = _rays(measured)
         across = (distance - bias) / (1.0 + scale) / distance
-        change = radial / (1.0 + scale) + across[:, None, None] * (np.eye(2) - radial)
-        change = to_vehicle @ change
+        change = to_vehicle @ (radial / (1.0 + scale) + across[:, None, None] * (np.eye(2) - radial))
         points = measured * across[:, None] @ to_vehicle.T + [0.0, lateral]
         covariances = change @ cycle.covariances @ change.transpose(0, 2, 1)
         cycles.append(Detections(cycle.t - latency, points, covariances, cycle.labels))
@@ -137,7 +126,7 @@ def fit_rmse(track: Map, truth: Truth) -> float:
     """
     distances = [np.zeros(0)]
     for label, boundary in track.boundaries.items():
-        cones = driving_order(truth, label)
+        cones = accuracy.driving_order(truth, label)
         fitted = cones
         if isinstance(boundary, SplineBoundary) and boundary.size < len(cones):
             like = boundary.spline
@@ -153,26 +142,20 @@ def _truth(log: Log) -> Truth:
     return log.truth
 
 
-# --- another run -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Gap:
     """Distance of one run from another."""
 
-    curves: dict[str, float]
-    """Two-way distance (m) of the two curves of each boundary that both runs have mapped."""
-    along: float
-    across: float
-    heading: float
-    """Root mean square errors of the poses in the reference's frame (m, m, rad)."""
+    curves: dict[str, float]  # two-way distance (m) of each boundary that both have mapped
+    along: float  # rms error along (m), in the frames of the reference
+    across: float  # (m)
+    heading: float  # (rad)
 
 
 def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
     """Return the turn (rad) of a map from that of the batch over the same log, and the rmse by the batch's.
 
-    Small turns about one point add up, so the turn from the batch is the difference of the turns from the
-    truth. Where either map lacks the metric, the result does too.
+    The turns are from the truth, since small turns add up. Empty where either map lacks a metric.
     """
     if not {"turn", "rmse"} <= set(values) & set(batch):
         return {}
@@ -181,10 +164,9 @@ def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str,
 
 
 def gap(run: RunResult, reference: RunResult) -> Gap:
-    """Return the gap of a run from a reference over the same log."""
     shared = sorted(set(run.map.boundaries) & set(reference.map.boundaries))
     own, others = run.map.boundaries, reference.map.boundaries
-    curves = {NAMES[label]: two_way_distance(own[label], others[label]) for label in shared}
+    curves = {NAMES[label]: accuracy.two_way_distance(own[label], others[label]) for label in shared}
     errors = pose_errors(run.trajectory_t, run.trajectory, reference.trajectory_t, reference.trajectory)
     return Gap(curves, *(root_mean_square(column) for column in errors.T))
 
@@ -217,6 +199,5 @@ def _aligning(points: list[Array], boundaries: list[MapBoundary], start: float) 
             lever = np.einsum("kd,kd->k", normal, left_of(point - motion[:2]))
             rows.append(np.column_stack([normal, lever]))
             errors.append(np.einsum("kd,kd->k", normal, position - point))
-        change = np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
-        motion = motion + change
+        motion = motion + np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
     return motion

@@ -27,15 +27,11 @@ from .accuracy import LapMetrics, lap_metrics, root_mean_square
 from .consistency import normal_errors
 from .trajectory import position_rms, trajectory_errors
 
-GATE: Final = ("dropped", "late", "refused")
-"""Counts of the gate in each cycle."""
+GATE: Final = ("dropped", "late", "refused")  # counts of the gate in each cycle
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
-    """Return the estimator, settings, versions, laps and timing, and with truth the paper's metrics.
-
-    Hints about the log are in it as well.
-    """
+    """Return the estimator, settings, versions, laps, timing, hints, and with truth the paper's metrics."""
     seconds = [record.seconds for record in result.cycles]
     summary: dict[str, Any] = {
         "estimator": result.estimator,
@@ -58,13 +54,10 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         summary["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
     if hints:
         summary["hints"] = [asdict(hint) for hint in hints]
-    events = [
-        {"cycle": record.cycle, "t": record.t, "jump": record.jump, "notice": record.notice}
-        for record in result.cycles
-        if record.jump is not None or record.notice
-    ]
-    if events:
-        summary["events"] = events
+    told = [record for record in result.cycles if record.jump is not None or record.notice]
+    if told:
+        keys = ("cycle", "t", "jump", "notice")
+        summary["events"] = [{key: getattr(record, key) for key in keys} for record in told]
     if any(record.health for record in result.cycles):
         number = counts([health_of(record) for record in result.cycles])
         summary["health"] = {**number, "stretches": [asdict(of) for of in stretches_of(result)]}

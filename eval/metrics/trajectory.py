@@ -19,23 +19,15 @@ from pathspace_graph.sim.curves import arc_lengths
 
 from .accuracy import boundary_distances, root_mean_square
 
-LOST, ASTRAY = 5.0, 1.0
-"""Position errors beyond which a vehicle is lost, or astray (m)."""
-MOST: Final = 35.0
-"""Greatest length of a reach (m)."""
-ON_CURVE: Final = 0.5
-"""Distance of a true cone from the mapped boundary at which the reach ends (m)."""
-SHORT: Final = 4.0
-"""Reach below which no planner can work (m)."""
-STARTING: Final = 0.03
-"""Share of lap 1 on which the map has only begun, and cycles don't count."""
+LOST, ASTRAY = 5.0, 1.0  # position errors beyond which a vehicle is lost, or astray (m)
+MOST: Final = 35.0  # greatest length of a reach (m)
+ON_CURVE: Final = 0.5  # distance of a true cone from the mapped boundary at which the reach ends (m)
+SHORT: Final = 4.0  # reach below which no planner can work (m)
+STARTING: Final = 0.03  # share of lap 1 on which the map has only begun, and cycles don't count
 
 
 def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
-    """Return poses (n, 3) [x, y, theta] at the stamps t (n,), linear between poses (N, 3) at pose_t (N,).
-
-    Headings turn the shorter way.
-    """
+    """Return poses (n, 3) at t (n,), linear between poses (N, 3) at pose_t (N,), by the shorter turn."""
     columns = (poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2]))
     x, y, theta = (np.interp(t, pose_t, column) for column in columns)
     return np.stack([x, y, wrap_angle(theta)], axis=1)
@@ -44,8 +36,7 @@ def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
 def pose_errors(t: Array, poses: Array, reference_t: Array, reference: Array) -> Array:
     """Return [along, across, heading] (k, 3) in m, m, rad: the error of each pose in its reference's frame.
 
-    t is (n,), poses is (n, 3). Nothing is aligned. Stamps outside those of the reference are left out (k <=
-    n).
+    t is (n,), poses is (n, 3). Nothing is aligned. Stamps outside those of the reference are left out.
     """
     inside = (t >= reference_t[0]) & (t <= reference_t[-1])
     expected = interpolate_poses(reference_t, reference, t[inside])
@@ -59,23 +50,15 @@ def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
     return pose_errors(t, poses, truth.pose_t, truth.poses)
 
 
-def ate(t: Array, poses: Array, truth: Truth) -> float:
-    """Return the absolute trajectory error sqrt(mean |p - p_true|^2) in m, without alignment."""
-    return position_rms(trajectory_errors(t, poses, truth))
-
-
 def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
     """Return the largest position error (m), its rms in the last second (m), and whether that is lost."""
     errors = trajectory_errors(t, poses, truth)
     if len(errors) == 0:
         return {}
     known = t[(t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])]
-    error_end = position_rms(errors[known >= known[-1] - 1.0])
-    return {
-        "error_max": float(np.linalg.norm(errors[:, :2], axis=1).max()),
-        "error_end": error_end,
-        "lost_at_end": bool(error_end > LOST),
-    }
+    largest = float(np.linalg.norm(errors[:, :2], axis=1).max())
+    end = position_rms(errors[known >= known[-1] - 1.0])
+    return {"error_max": largest, "error_end": end, "lost_at_end": end > LOST}
 
 
 def longest_astray(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:
@@ -91,10 +74,8 @@ def longest_astray(t: Array, poses: Array, truth: Truth, since: float) -> dict[s
     astray = np.append(errors > ASTRAY, False).astype(int)
     begins = np.flatnonzero(np.diff(astray, prepend=0) == 1)
     ends = np.minimum(np.flatnonzero(np.diff(astray, prepend=0) == -1), len(stamps) - 1)
-    return {
-        "astray_time": float((stamps[ends] - stamps[begins]).max(initial=0.0)),
-        "astray_way": float((driven[ends] - driven[begins]).max(initial=0.0)),
-    }
+    time, way = (float((of[ends] - of[begins]).max(initial=0.0)) for of in (stamps, driven))
+    return {"astray_time": time, "astray_way": way}
 
 
 def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, float]:
@@ -119,11 +100,8 @@ def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, flo
 
 
 def position_rms(errors: Array) -> float:
-    """Return the root mean square distance (m) of pose errors (k, 3)."""
+    """Return sqrt(mean |p - p_true|^2), m, of pose errors (k, 3): the absolute trajectory error (ATE)."""
     return root_mean_square(np.linalg.norm(errors[:, :2], axis=1))
-
-
-# --- reach -----------------------------------------------------------------------------------------------
 
 
 class ReachObserver:
@@ -212,11 +190,7 @@ def reach_values(rows: Array) -> dict[str, float]:
     if len(counted) == 0:
         return {}
     reach, squares, cones = counted.T
-    median, tenth = np.quantile(reach, [0.5, 0.1])
-    error = np.sqrt(squares.sum() / cones.sum()) if cones.sum() else np.nan
-    return {
-        "reach_median": float(median),
-        "reach_p10": float(tenth),
-        "reach_short": float(np.mean(reach < SHORT)),
-        "reach_error": float(error),
-    }
+    median, tenth = np.quantile(reach, [0.5, 0.1]).tolist()
+    error = float(np.sqrt(squares.sum() / cones.sum())) if cones.sum() else float("nan")
+    short = float(np.mean(reach < SHORT))
+    return {"reach_median": median, "reach_p10": tenth, "reach_short": short, "reach_error": error}

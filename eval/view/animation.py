@@ -32,18 +32,14 @@ from pathspace_graph.run import ObservedCycle, Readings
 from pathspace_graph.settings.output import FilmSettings
 
 SUFFIXES: Final = (".gif", ".mp4")
-DPI: Final = 100.0
-"""Resolution of a frame (dots per inch), which decides how large the text is."""
-VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])
-"""Arrow that stands for the vehicle (m, vehicle frame), larger than it is, so that it is seen."""
+DPI: Final = 100.0  # resolution of a frame (dots per inch), which decides how large the text is
+VEHICLE: Final = np.array([[2.4, 0.0], [-1.2, 1.2], [-0.6, 0.0], [-1.2, -1.2]])  # arrow (m), larger than life
 Pixels = NDArray[np.uint8]
 _STYLE: Final = MapStyle(curve_width=1.4, path_width=0.8, marker_size=2.8, widest_band=5.0)
 """Lines are wider than on paper, since a film has few pixels."""
-_MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)
-"""Place of the map: left, bottom, width, height, as shares of the frame."""
+_MAP_PLACE: Final = (0.07, 0.085, 0.69, 0.845)  # left, bottom, width and height, as shares of the frame
 _TEXT_PLACE: Final = (0.775, 0.085, 0.212, 0.845)
-_FRAME_STEP: Final = 10.0
-"""Step (m) by which the part of the plane that is shown grows."""
+_FRAME_STEP: Final = 10.0  # step (m) by which the part of the plane that is shown grows
 
 
 def lap_seconds(log: Log) -> float:
@@ -107,10 +103,7 @@ class GifFilm:
         self._time = 0.0
 
     def add(self, figure: Figure, seconds: float) -> None:
-        """Add a figure, of the same size as those before, as a frame that is shown for a time (s).
-
-        The format counts in hundredths of a second, whose rounding must not add up.
-        """
+        """Add a figure as a frame, whose time (s) is rounded to 0.01 s so that errors do not add up."""
         picture = Image.fromarray(pixels_of(figure))
         # one index of the palette is left for what does not change
         self._frames.append(picture.quantize(255, dither=Image.Dither.NONE))
@@ -118,7 +111,6 @@ class GifFilm:
         self._durations.append(10 * (round(100.0 * self._time) - round(100.0 * before)))
 
     def write(self, file: Path) -> None:
-        """Write a film that is repeated for ever."""
         if not self._frames:
             raise OutputError(f"{file.name}: expected a film of at least one frame, found none")
         first, *others = self._frames
@@ -148,25 +140,21 @@ class _FfmpegFilm:
             self.writer.grab_frame()
 
 
-# --- frames ----------------------------------------------------------------------------------------------
-
-
 class Animation:
     """Draws a frame of a film at equal steps of the log's time; it is an observer of `run.run_online`.
 
-    `finish` must be called at the end. The true cones are drawn, and held against the map, where there is
-    a truth.
+    Call `finish` at the end. The true cones are drawn, and held against the map, where there is a truth.
     """
 
     def __init__(
         self,
         film: Film,
         lap_seconds: float,
-        settings: FilmSettings | None = None,
+        settings: FilmSettings,
         truth: Truth | None = None,
         title: str = "",
     ) -> None:
-        self.settings = settings or FilmSettings()
+        self.settings = settings
         self._film, self._lap, self._truth, self._title = film, lap_seconds, truth, title
         self._begin: float | None = None
         self._frames = 0
@@ -183,7 +171,6 @@ class Animation:
         self._text = self._figure.add_axes(_TEXT_PLACE)
 
     def __call__(self, cycle: ObservedCycle) -> None:
-        """Note what happened in a cycle, and draw a frame where one is due."""
         t, result = cycle.detections.t, cycle.result
         self._begin = t if self._begin is None else self._begin
         film_time = (t - self._begin) * self.settings.seconds_per_lap / self._lap
@@ -213,8 +200,6 @@ class Animation:
             self._notice, self._notice_until = "\n".join(told), film_time + 2.0
         self._was_closed, self._size = result.closed, sum(result.sizes)
 
-    # --- a frame -----------------------------------------------------------------------------------------
-
     def _draw(self, cycle: ObservedCycle, film_time: float) -> None:
         axes = self._axes
         with style.figure_context():
@@ -225,8 +210,7 @@ class Animation:
             for label, cones in sorted(cycle.map.points.items()):
                 map_plot.draw_orange(axes, cones.points, label, _STYLE)
             path = np.array(self._poses)
-            map_plot.draw_trajectory(axes, path, _STYLE)
-            map_plot.draw_unhealthy(axes, path, self._healths, _STYLE)
+            map_plot.draw_trajectory(axes, path, _STYLE, self._healths)
             _draw_readings(axes, cycle.readings, path[-1])
             _draw_vehicle(axes, path[-1], cycle.window)
             self._show(path[-1:, :2])

@@ -29,10 +29,8 @@ from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 from .animation import Animation, check_film_file, film, lap_seconds
 
 SUFFIX: Final = ".rrd"
-DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
-"""Variables of the environment of which one is set where there is a display, on Linux."""
-PORT: Final = 9876
-"""The viewer's port, rerun's own; a viewer that is there already is used."""
+DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")  # one is set with a display, on Linux
+PORT: Final = 9876  # the viewer's port, rerun's own; a viewer that is there already is used
 
 
 def import_rerun(option: str) -> Any:
@@ -74,10 +72,9 @@ def recording(
     settings: RecordingSettings | None = None,
     truth: Truth | None = None,
 ) -> "Iterator[Recorder]":
-    """Yield an observer that records each cycle that it is shown, to a file, to a window, or to both.
+    """Yield an observer that records each cycle, and the true cones if known, to a file, a window, or both.
 
-    The file appears as a whole at the end, and an earlier one is kept as a numbered backup. The window stays
-    open afterwards. The true cones are shown where there is a truth.
+    The file appears as a whole at the end, with an earlier one as a numbered backup; the window stays open.
     """
     target = None if file is None else Path(file)
     check_recording(target, window)
@@ -113,43 +110,32 @@ def _open_window(rerun: Any, stream: Any) -> None:
 
 # --- what is shown --------------------------------------------------------------------------------------
 
-TIMELINES: Final = ("cycle", "time")
-"""Timelines of the perception cycles, from 0, and of the log's time (s)."""
+TIMELINES: Final = ("cycle", "time")  # timelines of the perception cycles, from 0, and of the log's time (s)
 TIMELINE, TIME = TIMELINES
 
-MAP: Final = "map"
-"""Entity above all that has a place, in the map frame (m)."""
-TRAJECTORY: Final = f"{MAP}/trajectory"
-"""Way from the pose of the cycle before."""
+MAP: Final = "map"  # entity above all that has a place, in the map frame (m)
+TRAJECTORY: Final = f"{MAP}/trajectory"  # way from the pose of the cycle before
 VEHICLE: Final = f"{MAP}/vehicle"
 WINDOW: Final = f"{MAP}/window"
-READINGS: Final = f"{MAP}/readings"
-"""Entity above the detections of the cycle: `used`, `gated` or, where it isn't known, `detected`."""
-FEET: Final = f"{READINGS}/feet"
-"""Line from each detection in use to its foot point."""
+READINGS: Final = f"{MAP}/readings"  # above `used`, `gated` or, where that is not known, `detected`
+FEET: Final = f"{READINGS}/feet"  # line from each detection in use to its foot point
 TRUE_CONES: Final = f"{MAP}/truth/cones"
 
 HEALTH: Final = "health"
 MESSAGES: Final = "messages"
-UPDATE: Final = "update"
-"""Entity above the time of each update (ms)."""
-SIZES: Final = "size"
-"""Entity above the numbers of control points or landmarks."""
-READING_COUNTS: Final = "readings"
-"""Entity above the numbers of detections that were offered and used."""
+UPDATE: Final = "update"  # entity above the time of each update (ms)
+SIZES: Final = "size"  # entity above the numbers of control points or landmarks
+READING_COUNTS: Final = "readings"  # entity above the numbers of detections that were offered and used
 
-OUTLINE: Final = np.array([[1.8, 0.0], [-0.9, 0.7], [-0.9, -0.7], [1.8, 0.0]])
-"""Triangle that stands for the vehicle (m, vehicle frame)."""
-LOW, MIDDLE, HIGH, TOP = 10.0, 20.0, 30.0, 40.0
-"""Order of drawing, the last one on top."""
-_SERIES: Final = {
+OUTLINE: Final = np.array([[1.8, 0.0], [-0.9, 0.7], [-0.9, -0.7], [1.8, 0.0]])  # vehicle (m)
+LOW, MIDDLE, HIGH, TOP = 10.0, 20.0, 30.0, 40.0  # order of drawing, the last one on top
+_SERIES: Final = {  # colour of each curve over time
     f"{UPDATE}/milliseconds": BLUE,
     f"{SIZES}/left": BLUE,
     f"{SIZES}/right": ORANGE,
     f"{READING_COUNTS}/offered": GREY,
     f"{READING_COUNTS}/used": GREEN,
 }
-"""Colour of each curve over time."""
 
 
 def blueprint(rerun: Any) -> Any:
@@ -176,10 +162,7 @@ def blueprint(rerun: Any) -> Any:
 
 
 class Recorder:
-    """Shows each cycle to a stream of rerun; `recording` makes one, and `run.run_online` calls it.
-
-    Colours and sizes are logged once, for all times. Each cycle logs places and numbers.
-    """
+    """Shows each cycle to a stream of rerun: places and numbers; colours and sizes once, for all times."""
 
     def __init__(self, rerun: Any, stream: Any, settings: RecordingSettings, truth: Truth | None) -> None:
         self._rerun, self._stream, self._settings = rerun, stream, settings
@@ -202,8 +185,6 @@ class Recorder:
         self._show_readings(cycle)
         self._show_figures(cycle)
         self._show_messages(cycle)
-
-    # --- colours and sizes -------------------------------------------------------------------------------
 
     def _set_styles(self) -> None:
         rerun = self._rerun
@@ -237,8 +218,6 @@ class Recorder:
 
     def _log_static(self, path: str, what: Any) -> None:
         self._stream.log(path, what, static=True)
-
-    # --- what has a place --------------------------------------------------------------------------------
 
     def _lines(self, path: str, strips: list[Array]) -> None:
         self._stream.log(path, self._rerun.LineStrips2D.from_fields(strips=strips))
@@ -288,8 +267,6 @@ class Recorder:
         self._points(f"{READINGS}/gated", readings.points[~readings.used])
         self._lines(FEET, list(np.stack([readings.points, readings.feet], axis=1)[readings.used]))
 
-    # --- what has none -----------------------------------------------------------------------------------
-
     def _show_figures(self, cycle: ObservedCycle) -> None:
         offered, used = len(cycle.detections.labels), cycle.result.readings
         values = (1e3 * cycle.seconds, *cycle.result.sizes, offered, used)
@@ -333,9 +310,6 @@ def pale(color: str) -> str:
 
 def _rgb(color: str) -> tuple[int, ...]:
     return tuple(bytes.fromhex(color.removeprefix("#")))
-
-
-# --- all that watches a run ------------------------------------------------------------------------------
 
 
 class Watched(Protocol):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.accuracy import cone_distances, lap_metrics
-from pathspace_graph.eval.metrics.trajectory import ate
+from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_errors
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
@@ -85,7 +85,7 @@ def test_a_noisy_lap_is_mapped(lap: Log, mapped: tuple[FixedLagMapper, list[Cycl
     assert figures.rmse < 1.0
     assert figures.missed < 0.05
     t = np.array([result.t for result in results])
-    assert ate(t, poses_of(results), truth_of(lap)) < 2.5
+    assert position_rms(trajectory_errors(t, poses_of(results), truth_of(lap))) < 2.5
     assert t.tolist() == [cycle.t for cycle in lap.cycles]
 
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.eval.metrics.trajectory import ate
+from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_errors
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
@@ -53,4 +53,4 @@ def test_an_oval_is_mapped_online_and_as_a_batch(cones: int) -> None:
         assert run.map.boundaries
         if cones >= 8:
             assert run.map.closed
-            assert ate(run.trajectory_t, run.trajectory, log.truth) < 0.5
+            assert position_rms(trajectory_errors(run.trajectory_t, run.trajectory, log.truth)) < 0.5

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
-from pathspace_graph.eval.metrics.trajectory import ate
+from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_errors
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
@@ -76,7 +76,7 @@ def test_a_noisy_drive_is_mapped_completely() -> None:
     assert result.map.closed and result.laps == 2
     metrics = lap_metrics(result.map, log.truth, 2)
     assert metrics.missed == 0.0
-    assert ate(result.trajectory_t, result.trajectory, log.truth) < 0.3
+    assert position_rms(trajectory_errors(result.trajectory_t, result.trajectory, log.truth)) < 0.3
     assert result.cycles[-1].stages.keys() == {
         "predict", "associate", "create", "update", "close", "marginalize"
     }  # fmt: skip

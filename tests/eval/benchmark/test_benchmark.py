@@ -18,7 +18,7 @@ def test_the_script_ends_with_1_where_it_got_worse(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, times: float, code: int | None
 ) -> None:
     def run(factor: float, *options: str) -> None:
-        monkeypatch.setattr(benchmark.Benchmark, "measure", lambda self: steady_run(0.002 * factor))
+        monkeypatch.setattr(benchmark.measurement, "measure_drive", lambda *_: steady_run(0.002 * factor))
         monkeypatch.setattr("sys.argv", ["benchmark", "--baseline", str(tmp_path / "b.json"), *options])
         benchmark.main()
 
@@ -36,7 +36,7 @@ def test_the_script_ends_with_1_where_it_got_worse(
 
 def test_the_file_has_an_object_for_each_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     open_loop = steady_run(closing=300)
-    monkeypatch.setattr(benchmark.Benchmark, "measure", lambda self: open_loop)
+    monkeypatch.setattr(benchmark.measurement, "measure_drive", lambda *_: open_loop)
     monkeypatch.setattr("sys.argv", ["benchmark", "--json", str(tmp_path / "figures.json")])
     benchmark.main()
     rows = json.loads((tmp_path / "figures.json").read_text())

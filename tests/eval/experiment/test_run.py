@@ -18,7 +18,7 @@ from pathspace_graph.eval.experiment.cells import Drive
 from pathspace_graph.eval.experiment.frame import TIMES, without_times
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.eval.experiment.tables import write_study, write_tables
+from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.io.log import Log
 
 from ...scenes.pretenders import Fragile, Pretender, contents, register, write_round_track
@@ -72,7 +72,7 @@ def test_a_row_for_every_run_and_lap(study: Study) -> None:
 
 def test_results_load_into_pandas(study: Study, tmp_path: Path) -> None:
     frame = run_study(study, tmp_path)
-    write_tables(study, frame, tmp_path)
+    write_study(study, frame, tmp_path)
     loaded = pd.read_csv(tmp_path / "results.csv", keep_default_na=True)
     assert list(loaded) == list(without_times(frame))
     np.testing.assert_array_equal(loaded["rmse"], frame["rmse"].astype(float))
@@ -111,7 +111,7 @@ def interrupt_after(cells: int) -> Any:
 
 def test_a_killed_study_goes_on_where_it_was_with_the_same_results(study: Study, tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    write_tables(study, run_study(study, whole), whole)
+    write_study(study, run_study(study, whole), whole)
     calls = Pretender.calls
     for cells in (3, 2):
         with pytest.raises(KeyboardInterrupt):
@@ -120,7 +120,7 @@ def test_a_killed_study_goes_on_where_it_was_with_the_same_results(study: Study,
     # what a kill in the middle of writing leaves
     cell = next((killed / "cells").iterdir())
     cell.with_name(".half.tmp.json").write_text("{")
-    write_tables(study, run_study(study, killed), killed)
+    write_study(study, run_study(study, killed), killed)
     assert Pretender.calls == 2 * calls
     first, second = contents(whole), contents(killed)
     for name in ("results.csv", "study.json"):
@@ -173,14 +173,14 @@ def test_failed_cells_are_kept_until_they_are_to_be_retried(
 def test_a_log_that_cannot_be_simulated_fails_its_cells_only(
     study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = Drive.simulate
+    real = Drive.load
 
-    def simulate(drive: Drive) -> Log:
+    def load(drive: Drive) -> Log:
         if drive.seed == 1:
             raise ValueError("stuck")
         return real(drive)
 
-    monkeypatch.setattr(Drive, "simulate", simulate)
+    monkeypatch.setattr(Drive, "load", load)
     frame = run_study(replace(study, estimators=("pretender",)))
     assert set(frame[frame["seed"] == 1]["failure"]) == {"ValueError: stuck"}
     assert set(frame[frame["seed"] == 0]["failure"]) == {""}

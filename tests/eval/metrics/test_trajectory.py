@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pathspace_graph.eval.metrics.trajectory import (
-    ate,
     end_of_trajectory,
     interpolate_poses,
     longest_astray,
+    position_rms,
     trajectory_errors,
     vehicle_errors,
 )
@@ -30,7 +30,7 @@ def test_trajectory_errors_are_along_and_across_the_true_heading() -> None:
     errors = trajectory_errors(stamps, poses, true)
     expected = [[0.3, 0, 1.6 - np.pi / 2], [0, 0.4, 0], [0, 0, 0]]
     np.testing.assert_allclose(errors, expected, atol=1e-12)
-    assert ate(stamps, poses, true) == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 3))
+    assert position_rms(errors) == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 3))
 
 
 def test_a_vehicle_is_lost_that_is_5_m_off_in_the_last_second() -> None:

@@ -82,7 +82,7 @@ def test_the_film_ends_after_its_laps_and_the_mapping_goes_on(short_log: Log) ->
 
 def test_a_film_without_a_frame_has_nothing_to_hold() -> None:
     reel = Reel()
-    Animation(reel, 1.0).finish()
+    Animation(reel, 1.0, FILM).finish()
     assert reel.seconds == []
 
 
