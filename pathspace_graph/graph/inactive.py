@@ -16,7 +16,7 @@ conditional in the frame of its own anchor: however far the chain swings, it ben
 link holds the origin of the map frame. To bring it back to (0, 0, 0), the whole map is moved rigidly.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -24,6 +24,7 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, inverse
 
 from .gaussian import (
@@ -32,7 +33,6 @@ from .gaussian import (
     jacobian_factor,
     keys_of,
     normal_equations,
-    sparse_marginal,
     square_root_form,
 )
 from .relative import RelativeFactor, by_frame_of, from_frame, relative_factor, rotations, to_frame
@@ -138,11 +138,7 @@ class Link:
     others: Layout  # variables z
     gain: Array  # (n, m) G
     offset: Array  # (n,) e
-
-    def solve(self, variables: Variables, frame: Array) -> Array:
-        """Return the mean (n,) of the leaving variables in the map frame, with the anchor at a pose (3,)."""
-        others = to_frame(variables.of(self.others.keys), frame, self.others)
-        return from_frame(self.gain @ others + self.offset, frame, self.leaving)
+    noise: Array  # (n, n) square root N of the covariance N N' of y given z
 
     def holds(self, keys: IntArray) -> bool:
         return bool(np.isin(self.factor.keys.keys, keys).any())
@@ -154,6 +150,7 @@ class InactiveChain(InactiveMap):
     def __init__(self) -> None:
         super().__init__()
         self.links: list[Link] = []
+        self._poses: IntArray = NO_KEYS  # (a,) keys of the origin and of past anchors, ascending
         self.poses: dict[int, Array] = {}  # (3,) of the origin and of past anchors by key, as of `refresh`
 
     def __len__(self) -> int:
@@ -202,22 +199,26 @@ class InactiveChain(InactiveMap):
     def _changed(self) -> None:
         leaving = [link.leaving.keys for link in self.links]
         keys = np.concatenate([NO_KEYS, *leaving])
-        self.keys = np.sort(keys[~are_poses(keys)])
+        self.keys, self._poses = np.sort(keys[~are_poses(keys)]), np.sort(keys[are_poses(keys)])
         self.anchors = np.array([link.factor.frame for link in self.links[-1:]], np.intp)
         self._active = None
 
     def refresh(self, variables: Variables) -> None:
-        self.poses = {}
-        for link in reversed(self.links):
-            values = link.solve(variables, self._pose(link.factor.frame, variables))
-            points = ~are_poses(link.leaving.keys)
-            count = int(link.leaving.widths[points].sum())
-            variables.values[variables.layout.entries(link.leaving.keys[points])] = values[:count]
-            poses = values[count:].reshape(-1, POSE)
-            self.poses |= dict(zip(link.leaving.keys[~points].tolist(), poses, strict=True))
+        if not self.links:
+            return
+        known = self._with_poses(variables)
+        known.values = _link_means(known.values, self.links, *self._columns(known.layout))
+        variables.values[:] = known.of(variables.keys)
+        poses = known.of(self._poses).reshape(-1, POSE)
+        self.poses = dict(zip(self._poses.tolist(), poses, strict=True))
 
-    def _pose(self, key: int, variables: Variables) -> Array:
-        return self.poses[key] if key in self.poses else variables.of(np.array([key]))
+    def _columns(self, layout: Layout) -> tuple[IntArray, IntArray, IntArray]:
+        """Return the columns of the links' frames (l,), and those of all y and of all z, link after link."""
+        frames, leaving, others = zip(
+            *((link.factor.frame, link.leaving.keys, link.others.keys) for link in self.links), strict=True
+        )
+        by_link = layout.entries(np.concatenate(leaving)), layout.entries(np.concatenate(others))
+        return (layout.columns(np.array(frames)), *by_link)
 
     @property
     def newest(self) -> IntArray:
@@ -247,7 +248,8 @@ class InactiveChain(InactiveMap):
         near = relative_factor(prior, anchor, *pose_and_reference(anchor, variables), variables)
         self.refresh(variables)
         motion = inverse(self.origin)
-        self.poses = {key: compose(motion, pose) for key, pose in self.poses.items()}
+        moved = compose(motion, np.array([*self.poses.values()]))
+        self.poses = dict(zip(self.poses, moved, strict=True))
         variables.values = from_frame(variables.values, motion, variables.layout)
         for follower in followers:
             follower.move(motion)
@@ -261,19 +263,27 @@ class InactiveChain(InactiveMap):
         return graph_of(prior, *(link.factor.factor(known) for link in self.links))
 
     def marginal(self, prior: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.GaussianFactorGraph:
-        """Return the prior of the active variables, linearized at the refreshed values."""
-        graph = self.joint(prior, variables)
-        anchors = np.array([key for key in self.poses if key != ORIGIN_KEY], np.intp)
-        inactive = np.append(self.keys, anchors)
-        return sparse_marginal(graph, np.setdiff1d(keys_of(graph), inactive))
+        """Return the prior of the active variables, linearized at the refreshed values.
+
+        All that the links say of these is where the origin is, which is at (0, 0, 0).
+        """
+        known, (active, entries) = self._with_poses(variables), self.active(variables.layout)
+        columns = self._columns(known.layout)
+        by_all, covariance = _origin_by_active(
+            known.values, self.links, *columns, int(known.layout.columns(np.array([ORIGIN_KEY]))[0])
+        )
+        root = np.linalg.inv(np.linalg.cholesky(covariance))
+        jacobian = root @ by_all[:, known.layout.entries(active.keys)]
+        right = jacobian @ variables.change(entries) - root @ self.origin
+        return graph_of(prior, jacobian_factor(active.keys, jacobian, right))
 
     def _with_poses(self, variables: Variables) -> Variables:
-        known = variables.copy()
-        poses = {ORIGIN_KEY: np.zeros(POSE)} | self.poses
-        keys = sorted(poses)
-        values = np.concatenate([poses[key] for key in keys])
-        reference = np.concatenate([np.zeros(POSE) if key == ORIGIN_KEY else poses[key] for key in keys])
-        known.insert(np.array(keys, np.intp), values, reference)
+        """Return the variables with the origin and past anchors, as of `refresh`."""
+        known, poses = variables.copy(), self.poses
+        keys = self._poses if self.links else np.array([ORIGIN_KEY])
+        values = [poses.get(key, np.zeros(POSE)) for key in keys.tolist()]
+        reference = np.concatenate(values) * np.repeat(keys != ORIGIN_KEY, POSE)
+        known.insert(keys, np.concatenate(values), reference)
         return known
 
 
@@ -313,7 +323,58 @@ def new_link(
     gain = np.asarray(solved[:, :-1], float)
     offset = factor.local[keys.entries(own.keys)] - gain @ factor.local[keys.entries(others.keys)]
     offset += solved[:, -1]
-    return Link(factor, weak, own, others, gain, offset)
+    noise = np.asarray(np.linalg.inv(root[:, keys.entries(own.keys)]), float)
+    return Link(factor, weak, own, others, gain, offset, noise)
+
+
+@compiled
+def _link_means(
+    values: Array, links: Sequence[Link], frames: IntArray, leaving: IntArray, others: IntArray
+) -> Array:
+    """Return all values (n,) with those that left at their means, given the active ones, the newest first.
+
+    The columns are those of `InactiveChain._columns`.
+    """
+    values = values.copy()
+    for link, frame, y, z in reversed([*_by_link(links, frames, leaving, others)]):
+        pose = values[frame : frame + POSE]
+        mean = link.gain @ to_frame(values[z], pose, link.others) + link.offset
+        values[y] = from_frame(mean, pose, link.leaving)
+    return values
+
+
+@compiled
+def _origin_by_active(
+    values: Array, links: Sequence[Link], frames: IntArray, leaving: IntArray, others: IntArray, origin: int
+) -> tuple[Array, Array]:
+    """Return the derivative (3, n) of the origin, at its column, by active variables, and its covariance.
+
+    From the oldest link on, what has left is replaced by its conditional: `y = from(G to(z, f) + e + N w, f)`
+    in the frame f, with w of unit covariance. The covariance (3, 3) is that given the active variables.
+    """
+    by_all, covariance = np.zeros((POSE, len(values))), np.zeros((POSE, POSE))
+    by_all[:, origin : origin + POSE] = np.eye(POSE)
+    for link, frame, y, z in _by_link(links, frames, leaving, others):
+        pose = values[frame : frame + POSE]
+        by_mean = by_all[:, y] @ rotations(link.leaving, pose[2])
+        by_noise, by_others = by_mean @ link.noise, by_mean @ link.gain
+        by_all[:, y] = 0.0
+        by_all[:, z] += by_others @ rotations(link.others, pose[2]).T
+        by_all[:, frame : frame + POSE] += by_others @ by_frame_of(values[z], pose, link.others)
+        by_all[:, frame : frame + POSE] -= by_mean @ by_frame_of(values[y], pose, link.leaving)
+        covariance += by_noise @ by_noise.T
+    return by_all, covariance
+
+
+def _by_link(
+    links: Sequence[Link], frames: IntArray, leaving: IntArray, others: IntArray
+) -> Iterator[tuple[Link, int, IntArray, IntArray]]:
+    ends = (
+        np.cumsum([of.size for of in all_of])
+        for all_of in zip(*((k.leaving, k.others) for k in links), strict=True)
+    )
+    columns = (np.split(all_of, end[:-1]) for all_of, end in zip((leaving, others), ends, strict=True))
+    return zip(links, frames.tolist(), *columns, strict=True)
 
 
 def pose_and_reference(key: int, variables: Variables) -> tuple[Array, Array]:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,13 @@ import pytest
 from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
 from pathspace_graph.factors.footpoint import TOLERANCES, joint_foot_points, refine_joint_foot_points
 from pathspace_graph.factors.kernels import _KERNELS, COMPILED, IN_NUMPY, NUMPY_ONLY
+from pathspace_graph.graph.variables import CALIBRATION_KEY, ORIGIN_KEY, Layout, control_keys, pose_keys
 
 for _module in (
     "front_end.gate",
     "front_end.scan_matching",
     "front_end.sightings",
+    "graph.inactive",
     "graph.relative",
     "graph.rows",
     "mapping.path",
@@ -54,6 +57,29 @@ def rows_of_a_system(rng: np.random.Generator) -> tuple[Any, ...]:
     held = rng.permutation(keys)[:4]
     factor = held, np.asfortranarray(information(rng, 13))
     return keys, starts, np.full(10, 3), [factor], [(*rows, residual)] * 2, rng.normal(size=30)
+
+
+def links(rng: np.random.Generator) -> tuple[Any, ...]:
+    """Values of a calibration, four points, and poses of the origin, an anchor and two more; two links."""
+    point, pose = control_keys(0, np.arange(4)), pose_keys(np.arange(3))
+    keys = np.concatenate([[CALIBRATION_KEY], point, pose, [ORIGIN_KEY]])
+    layout, both = Layout(np.sort(keys)), []
+    for left, given in (
+        (np.array([point[0], ORIGIN_KEY]), np.array([CALIBRATION_KEY, point[1]])),
+        (np.array([point[1], pose[0]]), np.array([CALIBRATION_KEY, point[2], point[3], pose[1]])),
+    ):
+        y, z = Layout(np.sort(left)), Layout(np.sort(given))
+        numbers = [rng.normal(size=shape) for shape in ((y.size, z.size), (y.size,), (y.size, y.size))]
+        both.append(
+            SimpleNamespace(
+                leaving=y, others=z, **dict(zip(("gain", "offset", "noise"), numbers, strict=True))
+            )
+        )
+    frames = layout.columns(pose[[0, 2]])
+    columns = (
+        layout.entries(np.concatenate([getattr(k, of).keys for k in both])) for of in ("leaving", "others")
+    )
+    return rng.normal(size=layout.size), both, frames, *columns
 
 
 def block_of_rows(rng: np.random.Generator) -> tuple[Any, ...]:
@@ -226,6 +252,8 @@ CASES: dict[str, Arguments] = {
         np.array([2, 4, 6]),
         np.array([8]),
     ),
+    "link_means": links,
+    "origin_by_active": lambda rng: (*links(rng), 19),
     "squared": lambda rng: (
         rng.normal(size=3),
         information(rng, 3),

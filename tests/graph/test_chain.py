@@ -137,6 +137,22 @@ def test_the_chain_and_the_prior_are_the_whole_gaussian(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_the_marginal_is_that_of_the_whole_gaussian(seed: int) -> None:
+    """The links are linear in all but the frames, so at the mean the derivatives are exact."""
+    drive = Drive(seed)
+    variables, active = drive.variables, drive.active()
+    variables.values[variables.layout.entries(active)] = drive.mean(active)
+    drive.chain.refresh(variables)
+    layout, kept = Layout(keys_of(drive.whole)), Layout(active)
+    gone = layout.entries(np.setdiff1d(layout.keys, active))
+    expected = schur(*normal_equations(drive.whole, layout), gone)
+    found = normal_equations(drive.chain.marginal(drive.prior, variables), kept)
+    scale = np.abs(expected[0]).max()
+    np.testing.assert_allclose(found[0], expected[0], atol=1e-5 * scale)
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-5 * scale)
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_the_inactive_variables_follow_the_active_ones_to_the_mean(seed: int) -> None:
     """The origin is one of them, and its mean is where it is by definition."""
     drive = Drive(seed)
