@@ -57,6 +57,7 @@ SPEED: Final = {  # figures of the benchmark, each with its label
     "p99": "99th percentile of an update [ms]",
     "closing": "the update that closes the loop [ms]",
     "swap": "the update that swaps the map [ms]",
+    "slowest_other": "the slowest of all other updates [ms]",
     "solve": "the batch of the open lap, in its own process [s]",
 }
 README: Final = ("rmse", "missed", "reach_median")

@@ -34,6 +34,8 @@ LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cy
 REST: Final = 10.0  # distance for which the loop is left as it is after a failure (m)
 RECOGNITION_INTERVAL: Final = 10.0  # least distance of two attempts to recognize the place (m along the path)
 RECURRENCE_INTERVAL: Final = 5.0  # the same for attempts to find a lap in the odometry alone
+LONG_PATH: Final = 1000.0
+"""Path from which on both distances grow with it (m), as the cost of an attempt does."""
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
 """Notice of the first cycle with a revisit."""
 NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
@@ -71,7 +73,7 @@ class TrackLoop:
         self._believed = self.settings  # with the priors of the calibrations as they are now
         self._settled: float | None = None  # path driven (m) when the closed map was last replaced
         self._closing_tried = 0.0
-        self._loop_tried, self._recognition_tried = 0.0, 0.0
+        self._loop_tried, self._recognition_tried = 0.0, 0.0  # paths (m) at which they are tried next
         self._resumes = 0.0
 
     @property
@@ -298,12 +300,13 @@ class TrackLoop:
         boundaries, length = self._smoother.map.state.boundaries, self._path.length
         if length < self._loop_tried or set(boundaries) != set(BOUNDARIES):
             return
-        self._loop_tried = length + RECURRENCE_INTERVAL
+        apart = max(length / LONG_PATH, 1.0)
+        self._loop_tried = length + RECURRENCE_INTERVAL * apart
         if self.record.unsolvable is not None:
             return
         recurrence = self.record.recurrence()
-        if recurrence is None and length >= self._recognition_tried + RECOGNITION_INTERVAL:
-            self._recognition_tried = length
+        if recurrence is None and length >= self._recognition_tried:
+            self._recognition_tried = length + RECOGNITION_INTERVAL * apart
             place = recognize(self._smoother)
             recurrence = None if place is None else self.record.recurrence_since(place)
         if recurrence is not None:
