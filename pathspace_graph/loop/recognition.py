@@ -38,7 +38,6 @@ def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
     if not may_tell_place(track.state, settings):
         return None
     smoother.carry()
-    smoother.refresh()
     covariance = smoother.newest_covariance()
     return find_place(track, covariance, settings) if is_lost(covariance, settings) else None
 
