@@ -49,8 +49,8 @@ class RelativeFactor:
         """Return the factor on its keys and the frame's, but the origin's, linearized at the values."""
         keys = np.append(self.keys.keys, self.frame)
         entries = variables.layout.entries(keys)
-        now, columns = (variables.values[entries], variables.change(entries)), self.keys
-        block = _relative_block(self.root, self.right, self.local, *now, columns.turning, columns.headings)
+        now = variables.values[entries], variables.change(entries)
+        block = _relative_block(self.root, self.right, self.local, *now, self.keys)
         widths, moves = np.append(self.keys.widths, POSE), keys != ORIGIN_KEY
         if not moves.all():
             block = np.asfortranarray(block[:, np.append(np.repeat(moves, widths), True)])
@@ -94,31 +94,16 @@ def relative_factor(
 
 @compiled
 def _relative_block(
-    root: Array,
-    right: Array,
-    local: Array,
-    values: Array,
-    change: Array,
-    turning: IntArray,
-    headings: IntArray,
+    root: Array, right: Array, local: Array, values: Array, change: Array, keys: Layout
 ) -> Array:
     """Return `[J | J d - r]` (r, q + 4), by columns, with derivatives J and residuals r of a relative factor.
 
     The values (q + 3,) and the unknowns d, which are `change` (q + 3,) now, are those of its variables and
-    then of the frame. The columns of points and poses and those of headings are as in a `Layout`.
+    then of the frame.
     """
-    frame, c, s = values[-POSE:], np.cos(values[-1]), np.sin(values[-1])
-    by_all, there = np.zeros((len(local), len(values))), values[:-POSE].copy()
-    by_all[np.arange(len(local)), np.arange(len(local))] = 1.0
-    x, y = turning, turning + 1
-    dx, dy = there[x] - frame[0], there[y] - frame[1]
-    there[x], there[y] = c * dx + s * dy, -s * dx + c * dy
-    there[headings] -= frame[2]
-    by_all[x, x], by_all[x, y], by_all[y, x], by_all[y, y] = c, s, -s, c
-    by_all[x, -3], by_all[x, -2], by_all[x, -1] = -c, -s, there[y]
-    by_all[y, -3], by_all[y, -2], by_all[y, -1] = s, -c, -there[x]
-    by_all[headings, -1] = -1.0
-    jacobian, residual = root @ by_all, root @ (there - local) - right
+    now, frame = values[:-POSE], values[-POSE:]
+    by_all = np.hstack([rotations(keys, frame[2]).T, by_frame_of(now, frame, keys)])
+    jacobian, residual = root @ by_all, root @ (to_frame(now, frame, keys) - local) - right
     return np.asfortranarray(np.column_stack([jacobian, jacobian @ change - residual]))
 
 
