@@ -24,6 +24,7 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.se2 import compose, inverse
 
 from .gaussian import (
@@ -88,7 +89,7 @@ class InactiveMap:
         self.net.push_back(conditional)
         self.keys = np.union1d(self.keys, keys)
         self._old_anchors = np.union1d(self._old_anchors, keyframes)
-        separator = np.array(list(conditional.keys()), np.intp)[len(frontals) :]
+        separator = keys_of_factor(conditional)[len(frontals) :]
         self.anchors = separator[are_poses(separator)]
         self._given = np.setdiff1d(
             np.union1d(self._given, separator), np.append(self.keys, self._old_anchors)
@@ -143,9 +144,6 @@ class Link:
         """Return the mean (n,) of the leaving variables in the map frame, with the anchor at a pose (3,)."""
         others = to_frame(variables.of(self.others.keys), frame, self.others)
         return from_frame(self.gain @ others + self.offset, frame, self.leaving)
-
-    def holds(self, keys: IntArray) -> bool:
-        return bool(np.isin(self.factor.keys.keys, keys).any())
 
 
 class InactiveChain(InactiveMap):
@@ -225,7 +223,7 @@ class InactiveChain(InactiveMap):
         return np.asarray(keys[~are_poses(keys)])
 
     def holds(self, keys: IntArray) -> bool:
-        return any(link.holds(keys) for link in self.links)
+        return any(np.isin(link.factor.keys.keys, keys).any() for link in self.links)
 
     # --- the frame ---------------------------------------------------------------------------------------
 
@@ -295,7 +293,7 @@ def new_link(
     variables: Variables,
 ) -> Link:
     """Return a conditional of variables (k,), given others, as a link in the frame of a pose."""
-    order, (A, b) = np.array(list(conditional.keys()), np.intp), conditional.jacobian()
+    order, (A, b) = keys_of_factor(conditional), conditional.jacobian()
     (pose, reference), columns = pose_and_reference(frame, variables), np.repeat(order, sizes(order))
     right = np.array(b).ravel() - A[:, columns == frame] @ (pose - reference)
     keys = Layout(np.sort(order[order != frame]))

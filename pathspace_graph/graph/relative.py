@@ -19,7 +19,6 @@ from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, relative
 
 from .gaussian import (
-    condition,
     graph_of,
     jacobian_factor,
     keys_of,
@@ -77,17 +76,14 @@ def relative_factor(
     That is at `pose` (3,), its unknown measured from `reference` (3,). In the frame of a fixed pose variables
     are linear functions of the unknowns, so the change of frame is exact.
     """
-    held = keys_of(graph)
-    keys = Layout(held[held != frame])
-    if keys.size < Layout(held).size:
-        information, vector = condition(graph, keys, frame, pose - reference)
-    else:
-        information, vector = normal_equations(graph, keys)
-    known = keys.keys[np.diagonal(information)[keys.starts] > 0.0]
-    kept, own = Layout(known), keys.entries(known)
+    held = Layout(keys_of(graph))
+    information, vector = normal_equations(graph, held)
+    known = held.keys[(np.diagonal(information)[held.starts] > 0.0) & (held.keys != frame)]
+    kept, own, fixed = Layout(known), held.entries(known), held.entries(held.keys[held.keys == frame])
     entries = variables.layout.entries(known)
-    vector = vector[own] - information[np.ix_(own, own)] @ variables.change(entries)
-    root, right = square_root_form(information[np.ix_(own, own)], vector)
+    vector = vector[own] - information[np.ix_(own, fixed)] @ (pose - reference)[: len(fixed)]
+    information = information[np.ix_(own, own)]
+    root, right = square_root_form(information, vector - information @ variables.change(entries))
     local = to_frame(variables.values[entries], pose, kept)
     return RelativeFactor(frame, kept, root @ rotations(kept, pose[2]), right, local)
 
