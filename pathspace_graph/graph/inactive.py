@@ -268,10 +268,9 @@ class InactiveChain(InactiveMap):
     def _with_poses(self, variables: Variables) -> Variables:
         known = variables.copy()
         poses = {ORIGIN_KEY: np.zeros(POSE)} | self.poses
-        keys = sorted(poses)
-        values = np.concatenate([poses[key] for key in keys])
-        reference = np.concatenate([np.zeros(POSE) if key == ORIGIN_KEY else poses[key] for key in keys])
-        known.insert(np.array(keys, np.intp), values, reference)
+        keys = np.array(sorted(poses), np.intp)
+        values = np.concatenate([poses[key] for key in keys.tolist()])
+        known.insert(keys, values, np.where(np.repeat(keys == ORIGIN_KEY, POSE), 0.0, values))
         return known
 
 
