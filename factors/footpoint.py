@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
@@ -64,8 +64,8 @@ class Stretch:
         return np.minimum(np.maximum(v, self.begin), self.end)
 
     def where(self, rows: BoolArray) -> Stretch:
-        names = ("begin", "end", "low", "high", "floor", "ceiling", "interval")
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+        _, *limits = vars(self).values()
+        return Stretch(self.periodic, *(limit[rows] for limit in limits))
 
 
 def stretch_of(spans: Spans, curve: IntArray, u_low: Array, u_high: Array) -> Stretch:
@@ -197,11 +197,10 @@ def _searched(
     tolerances: tuple[float, ...],
 ) -> tuple[Any, ...]:
     """Return the fields of `joint_foot_points`; the tolerances are those of this module."""
-    stretch, points_t = stretch_of(spans, curve, u_low, u_high), np.ascontiguousarray(points.T)
-    search = spans, spans.curve_coefficients(control_points), points_t
-    start = _nearest_on_grid(*search, curve, stretch, coarse_step)
-    probe = _descend(*search, start, stretch, np.full(len(points), coarse_step), iterations)
-    return _finish(spans, control_points, points_t, curve, probe, stretch)
+    search = _Search.of(spans, control_points, points, curve, u_low, u_high)
+    start = search.nearest_on_grid(coarse_step)
+    probe = search.descend(start, np.full(len(points), coarse_step), iterations)
+    return search.finish(control_points, probe)
 
 
 @compiled
@@ -218,30 +217,116 @@ def _refined(
     tolerances: tuple[float, ...],
 ) -> tuple[Any, ...]:
     """Return the fields of `refine_joint_foot_points`; the last two arguments are those of this module."""
-    stretch, points_t = stretch_of(spans, curve, u_low, u_high), np.ascontiguousarray(points.T)
-    search = spans, spans.curve_coefficients(control_points), points_t
-    start = stretch.moved_into(u_start + spans.shift.take(curve))
-    probe = _newton(*search, start, stretch, iterations, safeguarded)
-    return _finish(spans, control_points, points_t, curve, probe, stretch)
+    search = _Search.of(spans, control_points, points, curve, u_low, u_high)
+    start = search.stretch.moved_into(u_start + spans.shift.take(curve))
+    return search.finish(control_points, search.newton(start, iterations, safeguarded))
 
 
-def _nearest_on_grid(
-    spans: Spans, coefficients: Array, points_t: Array, curve: IntArray, stretch: Stretch, step: float
-) -> Array:
-    """Return the nearest place (m,) to each point, of a grid in its stretch and the stretch's limits."""
-    if len(curve) == 0:
-        return np.zeros(0)
-    low, high = stretch.low, stretch.high
-    masks = [curve == k for k in range(len(spans.low))]
-    grid = np.concatenate([_grid(low[rows], high[rows], step) for rows in masks if rows.any()])
-    number, s = spans.locate(np.concatenate([grid, low, high]))
-    on_curve = horner(coefficients[:, 0].take(number, axis=-1), s)
-    on_grid, ends = on_curve[:, : len(grid)], on_curve[:, len(grid) :].reshape(2, 2, -1)
-    offsets = ends - points_t[:, None]
-    at_ends = offsets[0] ** 2 + offsets[1] ** 2
-    index, at_grid = _nearest_of(points_t.T, grid, on_grid, low, high)
-    choice = np.concatenate([at_grid[None], at_ends]).argmin(axis=0)
-    return np.asarray(np.choose(choice, [grid[index], low, high]))
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Points, and the stretches where their foot points are searched for."""
+
+    spans: Spans
+    coefficients: Array  # of the curves (`Spans.curve_coefficients`)
+    points: Array  # (2, m) in m
+    curve: IntArray  # (m,) number of each row's own curve
+    stretch: Stretch
+
+    @staticmethod
+    def of(
+        spans: Spans, control_points: Array, points: Array, curve: IntArray, u_low: Array, u_high: Array
+    ) -> _Search:
+        coefficients, columns = spans.curve_coefficients(control_points), np.ascontiguousarray(points.T)
+        return _Search(spans, coefficients, columns, curve, stretch_of(spans, curve, u_low, u_high))
+
+    def where(self, rows: BoolArray) -> _Search:
+        points, curve, stretch = self.points[:, rows], self.curve[rows], self.stretch.where(rows)
+        return _Search(self.spans, self.coefficients, points, curve, stretch)
+
+    def nearest_on_grid(self, step: float) -> Array:
+        """Return the nearest place (m,) to each point, of a grid in its stretch and the stretch's limits."""
+        if len(self.curve) == 0:
+            return np.zeros(0)
+        low, high = self.stretch.low, self.stretch.high
+        masks = [self.curve == k for k in range(len(self.spans.low))]
+        grid = np.concatenate([_grid(low[rows], high[rows], step) for rows in masks if rows.any()])
+        number, s = self.spans.locate(np.concatenate([grid, low, high]))
+        on_curve = horner(self.coefficients[:, 0].take(number, axis=-1), s)
+        on_grid, ends = on_curve[:, : len(grid)], on_curve[:, len(grid) :].reshape(2, 2, -1)
+        offsets = ends - self.points[:, None]
+        at_ends = offsets[0] ** 2 + offsets[1] ** 2
+        index, at_grid = _nearest_of(self.points.T, grid, on_grid, low, high)
+        choice = np.concatenate([at_grid[None], at_ends]).argmin(axis=0)
+        return np.asarray(np.choose(choice, [grid[index], low, high]))
+
+    def newton(self, start: Array, iterations: int, safeguarded: int) -> _Probe:
+        """Take Newton steps; a row that one leads farther away is searched for to the end of its bracket."""
+        reach, last = self.stretch.interval, self.probe(start)
+        for _ in range(iterations):
+            step = np.minimum(np.maximum(last.step, -reach), reach)
+            v = self.stretch.within(last.v + step)
+            probe = self.probe(v)
+            farther = ~_no_farther(probe.square, last.square)
+            if farther.any():
+                v[farther] = self.where(farther).descend(last.v[farther], reach[farther], safeguarded).v
+                probe = self.probe(v)
+            last = probe
+        return last
+
+    def descend(self, start: Array, reach: Array, iterations: int) -> _Probe:
+        """Take Newton steps that stay inside a bracket, or go to the middle of the bracket.
+
+        The bracket reaches from the nearest place so far to one where the distance surely rises again, so
+        that no row ever gets farther away. At first it is `reach` (m,) long, downhill.
+        """
+        tolerance, best = _STEP_TOLERANCE * self.stretch.length, self.probe(start)
+        end, step = start - np.sign(best.slope) * reach, best.step
+        for _ in range(iterations):
+            inside = np.abs(step) < np.abs(end - best.v)
+            candidate = self.stretch.within(np.where(inside, best.v + step, 0.5 * (best.v + end)))
+            probe = self.probe(candidate)
+            if not (np.abs(candidate - best.v) > tolerance).any():
+                return probe
+            better = _no_farther(probe.square, best.square)
+            passed = probe.slope * best.slope <= 0.0
+            end = np.where(better, np.where(passed, best.v, end), probe.v)
+            step = np.where(better, probe.step, np.inf)
+            pairs = zip(vars(probe).values(), vars(best).values(), strict=True)
+            best = probe if better.all() else _Probe(*(np.where(better, new, old) for new, old in pairs))
+        return best
+
+    def probe(self, v: Array) -> _Probe:
+        """Return the curve at the places v (m,), and its distance from the points."""
+        number, s = self.spans.locate(v)
+        orders = horner(self.coefficients.take(number, axis=-1), s)
+        offset, first = orders[0], orders[1]
+        offset -= self.points
+        products = orders * offset
+        square, slope, centripetal = products[:, 0] + products[:, 1]
+        speed = _dot(first, first)
+        curvature = np.abs(speed + centripetal)
+        divisor = np.where(curvature > _FLAT * speed, curvature, speed)
+        step = -slope / np.maximum(divisor, _TINY)
+        return _Probe(v, number, s, offset, first, square, slope, step)
+
+    def finish(self, control_points: Array, probe: _Probe) -> tuple[Any, ...]:
+        """Return the fields of `FootPoints` at the places that were found."""
+        columns = self.spans.columns.take(probe.number, axis=0)
+        tangent = _unit_tangent(control_points, probe.first, columns, self.stretch.length)
+        normal = np.empty_like(tangent)
+        np.negative(tangent[1], out=normal[0])
+        normal[1] = tangent[0]
+        return (
+            self.stretch.in_domain(probe.v) - self.spans.shift.take(self.curve),
+            (self.points + probe.offset).T,
+            tangent.T,
+            normal.T,
+            -_dot(normal, probe.offset),
+            _interior(probe, self.stretch),
+            self.spans.basis(probe.number, probe.s),
+            probe.number + (self.spans.first + self.spans.degree),
+            columns,
+        )
 
 
 def _grid(low: Array, high: Array, step: float) -> Array:
@@ -267,109 +352,15 @@ def _nearest_of(
     return index, least
 
 
-def _newton(
-    spans: Spans,
-    coefficients: Array,
-    points_t: Array,
-    start: Array,
-    stretch: Stretch,
-    iterations: int,
-    safeguarded: int,
-) -> _Probe:
-    """Take Newton steps; a row that one leads farther away is searched for to the end of its bracket."""
-    reach = stretch.interval
-    last = _probe(spans, coefficients, points_t, start)
-    for _ in range(iterations):
-        step = np.minimum(np.maximum(last.step, -reach), reach)
-        v = stretch.within(last.v + step)
-        probe = _probe(spans, coefficients, points_t, v)
-        farther = ~_no_farther(probe.square, last.square)
-        if farther.any():
-            own, start = stretch.where(farther), last.v[farther]
-            search = spans, coefficients, points_t[:, farther]
-            v[farther] = _descend(*search, start, own, own.interval, safeguarded).v
-            probe = _probe(spans, coefficients, points_t, v)
-        last = probe
-    return last
-
-
-def _descend(
-    spans: Spans,
-    coefficients: Array,
-    points_t: Array,
-    start: Array,
-    stretch: Stretch,
-    reach: Array,
-    iterations: int,
-) -> _Probe:
-    """Take Newton steps that stay inside a bracket, or go to the middle of the bracket.
-
-    The bracket reaches from the nearest place so far to one where the distance surely rises again, so that no
-    row ever gets farther away. At first it is `reach` (m,) long, downhill.
-    """
-    tolerance = _STEP_TOLERANCE * stretch.length
-    best = _probe(spans, coefficients, points_t, start)
-    end, step = start - np.sign(best.slope) * reach, best.step
-    for _ in range(iterations):
-        inside = np.abs(step) < np.abs(end - best.v)
-        candidate = stretch.within(np.where(inside, best.v + step, 0.5 * (best.v + end)))
-        probe = _probe(spans, coefficients, points_t, candidate)
-        if not (np.abs(candidate - best.v) > tolerance).any():
-            return probe
-        better = _no_farther(probe.square, best.square)
-        passed = probe.slope * best.slope <= 0.0
-        end = np.where(better, np.where(passed, best.v, end), probe.v)
-        step = np.where(better, probe.step, np.inf)
-        pairs = [(getattr(probe, f.name), getattr(best, f.name)) for f in fields(_Probe)]
-        best = probe if better.all() else _Probe(*(np.where(better, new, old) for new, old in pairs))
-    return best
-
-
 def _no_farther(square: Array, than: Array) -> BoolArray:
     """Return where a squared distance (m,) is no larger than another one, apart from round-off."""
     return square <= than + _EQUAL_SQUARE * (1.0 + than)
-
-
-def _probe(spans: Spans, coefficients: Array, points_t: Array, v: Array) -> _Probe:
-    """Return the curve at the places v (m,), and its distance from points (2, m)."""
-    number, s = spans.locate(v)
-    orders = horner(coefficients.take(number, axis=-1), s)
-    offset, first = orders[0], orders[1]
-    offset -= points_t
-    products = orders * offset
-    square, slope, centripetal = products[:, 0] + products[:, 1]
-    speed = _dot(first, first)
-    curvature = np.abs(speed + centripetal)
-    divisor = np.where(curvature > _FLAT * speed, curvature, speed)
-    step = -slope / np.maximum(divisor, _TINY)
-    return _Probe(v, number, s, offset, first, square, slope, step)
 
 
 def _dot(a: Array, b: Array) -> Array:
     """Return the inner products (m,) of columns (2, m)."""
     products = a * b
     return np.asarray(products[0] + products[1])
-
-
-def _finish(
-    spans: Spans, control_points: Array, points_t: Array, curve: IntArray, probe: _Probe, stretch: Stretch
-) -> tuple[Any, ...]:
-    columns = spans.columns.take(probe.number, axis=0)
-    tangent = _unit_tangent(control_points, probe.first, columns, stretch.length)
-    normal = np.empty_like(tangent)
-    np.negative(tangent[1], out=normal[0])
-    normal[1] = tangent[0]
-    return (
-        stretch.in_domain(probe.v) - spans.shift.take(curve),
-        (points_t + probe.offset).T,
-        tangent.T,
-        normal.T,
-        -_dot(normal, probe.offset),
-        _interior(probe, stretch),
-        spans.basis(probe.number, probe.s),
-        probe.number + (spans.first + spans.degree),
-        columns,
-    )
 
 
 def _unit_tangent(control_points: Array, first: Array, columns: IntArray, length: Array) -> Array:

@@ -70,19 +70,50 @@ def spline_projection_factors(
     )
     factors = []
     for own in np.split(np.arange(len(pose_keys)), np.flatnonzero(np.diff(pose_keys)) + 1):
-        sightings = _Sightings(
-            int(pose_keys[own[0]]),
-            Curve.of(control_keys, tables, low[own], high[own]),
-            points_vehicle[own],
-            covariances[own],
-            sigma_model,
-            huber,
-            sensor_key,
-            twists[own],
-            None if sides is None else sides[own],
-        )
-        factors.append(sightings.factor)
+        pose_key, curve = int(pose_keys[own[0]]), Curve.of(control_keys, tables, low[own], high[own])
+        measured = points_vehicle[own], covariances[own], twists[own]
+        side = None if sides is None else sides[own]
+        factors.append(_projection_factor(pose_key, curve, *measured, side, sigma_model, huber, sensor_key))
     return factors
+
+
+def _projection_factor(
+    pose_key: int,
+    curve: Curve,
+    measured: Array,
+    covariances: Array,
+    twists: Array,
+    sides: Array | None,
+    sigma_model: float,
+    huber: float,
+    sensor_key: int | None,
+) -> gtsam.CustomFactor:
+    """Return the factor on the pose of the detections, the sensor's calibration and the control points."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
+        pose = values.atPose2(pose_key)
+        poses = np.tile(pose_array(pose), (len(measured), 1))
+        sensor = np.zeros(0) if sensor_key is None else np.array(values.atVector(sensor_key))
+        points = to_map(corrected(measured, twists, sensor), poses)
+        foot, residual, gradient, by_control = curve.distances(values, points, sides)
+        sigma = sigma_across(foot.normal_unit, covariances, poses, sigma_model)
+        steepness = np.hypot(gradient[:, 0], gradient[:, 1])
+        direction = gradient / steepness[:, None]
+        by = sensor_rows(direction, residual / steepness, poses, measured, twists, sensor)
+        usable, slots = curve.usable(foot)
+        whitened = by.factor * residual / sigma
+        if H is None:
+            return np.asarray(huber_roots(whitened, huber) * usable)
+        root = np.sqrt(huber_weights(whitened, huber)) * usable
+        scale, arm = by.factor * root / sigma, points - poses[:, :2]
+        by_theta = gradient[:, 1] * arm[:, 0] - gradient[:, 0] * arm[:, 1]
+        by_pose = np.column_stack([gradient @ rotation(pose.theta()), by_theta]) * scale[:, None]
+        by_calibration = [by.by_sensor * (steepness * root / sigma)[:, None]] if len(sensor) else []
+        fill(H, [by_pose, *by_calibration, *curve.by_key(by_control * scale[:, None, None], slots)])
+        return np.asarray(whitened * root)
+
+    keys = [pose_key, *([] if sensor_key is None else [int(sensor_key)]), *curve.keys]
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(measured)), keys, error)
 
 
 def boundary_point_factor(
@@ -104,13 +135,12 @@ def boundary_point_factor(
     curve = Curve.of(control_keys, tables, low, high)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
-        foot = curve.find(curve.control_points(values), points_map)
+        foot, distance, _normal, by_control = curve.distances(values, points_map)
         usable, slots = curve.usable(foot)
         scale = usable / sigma
         if H is not None:
-            by_control = -foot.basis[:, :, None] * foot.normal_unit[:, None, :] * scale[:, None, None]
-            fill(H, [*curve.by_key(by_control, slots)])
-        return np.asarray(foot.distance * scale)
+            fill(H, [*curve.by_key(by_control * scale[:, None, None], slots)])
+        return np.asarray(distance * scale)
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), list(curve.keys), error)
 
@@ -135,16 +165,28 @@ class Curve:
         touched = _touched(tables, low, high)
         return Curve(tuple(int(control_keys[j]) for j in touched), touched, tables, low, high)
 
-    def control_points(self, values: gtsam.Values, entries: int = 2) -> Array:
+    def control_points(self, values: gtsam.Values, entries: int) -> Array:
         """Return the unwrapped control points (n, entries); those that do not matter here stay zero."""
         at, size = values.atPoint2 if entries == 2 else values.atPoint3, self.tables.size
         distinct = np.zeros((size, entries))
         distinct[self.touched] = [at(key) for key in self.keys]
         return np.asarray(distinct[np.arange(len(self.tables.starts) + self.tables.degree) % size])
 
-    def find(self, control_points: Array, points: Array) -> FootPoints:
+    def distances(
+        self, values: gtsam.Values, points: Array, sides: Array | None = None
+    ) -> tuple[FootPoints, Array, Array, Array]:
+        """Return foot points, distances (m,), and their derivatives (m, 2) and (m, degree + 1, d).
+
+        The derivatives are by the points (m, 2), map frame, and by the control points of each span. With
+        `sides` (m,) the distances are those of `beyond_edge`.
+        """
+        control_points = self.control_points(values, 2 if sides is None else RIBBON)
         step = GRID_SHARE * self.tables.length / len(self.tables.starts)
-        return foot_points(self.tables, control_points, points, self.low, self.high, step)
+        line = np.ascontiguousarray(control_points[:, :2])
+        foot = foot_points(self.tables, line, points, self.low, self.high, step)
+        if sides is not None:
+            return foot, *beyond_edge(self.tables, control_points, sides, foot)
+        return foot, foot.distance, foot.normal_unit, -foot.basis[:, :, None] * foot.normal_unit[:, None, :]
 
     def usable(self, foot: FootPoints) -> tuple[BoolArray, IntArray]:
         """Return which rows (m,) may contribute, and the slots (m, p + 1) of their control points' keys."""
@@ -159,65 +201,6 @@ class Curve:
         blocks = np.zeros((len(self.touched), len(by_control), by_control.shape[2]))
         np.add.at(blocks, (slots, np.arange(len(by_control))[:, None]), by_control)
         return blocks
-
-
-@dataclass(frozen=True, eq=False)
-class _Sightings:
-    """Factor on the detections of one cycle: of a boundary, or of the edges of a ribbon."""
-
-    pose_key: int
-    curve: Curve
-    points_vehicle: Array  # (m, 2) detections in the vehicle frame, in m
-    covariances: Array  # (m, 2, 2) of these, in m^2
-    sigma_model: float  # of cones about a smooth curve (m)
-    huber: float  # whitened residual beyond which the weight of a row falls
-    sensor_key: int | None
-    twists: Array  # (m, 3) of the vehicle, in m/s, m/s and rad/s
-    sides: Array | None  # (m,) edge of a ribbon: left (1) or right (-1)
-
-    @property
-    def factor(self) -> gtsam.CustomFactor:
-        """Return the factor on the pose, the sensor's calibration and the control points."""
-        sensor = [] if self.sensor_key is None else [int(self.sensor_key)]
-        noise = gtsam.noiseModel.Unit.Create(len(self.points_vehicle))
-        return gtsam.CustomFactor(noise, [self.pose_key, *sensor, *self.curve.keys], self)
-
-    def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
-        """Return robust whitened rows (m,), and write their Jacobians to H where it is given."""
-        pose, measured, twists = values.atPose2(self.pose_key), self.points_vehicle, self.twists
-        poses = np.tile(pose_array(pose), (len(measured), 1))
-        sensor = np.zeros(0) if self.sensor_key is None else np.array(values.atVector(self.sensor_key))
-        points = to_map(corrected(measured, twists, sensor), poses)
-        foot, residual, gradient, by_control = self._distances(values, points)
-        sigma = sigma_across(foot.normal_unit, self.covariances, poses, self.sigma_model)
-        steepness = np.hypot(gradient[:, 0], gradient[:, 1])
-        direction = gradient / steepness[:, None]
-        by = sensor_rows(direction, residual / steepness, poses, measured, twists, sensor)
-        usable, slots = self.curve.usable(foot)
-        whitened = by.factor * residual / sigma
-        if H is None:
-            return np.asarray(huber_roots(whitened, self.huber) * usable)
-        root = np.sqrt(huber_weights(whitened, self.huber)) * usable
-        scale, arm = by.factor * root / sigma, points - poses[:, :2]
-        by_theta = gradient[:, 1] * arm[:, 0] - gradient[:, 0] * arm[:, 1]
-        by_pose = np.column_stack([gradient @ rotation(pose.theta()), by_theta]) * scale[:, None]
-        by_calibration = [by.by_sensor * (steepness * root / sigma)[:, None]] if len(sensor) else []
-        fill(H, [by_pose, *by_calibration, *self.curve.by_key(by_control * scale[:, None, None], slots)])
-        return np.asarray(whitened * root)
-
-    def _distances(self, values: gtsam.Values, points: Array) -> tuple[FootPoints, Array, Array, Array]:
-        """Return foot points, distances (m,), and their derivatives (m, 2) and (m, degree + 1, d).
-
-        The derivatives are by the points (m, 2), map frame, and by the control points of each span.
-        """
-        if self.sides is None:
-            foot = self.curve.find(self.curve.control_points(values), points)
-            n = foot.normal_unit
-            return foot, foot.distance, n, -foot.basis[:, :, None] * n[:, None, :]
-        ribbon = self.curve.control_points(values, RIBBON)
-        foot = self.curve.find(np.ascontiguousarray(ribbon[:, :2]), points)
-        beyond = beyond_edge(self.curve.tables, ribbon, self.sides, foot)
-        return foot, beyond.residual, beyond.by_point, beyond.by_control
 
 
 def _require_alike(names: str, *arrays: Array | IntArray) -> None:

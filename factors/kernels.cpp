@@ -420,29 +420,92 @@ py::tuple refined(const py::object& spans, const Array& control_points, const Ar
 
 using Columns = py::array_t<double, py::array::f_style>;
 
+struct Layout {  // graph.variables:Layout
+  explicit Layout(const py::handle& layout)
+      : keys(layout.attr("keys").cast<Ints>()), starts(layout.attr("starts").cast<Ints>()),
+        widths(layout.attr("widths").cast<Ints>()) {
+    expect(starts.size() == size() && widths.size() == size());
+  }
+  Index size() const { return keys.shape(0); }
+
+  // The place of a key, which is -1 where the layout does not hold it.
+  Index find(Index key) const {
+    const Index* last = keys.data() + size();
+    const Index* place = std::lower_bound(keys.data(), last, key);
+    return place == last || *place != key ? -1 : place - keys.data();
+  }
+  Index place(Index key) const {
+    const Index found = find(key);
+    if (found < 0) throw py::value_error("expected rows on known variables, found others");
+    return found;
+  }
+
+  Ints keys, starts, widths;
+};
+
+struct Rows {  // graph.rows:Rows
+  explicit Rows(const py::handle& rows)
+      : keys(rows.attr("keys").cast<Ints>()), jacobian(rows.attr("jacobian").cast<Array>()),
+        residual(rows.attr("residual").cast<Array>()), owner(rows.attr("owner").cast<Ints>()) {
+    expect(keys.shape(0) == size() && jacobian.shape(0) == size() && owner.size() == size());
+  }
+  Rows(Index rows, Index k, Index width)
+      : keys(Shape{rows, k}), jacobian(Shape{rows, width}), residual(rows), owner(rows) {}
+
+  Index size() const { return residual.shape(0); }
+  Index width() const { return jacobian.shape(1); }
+  bool same_keys(Index row, Index other) const {
+    const Index k = keys.shape(1);
+    return std::equal(keys.data() + row * k, keys.data() + (row + 1) * k, keys.data() + other * k);
+  }
+  void set(Index at, const Rows& from, Index row) {
+    const Index k = keys.shape(1);
+    std::copy_n(from.keys.data() + row * k, k, keys.mutable_data() + at * k);
+    std::copy_n(from.jacobian.data() + row * width(), width(), jacobian.mutable_data() + at * width());
+    residual.mutable_data()[at] = from.residual.data()[row];
+    owner.mutable_data()[at] = from.owner.data()[row];
+  }
+  py::tuple parts() const { return py::make_tuple(keys, jacobian, residual, owner); }
+
+  Ints keys;
+  Array jacobian, residual;
+  Ints owner;
+};
+
+// Which of a row's keys each of its columns is by, and which entry of that variable.
+struct Pattern {
+  Pattern() = default;
+  explicit Pattern(const py::handle& rows) {
+    Index number = 0;
+    for (const py::handle& width : rows.attr("widths")) {
+      for (Index j = 0; j < width.cast<Index>(); ++j) key.push_back(number), entry.push_back(j);
+      ++number;
+    }
+  }
+  std::vector<Index> key, entry;
+};
+
 // The columns of one row after another; the keys of neighbouring rows are mostly the same.
 class RowColumns {
  public:
-  RowColumns(const Ints& keys, const Ints& starts, const Ints& sought, const Ints& key, const Ints& entry)
-      : keys_(keys), starts_(starts), sought_(sought), key_(key), entry_(entry), k_(sought.shape(1)),
-        wanted_(k_), begin_(k_), columns_(key.shape(0)) {
-    expect(entry.size() == key.size() && starts.size() == keys.size());
+  RowColumns(const Layout& layout, const Rows& rows, const py::handle& own)
+      : layout_(layout), rows_(rows), k_(rows.keys.shape(1)), wanted_(k_), begin_(k_), columns_(rows.width()) {
+    if (rows.size()) pattern_ = Pattern(own);
+    expect(rows.size() == 0 || pattern_.key.size() == columns_.size());
   }
 
   const std::vector<Index>& of(Index row) {
-    const Index* known = keys_.data();
-    const Index* last = known + keys_.shape(0);
     bool same = row > 0;
     for (Index j = 0; j < k_; ++j) {
-      const Index wanted = sought_.data()[row * k_ + j];
+      const Index wanted = rows_.keys.data()[row * k_ + j];
       if (row > 0 && wanted == wanted_[j]) continue;
-      const Index* place = std::lower_bound(known, last, wanted);
+      const Index place = layout_.find(wanted);
       wanted_[j] = wanted, same = false;
-      begin_[j] = place == last || *place != wanted ? kUnknown : starts_.data()[place - known];
+      begin_[j] = place < 0 ? kUnknown : layout_.starts.data()[place];
     }
     for (std::size_t j = 0; j < columns_.size() && !same; ++j) {
-      const Index first = begin_[key_.data()[j]];
-      columns_[j] = first == kUnknown ? kUnknown : first + entry_.data()[j];
+      const Index first = begin_[pattern_.key[j]];
+      columns_[j] = first == kUnknown ? kUnknown : first + pattern_.entry[j];
     }
     return columns_;
   }
@@ -457,33 +520,16 @@ class RowColumns {
   static constexpr Index kUnknown = -1;
 
  private:
-  const Ints &keys_, &starts_, &sought_, &key_, &entry_;
+  const Layout& layout_;
+  const Rows& rows_;
+  Pattern pattern_;
   Index k_;
   std::vector<Index> wanted_, begin_, columns_;
 };
 
-// Rows of one pattern: the keys of each, and the key and the entry that each of its columns is by.
-struct Rows {
-  explicit Rows(const py::handle& rows) {
-    const py::tuple own = rows.cast<py::tuple>();
-    sought = own[0].cast<Ints>(), key = own[1].cast<Ints>(), entry = own[2].cast<Ints>();
-    jacobian = own[3].cast<Array>(), residual = own[4].cast<Array>();
-    expect(sought.shape(0) == size() && jacobian.size() == size() * width());
-  }
-  Index size() const { return residual.shape(0); }
-  Index width() const { return key.shape(0); }
-  bool same_keys(Index row, Index other) const {
-    const Index k = sought.shape(1);
-    return std::equal(sought.data() + row * k, sought.data() + (row + 1) * k, sought.data() + other * k);
-  }
-
-  Ints sought, key, entry;
-  Array jacobian, residual;
-};
-
-void add_rows(double* H, double* g, Index n, const Rows& rows, const Ints& keys, const Ints& starts,
-              const double* change) {
-  RowColumns columns(keys, starts, rows.sought, rows.key, rows.entry);
+void add_rows(double* H, double* g, Index n, const py::handle& own, const Layout& layout, const double* change) {
+  const Rows rows(own);
+  RowColumns columns(layout, rows, own);
   const Index width = rows.width();
   std::vector<Index> places(width * (width + 1) / 2);
   for (Index i = 0; i < rows.size(); ++i) {
@@ -503,14 +549,12 @@ void add_rows(double* H, double* g, Index n, const Rows& rows, const Ints& keys,
 }
 
 // Add a factor with `[[L, g], [g', f]]` on some keys.
-void add_factor(double* H, double* g, Index n, const Ints& sought, const Columns& matrix, const Ints& keys,
-                const Ints& starts, const Ints& widths, const double* change) {
+void add_factor(double* H, double* g, Index n, const Ints& keys, const Columns& matrix, const Layout& layout,
+                const double* change) {
   std::vector<Index> at;
-  for (Index k = 0; k < sought.shape(0); ++k) {
-    const Index place = std::lower_bound(keys.data(), keys.data() + keys.shape(0), sought.data()[k]) - keys.data();
-    if (place == keys.shape(0) || keys.data()[place] != sought.data()[k])
-      throw py::value_error("expected a prior on known variables, found others");
-    for (Index j = 0; j < widths.data()[place]; ++j) at.push_back(starts.data()[place] + j);
+  for (Index k = 0; k < keys.shape(0); ++k) {
+    const Index place = layout.place(keys.data()[k]);
+    for (Index j = 0; j < layout.widths.data()[place]; ++j) at.push_back(layout.starts.data()[place] + j);
   }
   const Index m = static_cast<Index>(at.size());
   expect(matrix.size() == (m + 1) * (m + 1));
@@ -524,8 +568,9 @@ void add_factor(double* H, double* g, Index n, const Ints& sought, const Columns
   }
 }
 
-py::tuple summed(const Ints& keys, const Ints& starts, const Ints& widths, const py::list& factors,
-                 const py::list& groups, const Array& change) {
+py::tuple summed(const py::handle& own_layout, const py::list& factors, const py::sequence& groups,
+                 const Array& change) {
+  const Layout layout(own_layout);
   const Index n = change.shape(0);
   Columns hessian(Shape{n, n});
   Array gradient(n);
@@ -533,125 +578,100 @@ py::tuple summed(const Ints& keys, const Ints& starts, const Ints& widths, const
   double* g = gradient.mutable_data();
   std::fill_n(H, n * n, 0.0);
   std::fill_n(g, n, 0.0);
-  expect(starts.size() == keys.size() && widths.size() == keys.size());
   for (const py::handle& factor : factors) {
     const py::tuple own = factor.cast<py::tuple>();
-    add_factor(H, g, n, own[0].cast<Ints>(), own[1].cast<Columns>(), keys, starts, widths, change.data());
+    add_factor(H, g, n, own[0].cast<Ints>(), own[1].cast<Columns>(), layout, change.data());
   }
-  for (const py::handle& rows : groups) add_rows(H, g, n, Rows(rows), keys, starts, change.data());
+  for (const py::handle& rows : groups) add_rows(H, g, n, rows, layout, change.data());
   return py::make_tuple(hessian, gradient);
 }
 
 // The rows `[A b]` of some groups on the variables that they hold, and the places of these variables.
-py::tuple block_of(const Ints& keys, const Ints& widths, const py::list& groups) {
-  std::vector<Rows> all(groups.begin(), groups.end());
+py::tuple block_of(const py::handle& own_layout, const py::sequence& groups) {
+  const Layout layout(own_layout);
+  std::vector<Rows> all;
+  std::vector<Pattern> patterns;
+  for (const py::handle& rows : groups) {
+    all.emplace_back(rows);
+    patterns.push_back(all.back().size() ? Pattern(rows) : Pattern());
+  }
   Index height = 0, width = 0;
-  std::vector<Index> first(keys.shape(0), -1), held;
-  const auto place_of = [&](Index key) {
-    const Index place = std::lower_bound(keys.data(), keys.data() + keys.shape(0), key) - keys.data();
-    if (place == keys.shape(0) || keys.data()[place] != key)
-      throw py::value_error("expected rows on known variables, found others");
-    return place;
-  };
+  std::vector<Index> first(layout.size(), -1), held;
   for (const Rows& rows : all) {
     height += rows.size();
-    for (Index i = 0; i < rows.sought.size(); ++i) first[place_of(rows.sought.data()[i])] = 0;
+    for (Index i = 0; i < rows.keys.size(); ++i) first[layout.place(rows.keys.data()[i])] = 0;
   }
-  for (Index k = 0; k < keys.shape(0); ++k)
-    if (first[k] == 0) held.push_back(k), first[k] = width, width += widths.data()[k];
+  for (Index k = 0; k < layout.size(); ++k)
+    if (first[k] == 0) held.push_back(k), first[k] = width, width += layout.widths.data()[k];
   Columns block(Shape{height, width + 1});
   double* at = block.mutable_data();
   std::fill_n(at, height * (width + 1), 0.0);
-  for (const Rows& rows : all)
+  for (std::size_t g = 0; g < all.size(); ++g) {
+    const Rows& rows = all[g];
     for (Index i = 0; i < rows.size(); ++i, ++at) {
-      const Index* own = rows.sought.data() + i * rows.sought.shape(1);
+      const Index* own = rows.keys.data() + i * rows.keys.shape(1);
       Index key = -1, begin = 0;
       for (Index j = 0; j < rows.width(); ++j) {
-        if (rows.key.data()[j] != key) key = rows.key.data()[j], begin = first[place_of(own[key])];
-        at[(begin + rows.entry.data()[j]) * height] = rows.jacobian.data()[i * rows.width() + j];
+        if (patterns[g].key[j] != key) key = patterns[g].key[j], begin = first[layout.place(own[key])];
+        at[(begin + patterns[g].entry[j]) * height] = rows.jacobian.data()[i * rows.width() + j];
       }
       at[width * height] = -rows.residual.data()[i];
     }
+  }
   return py::make_tuple(Ints(Shape{static_cast<Index>(held.size())}, held.data()), block);
 }
 
-Ints columns_of(const Ints& keys, const Ints& starts, const Ints& sought, const Ints& key,
-                const Ints& entry) {
-  const Index rows = sought.shape(0), width = key.shape(0);
-  Ints out(Shape{rows, width});
-  RowColumns columns(keys, starts, sought, key, entry);
-  for (Index i = 0; i < rows; ++i) {
+Ints columns_of(const py::handle& own_layout, const py::handle& own) {
+  const Layout layout(own_layout);
+  const Rows rows(own);
+  Ints out(Shape{rows.size(), rows.width()});
+  RowColumns columns(layout, rows, own);
+  for (Index i = 0; i < rows.size(); ++i) {
     const std::vector<Index>& at = columns.of(i);
-    std::copy(at.begin(), at.end(), out.mutable_data() + i * width);
+    std::copy(at.begin(), at.end(), out.mutable_data() + i * rows.width());
   }
   return out;
 }
 
-Array moved_residual(const Ints& keys, const Ints& starts, const Ints& sought, const Ints& key,
-                     const Ints& entry, const Array& jacobian, const Array& residual, const Array& change) {
-  const Index rows = sought.shape(0), width = key.shape(0);
-  expect(jacobian.size() == rows * width && residual.size() == rows);
-  Array out(rows);
-  RowColumns columns(keys, starts, sought, key, entry);
-  for (Index i = 0; i < rows; ++i) {
+Array moved_residual(const py::handle& own_layout, const py::handle& own, const Array& change) {
+  const Layout layout(own_layout);
+  const Rows rows(own);
+  Array out(rows.size());
+  RowColumns columns(layout, rows, own);
+  for (Index i = 0; i < rows.size(); ++i) {
     const std::vector<Index>& at = columns.known(i);
+    const double* J = rows.jacobian.data() + i * rows.width();
     double by_change = 0.0;
-    for (Index j = 0; j < width; ++j) by_change += jacobian.data()[i * width + j] * change.data()[at[j]];
-    out.mutable_data()[i] = residual.data()[i] - by_change;
+    for (Index j = 0; j < rows.width(); ++j) by_change += J[j] * change.data()[at[j]];
+    out.mutable_data()[i] = rows.residual.data()[i] - by_change;
   }
   return out;
 }
 
-// Columns of rows: keys, derivatives, residuals and owners.
-struct Kept {
-  explicit Kept(const py::tuple& rows)
-      : keys(rows[0].cast<Ints>()), jacobian(rows[1].cast<Array>()), residual(rows[2].cast<Array>()),
-        owner(rows[3].cast<Ints>()) {
-    expect(keys.shape(0) == size() && jacobian.shape(0) == size() && residual.size() == size());
-  }
-  Kept(Index rows, Index k, Index width)
-      : keys(Shape{rows, k}), jacobian(Shape{rows, width}), residual(rows), owner(rows) {}
-
-  Index size() const { return owner.shape(0); }
-  void set(Index at, const Kept& from, Index row) {
-    const Index k = keys.shape(1), width = jacobian.shape(1);
-    std::copy_n(from.keys.data() + row * k, k, keys.mutable_data() + at * k);
-    std::copy_n(from.jacobian.data() + row * width, width, jacobian.mutable_data() + at * width);
-    residual.mutable_data()[at] = from.residual.data()[row];
-    owner.mutable_data()[at] = from.owner.data()[row];
-  }
-  py::tuple columns() const { return py::make_tuple(keys, jacobian, residual, owner); }
-
-  Ints keys;
-  Array jacobian, residual;
-  Ints owner;
-};
-
-std::vector<bool> owned_by(const Kept& rows, const Ints& owners) {
+std::vector<bool> owned_by(const Rows& rows, const Ints& owners) {
   std::vector<bool> is(rows.size());
   for (Index i = 0; i < rows.size(); ++i)
     is[i] = std::binary_search(owners.data(), owners.data() + owners.shape(0), rows.owner.data()[i]);
   return is;
 }
 
-py::tuple parted(const py::tuple& rows, const Ints& gone) {
-  const Kept all(rows);
+py::tuple parted(const py::handle& rows, const Ints& gone) {
+  const Rows all(rows);
   const std::vector<bool> goes = owned_by(all, gone);
-  const Index count = std::count(goes.begin(), goes.end(), true);
-  Kept stay(all.size() - count, all.keys.shape(1), all.jacobian.shape(1));
-  Kept leave(count, all.keys.shape(1), all.jacobian.shape(1));
+  const Index count = std::count(goes.begin(), goes.end(), true), k = all.keys.shape(1);
+  Rows stay(all.size() - count, k, all.width()), leave(count, k, all.width());
   for (Index i = 0, kept = 0; i < all.size(); ++i)
     goes[i] ? leave.set(i - kept, all, i) : stay.set(kept++, all, i);
-  return py::make_tuple(stay.columns(), leave.columns());
+  return py::make_tuple(stay.parts(), leave.parts());
 }
 
-py::tuple replaced(const py::tuple& rows, const Ints& gone, const py::tuple& fresh, const Ints& keys,
-                   const Ints& starts, const Ints& key, const Ints& entry, const Array& change) {
-  const Kept old(rows), added(fresh);
+py::tuple replaced(const py::handle& rows, const Ints& gone, const py::handle& fresh, const py::handle& layout,
+                   const Array& change) {
+  const Rows old(rows), added(fresh);
   const std::vector<bool> goes = owned_by(old, gone);
-  const Array residual = moved_residual(keys, starts, added.keys, key, entry, added.jacobian, added.residual, change);
+  const Array residual = moved_residual(layout, fresh, change);
   Index at = old.size() - std::count(goes.begin(), goes.end(), true);
-  Kept out(at + added.size(), added.keys.shape(1), added.jacobian.shape(1));
+  Rows out(at + added.size(), added.keys.shape(1), added.width());
   for (Index i = 0; i < added.size(); ++i) {
     out.set(at + i, added, i);
     out.residual.mutable_data()[at + i] = residual.data()[i];
@@ -659,27 +679,28 @@ py::tuple replaced(const py::tuple& rows, const Ints& gone, const py::tuple& fre
   at = 0;
   for (Index i = 0; i < old.size(); ++i)
     if (!goes[i]) out.set(at++, old, i);
-  return out.columns();
+  return out.parts();
 }
 
-Ints owners_holding(const Ints& keys, const Ints& owner, const Ints& ascending) {
-  const Index rows = keys.shape(0), k = keys.shape(1);
+Ints owners_holding(const py::handle& own_rows, const Ints& ascending) {
+  const Rows rows(own_rows);
+  const Index k = rows.keys.shape(1);
   const Index* first = ascending.data();
   const Index* last = first + ascending.shape(0);
   std::vector<Index> found;
-  expect(owner.size() == rows);
-  for (Index i = 0; i < rows; ++i) {
-    const Index* own = keys.data() + i * k;
+  for (Index i = 0; i < rows.size(); ++i) {
+    const Index* own = rows.keys.data() + i * k;
     if (std::any_of(own, own + k, [&](Index one) { return std::binary_search(first, last, one); }))
-      found.push_back(owner.data()[i]);
+      found.push_back(rows.owner.data()[i]);
   }
   return Ints(Shape{static_cast<Index>(found.size())}, found.data());
 }
 
 Columns relative_block(const Array& root, const Array& right, const Array& local, const Array& values,
-                       const Array& change, const Ints& turning, const Ints& headings) {
+                       const Array& change, const py::handle& keys) {
   const Index r = root.shape(0), q = local.shape(0), width = q + 3;
   expect(root.size() == r * q && right.size() == r && values.size() == width && change.size() == width);
+  const Ints turning = keys.attr("turning").cast<Ints>(), headings = keys.attr("headings").cast<Ints>();
   const double* frame = values.data() + q;
   const Turn turn(frame[2]);
   std::vector<double> there(values.data(), frame), off(q);

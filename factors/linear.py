@@ -19,7 +19,7 @@ def linear_factor(keys: IntArray, widths: IntArray, A: Array, b: Array) -> gtsam
     return conditional_of(keys, widths, 1, np.concatenate([A, b[:, None]], axis=1))
 
 
-def keys_of_factor(factor: gtsam.GaussianFactor) -> IntArray:
+def keys_of_factor(factor: gtsam.GaussianFactor | gtsam.NonlinearFactor) -> IntArray:
     """Return the keys (k,) of a factor in its own order."""
     return np.array(list(factor.keys()), np.intp)
 

@@ -101,20 +101,15 @@ RIBBON: Final = 3  # entries of a ribbon's control point: x, y (m, map frame) an
 _LEAST_SPREAD = 0.05  # 1 - k d, which vanishes at the centre of curvature, counts as at least this
 
 
-@dataclass(frozen=True)
-class RibbonRows:
-    """A row for each detection: residual, gradient and Jacobian blocks, not whitened."""
+def beyond_edge(
+    tables: SpanPolynomials, control_points: Array, sides: Array, foot: FootPoints
+) -> tuple[Array, Array, Array]:
+    """Return `r = s n . (p - C(u)) - h(u)` (m,), in m, with u the foot point of p on the centre line C.
 
-    residual: Array  # (m,) distance of the detection beyond the edge of its side, in m
-    by_point: Array  # (m, 2) derivatives by the detection in the map frame
-    by_control: Array  # (m, degree + 1, 3) derivatives by the control points (x, y, h) of the span
-
-
-def beyond_edge(tables: SpanPolynomials, control_points: Array, sides: Array, foot: FootPoints) -> RibbonRows:
-    """Return `r = s n . (p - C(u)) - h(u)`, with u the foot point of p on the centre line C.
-
-    The side s (m,) is 1 for the left edge and -1 for the right one; control_points (n, 3) are unwrapped. With
-    d = n . (p - C), the unit tangent t, the speed |C'| and the curvature k of the centre line,
+    It is the distance beyond the edge of a side, not whitened. With it come the derivatives (m, 2) by p, map
+    frame, and (m, degree + 1, 3) by the control points (x, y, h) of the span. The side s (m,) is 1 for the
+    left edge and -1 for the right one; control_points (n, 3) are unwrapped. With d = n . (p - C), the unit
+    tangent t, the speed |C'| and the curvature k of the centre line,
 
         du/dp = t / (|C'| (1 - k d)),   du/dc_j = (d beta'_j n / |C'| - beta_j t) / (|C'| (1 - k d)),
         dr/dp = s n - h' du/dp,   dr/dc_j = -s beta_j n - h' du/dc_j,   dr/dh_j = -beta_j
@@ -135,7 +130,7 @@ def beyond_edge(tables: SpanPolynomials, control_points: Array, sides: Array, fo
     by_control[:, :, :2] = (along[:, None] * basis)[:, :, None] * t[:, None]
     by_control[:, :, :2] -= turning[:, :, None] * n[:, None]
     by_control[:, :, 2] = -basis
-    return RibbonRows(sides * d - half, sides[:, None] * n - along[:, None] * t, by_control)
+    return sides * d - half, sides[:, None] * n - along[:, None] * t, by_control
 
 
 @dataclass(frozen=True)

@@ -229,7 +229,7 @@ class Expansion:
         """Extend a curve to the last candidate of the proximity chain; return whether there is any."""
         if len(found.points) == 0:
             return False
-        last = _end_position(state, label)
+        last = state.control_points(label)[-1].copy()
         order = proximity_chain(found.points, last)
         points, rows = found.points[order], found.indices[order]
         covariances = self._covariances(detections, rows)
@@ -286,13 +286,8 @@ def proximity_chain(points: Array, start: Array) -> IntArray:
     return np.array(order, np.intp)
 
 
-def _end_position(state: CurveState, label: int) -> Array:
-    """Return S(1) (2,), which is the last control point of a clamped curve."""
-    return np.array(state.control_points(label)[-1])
-
-
 def _end(state: CurveState, label: int, path_ahead: PathAhead) -> End:
     """Return the end of a curve relative to the path."""
-    position = _end_position(state, label)
+    position = state.control_points(label)[-1].copy()
     station, lateral = path_ahead.since(path_ahead.driven - END_BEHIND).locate(position[None])
     return End(position, float(station[0]), SIDES[label] * float(lateral[0]))

@@ -224,16 +224,6 @@ def remove_information(
     return eliminate(graph_of(graph, weak), layout.keys)[1]
 
 
-def condition(
-    graph: gtsam.GaussianFactorGraph, layout: Layout, fixed: int, value: Array
-) -> tuple[Array, Array]:
-    """Return the normal equations on a layout, given the value of the unknown of one more key, `fixed`."""
-    joint = Layout(np.sort(np.append(layout.keys, fixed)))
-    hessian, vector = normal_equations(graph, joint)
-    free, known = joint.entries(layout.keys), joint.entries(np.array([fixed]))
-    return hessian[np.ix_(free, free)], vector[free] - hessian[np.ix_(free, known)] @ value
-
-
 # --- changes of variables --------------------------------------------------------------------------------
 
 

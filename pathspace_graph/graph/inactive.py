@@ -25,6 +25,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.kernels import compiled
+from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.se2 import compose, inverse
 
 from .gaussian import (
@@ -88,7 +89,7 @@ class InactiveMap:
         self.net.push_back(conditional)
         self.keys = np.union1d(self.keys, keys)
         self._old_anchors = np.union1d(self._old_anchors, keyframes)
-        separator = np.array(list(conditional.keys()), np.intp)[len(frontals) :]
+        separator = keys_of_factor(conditional)[len(frontals) :]
         self.anchors = separator[are_poses(separator)]
         self._given = np.setdiff1d(
             np.union1d(self._given, separator), np.append(self.keys, self._old_anchors)
@@ -139,9 +140,6 @@ class Link:
     gain: Array  # (n, m) G
     offset: Array  # (n,) e
     noise: Array  # (n, n) square root N of the covariance N N' of y given z
-
-    def holds(self, keys: IntArray) -> bool:
-        return bool(np.isin(self.factor.keys.keys, keys).any())
 
 
 class InactiveChain(InactiveMap):
@@ -226,7 +224,7 @@ class InactiveChain(InactiveMap):
         return np.asarray(keys[~are_poses(keys)])
 
     def holds(self, keys: IntArray) -> bool:
-        return any(link.holds(keys) for link in self.links)
+        return any(np.isin(link.factor.keys.keys, keys).any() for link in self.links)
 
     # --- the frame ---------------------------------------------------------------------------------------
 
@@ -305,7 +303,7 @@ def new_link(
     variables: Variables,
 ) -> Link:
     """Return a conditional of variables (k,), given others, as a link in the frame of a pose."""
-    order, (A, b) = np.array(list(conditional.keys()), np.intp), conditional.jacobian()
+    order, (A, b) = keys_of_factor(conditional), conditional.jacobian()
     (pose, reference), columns = pose_and_reference(frame, variables), np.repeat(order, sizes(order))
     right = np.array(b).ravel() - A[:, columns == frame] @ (pose - reference)
     keys = Layout(np.sort(order[order != frame]))

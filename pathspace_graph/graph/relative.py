@@ -19,7 +19,6 @@ from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, relative
 
 from .gaussian import (
-    condition,
     graph_of,
     jacobian_factor,
     keys_of,
@@ -49,8 +48,8 @@ class RelativeFactor:
         """Return the factor on its keys and the frame's, but the origin's, linearized at the values."""
         keys = np.append(self.keys.keys, self.frame)
         entries = variables.layout.entries(keys)
-        now, columns = (variables.values[entries], variables.change(entries)), self.keys
-        block = _relative_block(self.root, self.right, self.local, *now, columns.turning, columns.headings)
+        now = variables.values[entries], variables.change(entries)
+        block = _relative_block(self.root, self.right, self.local, *now, self.keys)
         widths, moves = np.append(self.keys.widths, POSE), keys != ORIGIN_KEY
         if not moves.all():
             block = np.asfortranarray(block[:, np.append(np.repeat(moves, widths), True)])
@@ -77,48 +76,30 @@ def relative_factor(
     That is at `pose` (3,), its unknown measured from `reference` (3,). In the frame of a fixed pose variables
     are linear functions of the unknowns, so the change of frame is exact.
     """
-    held = keys_of(graph)
-    keys = Layout(held[held != frame])
-    if keys.size < Layout(held).size:
-        information, vector = condition(graph, keys, frame, pose - reference)
-    else:
-        information, vector = normal_equations(graph, keys)
-    known = keys.keys[np.diagonal(information)[keys.starts] > 0.0]
-    kept, own = Layout(known), keys.entries(known)
+    held = Layout(keys_of(graph))
+    information, vector = normal_equations(graph, held)
+    known = held.keys[(np.diagonal(information)[held.starts] > 0.0) & (held.keys != frame)]
+    kept, own, fixed = Layout(known), held.entries(known), held.entries(held.keys[held.keys == frame])
     entries = variables.layout.entries(known)
-    vector = vector[own] - information[np.ix_(own, own)] @ variables.change(entries)
-    root, right = square_root_form(information[np.ix_(own, own)], vector)
+    vector = vector[own] - information[np.ix_(own, fixed)] @ (pose - reference)[: len(fixed)]
+    information = information[np.ix_(own, own)]
+    root, right = square_root_form(information, vector - information @ variables.change(entries))
     local = to_frame(variables.values[entries], pose, kept)
     return RelativeFactor(frame, kept, root @ rotations(kept, pose[2]), right, local)
 
 
 @compiled
 def _relative_block(
-    root: Array,
-    right: Array,
-    local: Array,
-    values: Array,
-    change: Array,
-    turning: IntArray,
-    headings: IntArray,
+    root: Array, right: Array, local: Array, values: Array, change: Array, keys: Layout
 ) -> Array:
     """Return `[J | J d - r]` (r, q + 4), by columns, with derivatives J and residuals r of a relative factor.
 
     The values (q + 3,) and the unknowns d, which are `change` (q + 3,) now, are those of its variables and
-    then of the frame. The columns of points and poses and those of headings are as in a `Layout`.
+    then of the frame.
     """
-    frame, c, s = values[-POSE:], np.cos(values[-1]), np.sin(values[-1])
-    by_all, there = np.zeros((len(local), len(values))), values[:-POSE].copy()
-    by_all[np.arange(len(local)), np.arange(len(local))] = 1.0
-    x, y = turning, turning + 1
-    dx, dy = there[x] - frame[0], there[y] - frame[1]
-    there[x], there[y] = c * dx + s * dy, -s * dx + c * dy
-    there[headings] -= frame[2]
-    by_all[x, x], by_all[x, y], by_all[y, x], by_all[y, y] = c, s, -s, c
-    by_all[x, -3], by_all[x, -2], by_all[x, -1] = -c, -s, there[y]
-    by_all[y, -3], by_all[y, -2], by_all[y, -1] = s, -c, -there[x]
-    by_all[headings, -1] = -1.0
-    jacobian, residual = root @ by_all, root @ (there - local) - right
+    now, frame = values[:-POSE], values[-POSE:]
+    by_all = np.hstack([rotations(keys, frame[2]).T, by_frame_of(now, frame, keys)])
+    jacobian, residual = root @ by_all, root @ (to_frame(now, frame, keys) - local) - right
     return np.asfortranarray(np.column_stack([jacobian, jacobian @ change - residual]))
 
 

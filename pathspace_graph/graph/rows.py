@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Final, cast
+from typing import Final
 
 import gtsam
 import numpy as np
@@ -27,6 +27,7 @@ from .variables import (
     CALIBRATION_KEY,
     CALIBRATION_LETTER,
     INDEX_BITS,
+    NO_KEYS,
     POSE,
     UNKNOWN,
     Layout,
@@ -35,11 +36,9 @@ from .variables import (
     pose_key,
     pose_keys,
     sizes,
-    spread,
 )
 
-Parts = tuple[IntArray, Array, Array, IntArray]
-Placed = tuple[IntArray, IntArray, IntArray, Array, Array]
+Parts = tuple[IntArray, Array, Array, IntArray]  # the fields of `Rows`
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +63,6 @@ class Rows:
     def where(self, chosen: BoolArray | IntArray | slice) -> Rows:
         return Rows(self.keys[chosen], self.jacobian[chosen], self.residual[chosen], self.owner[chosen])
 
-    @property
-    def placed(self) -> Placed:
-        """Return the keys of rows, the key and the entry of each derivative, derivatives and residuals."""
-        return self.keys, *_pattern(self.widths), self.jacobian, self.residual
-
     @cached_property
     def widths(self) -> tuple[int, ...]:
         """Return the widths (k,) of each row's variables."""
@@ -76,7 +70,7 @@ class Rows:
 
     def columns(self, layout: Layout) -> IntArray:
         """Return the column (m, n) of each derivative, which is UNKNOWN where a key is not in the layout."""
-        return _columns_of(layout.keys, layout.starts, *self.placed[:3])
+        return _columns_of(layout, self)
 
 
 @cache
@@ -86,20 +80,16 @@ def _widths(letters: tuple[int, ...]) -> tuple[int, ...]:
 
 
 @compiled
-def _columns_of(
-    keys: IntArray, starts: IntArray, sought: IntArray, key: IntArray, entry: IntArray
-) -> IntArray:
-    """Return `starts[j] + entry` (m, n), j the place of `sought[:, key]` in ascending keys, or UNKNOWN."""
-    places = np.minimum(keys.searchsorted(sought), len(keys) - 1)
-    begin = np.where(keys[places] == sought, starts[places], UNKNOWN)[:, key]
+def _columns_of(layout: Layout, rows: Rows) -> IntArray:
+    """Return `Rows.columns`."""
+    key, entry = _pattern(rows.widths)
+    begin = layout.columns(rows.keys)[:, key]
     return np.where(begin == UNKNOWN, UNKNOWN, begin + entry)
 
 
-def _known_columns(
-    keys: IntArray, starts: IntArray, sought: IntArray, key: IntArray, entry: IntArray
-) -> IntArray:
+def _known_columns(layout: Layout, rows: Rows) -> IntArray:
     """Return `_columns_of`; ValueError where a key is UNKNOWN."""
-    columns = _columns_of(keys, starts, sought, key, entry)
+    columns = _columns_of(layout, rows)
     if (columns == UNKNOWN).any():
         raise ValueError("expected rows on known variables, found others")
     return columns
@@ -117,25 +107,15 @@ def at_reference(groups: Sequence[Rows], variables: Variables) -> list[Rows]:
     moved = []
     for rows in groups:
         if len(rows):
-            residual = _moved_residual(layout.keys, layout.starts, *rows.placed, change)
+            residual = _moved_residual(layout, rows, change)
             moved.append(Rows(rows.keys, rows.jacobian, residual, rows.owner))
     return moved
 
 
 @compiled
-def _moved_residual(
-    keys: IntArray,
-    starts: IntArray,
-    sought: IntArray,
-    key: IntArray,
-    entry: IntArray,
-    jacobian: Array,
-    residual: Array,
-    change: Array,
-) -> Array:
-    """Return `r - J c` (m,) with c the change (n,) in the columns that `_known_columns` finds."""
-    columns = _known_columns(keys, starts, sought, key, entry)
-    return np.asarray(residual - (jacobian * change[columns]).sum(axis=1))
+def _moved_residual(layout: Layout, rows: Rows, change: Array) -> Array:
+    """Return `r - J c` (m,) with c the change (n,) of a layout's variables; ValueError for rows on others."""
+    return np.asarray(rows.residual - (rows.jacobian * change[_known_columns(layout, rows)]).sum(axis=1))
 
 
 def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.GaussianConditional]:
@@ -152,7 +132,7 @@ def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.
 def _factor(parts: Sequence[Rows], layout: Layout) -> gtsam.GaussianConditional:
     """Return the factor of rows on the variables of a layout."""
     try:
-        held, block = _block_of(layout.keys, layout.widths, [rows.placed for rows in parts])
+        held, block = _block_of(layout, parts)
     except ValueError:
         for rows in parts:
             layout.places(rows.keys)  # it says which variable is not known
@@ -162,22 +142,19 @@ def _factor(parts: Sequence[Rows], layout: Layout) -> gtsam.GaussianConditional:
 
 
 @compiled
-def _block_of(keys: IntArray, widths: IntArray, groups: list[Placed]) -> tuple[IntArray, Array]:
+def _block_of(layout: Layout, groups: Sequence[Rows]) -> tuple[IntArray, Array]:
     """Return the places (h,) of the variables that rows hold, and `[J -r]` (m, n + 1) on them, by columns.
 
-    The variables have ascending keys (k,) and widths (k,). ValueError where rows hold others.
+    ValueError where rows hold variables that the layout does not.
     """
-    sought = np.concatenate([np.zeros(0, np.intp), *(rows[0].ravel() for rows in groups)])
-    held = np.flatnonzero(among(keys, np.sort(sought)))
-    ends = widths[held].cumsum()
-    height, begin = sum(len(rows[0]) for rows in groups), 0
-    block = np.zeros((height, int(ends[-1]) + 1 if len(held) else 1), order="F")
-    for keys_of_rows, key, entry, jacobian, residual in groups:
-        end = begin + len(residual)
-        columns = _known_columns(keys[held], ends - widths[held], keys_of_rows, key, entry)
-        block[np.arange(begin, end)[:, None], columns] = jacobian
-        block[begin:end, -1] = -residual
-        begin = end
+    sought = np.concatenate([NO_KEYS, *(rows.keys.ravel() for rows in groups)])
+    held = np.flatnonzero(among(layout.keys, np.sort(sought)))
+    part, end = Layout(layout.keys[held]), 0
+    block = np.zeros((sum(map(len, groups)), part.size + 1), order="F")
+    for rows in groups:
+        begin, end = end, end + len(rows)
+        block[np.arange(begin, end)[:, None], _known_columns(part, rows)] = rows.jacobian
+        block[begin:end, -1] = -rows.residual
     return held, block
 
 
@@ -196,12 +173,12 @@ class KeptRows:
     @property
     def owners(self) -> IntArray:
         """Return the owners of all rows, which may occur several times."""
-        return np.concatenate([np.zeros(0, np.intp), *(rows.owner for rows in self.groups)])
+        return np.concatenate([NO_KEYS, *(rows.owner for rows in self.groups)])
 
     def holding(self, keys: IntArray) -> IntArray:
         """Return the owners of rows that hold any of some ascending keys (k,)."""
-        of_groups = (_owners_holding(rows.keys, rows.owner, keys) for rows in self.groups)
-        return np.concatenate([np.zeros(0, np.intp), *of_groups])
+        of_groups = (_owners_holding(rows, keys) for rows in self.groups)
+        return np.concatenate([NO_KEYS, *of_groups])
 
     def replace(self, owners: IntArray, groups: Sequence[Rows], variables: Variables) -> None:
         """Replace all rows of some owners by rows that are linearized at the variables' values."""
@@ -210,20 +187,19 @@ class KeptRows:
             if len(rows):
                 same = rows.widths in new
                 new[rows.widths] = stacked_rows([new[rows.widths], rows]) if same else rows
-        gone, change, layout = np.sort(owners), variables.values - variables.reference, variables.layout
+        gone, change = np.sort(owners), variables.values - variables.reference
         self.groups = []
         for widths in {**new, **kept}:
             fresh = new[widths] if widths in new else kept[widths].where(slice(0))
             old = kept[widths] if widths in kept else fresh.where(slice(0))
-            placed = layout.keys, layout.starts, *_pattern(widths), change
-            rows = Rows(*_replaced(old.parts, gone, fresh.parts, *placed))
+            rows = Rows(*_replaced(old, gone, fresh, variables.layout, change))
             if len(rows):
                 rows.__dict__["widths"] = widths
                 self.groups.append(rows)
 
     def drop(self, owners: IntArray) -> list[Rows]:
         """Drop the rows of some owners, and return them."""
-        both = [_parted(rows.parts, np.sort(owners)) for rows in (self.groups if len(owners) else ())]
+        both = [_parted(rows, np.sort(owners)) for rows in (self.groups if len(owners) else ())]
         if both:
             self.groups = [Rows(*kept) for kept, _ in both if len(kept[0])]
         return [Rows(*dropped) for _, dropped in both if len(dropped[0])]
@@ -241,38 +217,27 @@ def among(keys: IntArray, ascending: IntArray) -> BoolArray:
 
 
 @compiled
-def _owners_holding(keys: IntArray, owner: IntArray, ascending: IntArray) -> IntArray:
-    """Return the owners of rows that hold any of some ascending keys, given the keys (m, k) of each."""
-    return np.asarray(owner[among(keys, ascending).any(axis=1)])
+def _owners_holding(rows: Rows, ascending: IntArray) -> IntArray:
+    """Return the owners of rows that hold any of some ascending keys."""
+    return np.asarray(rows.owner[among(rows.keys, ascending).any(axis=1)])
 
 
 @compiled
-def _parted(rows: Parts, gone: IntArray) -> tuple[Parts, Parts]:
-    """Return the columns of rows without those of some ascending owners, and those of the latter."""
-    own = among(rows[3], gone)
-    stay, leave = (tuple(column[chosen] for column in rows) for chosen in (~own, own))
-    return cast(Parts, stay), cast(Parts, leave)
+def _parted(rows: Rows, gone: IntArray) -> tuple[Parts, Parts]:
+    """Return the parts of rows without those of some ascending owners, and the parts of the latter."""
+    own = among(rows.owner, gone)
+    return rows.where(~own).parts, rows.where(own).parts
 
 
 @compiled
-def _replaced(
-    rows: Parts,
-    gone: IntArray,
-    fresh: Parts,
-    keys: IntArray,
-    starts: IntArray,
-    key: IntArray,
-    entry: IntArray,
-    change: Array,
-) -> Parts:
-    """Return the columns of rows without those of some ascending owners, and then those of fresh rows.
+def _replaced(rows: Rows, gone: IntArray, fresh: Rows, layout: Layout, change: Array) -> Parts:
+    """Return the parts of rows without those of some ascending owners, and then those of fresh rows.
 
-    The fresh ones are linearized where the unknowns d are `change` (n,), in the columns of `_known_columns`.
+    The fresh ones are linearized where a layout's unknowns are `change` (n,). ValueError for rows on others.
     """
-    sought, jacobian, residual, owner = fresh
-    moved = _moved_residual(keys, starts, sought, key, entry, jacobian, residual, change)
-    pairs = zip(_parted(rows, gone)[0], (sought, jacobian, moved, owner), strict=True)
-    return cast(Parts, tuple(np.concatenate(pair) for pair in pairs))
+    if len(fresh):
+        fresh = replace(fresh, residual=_moved_residual(layout, fresh, change))
+    return stacked_rows([rows.where(~among(rows.owner, gone)), fresh]).parts
 
 
 def stacked_rows(groups: Sequence[Rows]) -> Rows:
@@ -289,9 +254,7 @@ def newton_system(
     where nothing holds one of them, and ValueError where something holds another one.
     """
     factors = [(keys_of_factor(factor), factor.augmentedInformation()) for factor in factors_of(graph)]
-    hessian, gradient = _summed(
-        layout.keys, layout.starts, layout.widths, factors, [rows.placed for rows in groups], change
-    )
+    hessian, gradient = _summed(layout, factors, groups, change)
     missing = layout.keys[hessian.diagonal()[layout.starts] == 0.0]
     if len(missing):
         raise SingularSystemError(f"expected a factor on every variable, found none on {names(missing)}")
@@ -300,30 +263,22 @@ def newton_system(
 
 @compiled
 def _summed(
-    keys: IntArray,
-    starts: IntArray,
-    widths: IntArray,
-    factors: list[tuple[IntArray, Array]],
-    groups: list[Placed],
-    change: Array,
+    layout: Layout, factors: list[tuple[IntArray, Array]], groups: Sequence[Rows], change: Array
 ) -> tuple[Array, Array]:
     """Return the lower triangle of H (n, n), by columns, and the negative gradient (n,), at `change` (n,).
 
-    They are sums over factors with `[[L, g], [g', f]]` on some of the variables, and over rows `J d + r`. The
-    variables have ascending keys (k,), and their first columns and widths (k,).
+    They are sums over factors with `[[L, g], [g', f]]` and over rows `J d + r`, on variables of a layout.
     """
     hessian, gradient = np.zeros((len(change), len(change)), order="F"), np.zeros(len(change))
-    for own, matrix in factors:
-        places = _known_columns(keys, np.arange(len(keys)), own[:, None], *_pattern((1,)))[:, 0]
-        entries = spread(starts[places], widths[places])
+    for keys, matrix in factors:
+        entries = layout.entries(keys)
         hessian[np.ix_(entries, entries)] += matrix[:-1, :-1]
         gradient[entries] += matrix[:-1, -1] - matrix[:-1, :-1] @ change[entries]
-    for sought, key, entry, jacobian, residual in groups:
-        columns = _known_columns(keys, starts, sought, key, entry)
-        A = np.zeros((len(jacobian), len(gradient)))
-        A[np.arange(len(jacobian))[:, None], columns] = jacobian
+    for rows in groups:
+        A = np.zeros((len(rows), len(gradient)))
+        A[np.arange(len(rows))[:, None], _known_columns(layout, rows)] = rows.jacobian
         hessian += A.T @ A
-        gradient -= (A @ change + residual) @ A
+        gradient -= (A @ change + rows.residual) @ A
     return hessian, gradient
 
 

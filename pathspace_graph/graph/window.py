@@ -4,7 +4,7 @@ This is the fluid relinearization of iSAM2 (Kaess et al. 2012). No linearization
 frozen.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, Protocol, TypeVar
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.odometry import IntegratedOdometry
 
 from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_form
@@ -201,71 +202,59 @@ class WindowFactors(Generic[M_co]):
             self.gauge.replace(stale, weak, self.variables)
 
 
-@dataclass(frozen=True, eq=False)
-class _UserFactor:
-    factor: gtsam.NonlinearFactor
-    keys: IntArray
-
-    @property
-    def holds_pose(self) -> bool:
-        return bool(are_poses(self.keys).any())
-
-    def holds_any(self, keys: IntArray) -> bool:
-        return bool(np.isin(self.keys, keys).any())
-
-
 class UserFactors:
     """User's factors, which stay nonlinear until one of their variables is eliminated."""
 
     def __init__(self) -> None:
-        self._active: list[_UserFactor] = []
-        self._inactive: list[_UserFactor] = []
+        self.factors: list[gtsam.NonlinearFactor] = []  # active ones
+        self._inactive: list[gtsam.NonlinearFactor] = []
         self.given = False  # whether the user has ever given a factor, which may be absolute
 
     def add(self, factors: Sequence[gtsam.NonlinearFactor]) -> bool:
         """Add factors that `check_factors` lets pass, and return whether any of them holds a pose."""
-        new = [_UserFactor(factor, np.array(list(factor.keys()), np.intp)) for factor in factors]
-        self._active += new
-        self.given |= len(new) > 0
-        return any(one.holds_pose for one in new)
+        self.factors = [*self.factors, *factors]
+        self.given |= len(factors) > 0
+        return any(map(_holds_pose, factors))
 
     @property
     def keys(self) -> IntArray:
         """Return the keys (k,) of all active factors; a key may occur several times."""
-        return np.concatenate([np.zeros(0, np.intp), *(one.keys for one in self._active)])
+        return np.concatenate([NO_KEYS, *map(keys_of_factor, self.factors)])
 
     @property
     def count(self) -> int:
-        return len(self._active) + len(self._inactive)
-
-    @property
-    def factors(self) -> list[gtsam.NonlinearFactor]:
-        return [one.factor for one in self._active]
+        return len(self.factors) + len(self._inactive)
 
     def linearized(self, variables: Variables, whole: bool = False) -> list[gtsam.GaussianFactor]:
         """Return the active factors, and the inactive ones too if `whole`, linearized at the values."""
-        return _linear(self._active + self._inactive if whole else self._active, variables)
+        return _linear(self.factors + self._inactive if whole else self.factors, variables)
 
     def remove(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
         """Remove every factor that holds one of these variables (k,), and return them linearized."""
-        removed, self._active = self._split(lambda one: one.holds_any(keys))
-        return _linear(removed, variables)
+        return _linear(self._taken(keys), variables)
 
     def deactivate(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
         """Deactivate factors on one of the map points (k,) and on no pose, and return them linearized."""
-        inactive, self._active = self._split(lambda one: one.holds_any(keys) and not one.holds_pose)
+        inactive = self._taken(keys, with_poses=False)
         self._inactive += inactive
         return _linear(inactive, variables)
 
     def reactivate(self) -> None:
-        self._active, self._inactive = self._active + self._inactive, []
+        self.factors, self._inactive = self.factors + self._inactive, []
 
-    def _split(self, condition: Callable[[_UserFactor], bool]) -> tuple[list[_UserFactor], list[_UserFactor]]:
-        chosen: list[_UserFactor] = []
-        others: list[_UserFactor] = []
-        for one in self._active:
-            (chosen if condition(one) else others).append(one)
-        return chosen, others
+    def _taken(self, keys: IntArray, with_poses: bool = True) -> list[gtsam.NonlinearFactor]:
+        """Take out the active factors on one of these variables (k,), and on no pose unless `with_poses`."""
+        taken = [
+            one
+            for one in self.factors
+            if np.isin(keys_of_factor(one), keys).any() and (with_poses or not _holds_pose(one))
+        ]
+        self.factors = [one for one in self.factors if one not in taken]
+        return taken
+
+
+def _holds_pose(factor: gtsam.NonlinearFactor) -> bool:
+    return bool(are_poses(keys_of_factor(factor)).any())
 
 
 def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables, next_cycle: int) -> None:
@@ -283,12 +272,12 @@ def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables
     for row, factor in enumerate(factors):
         if not isinstance(factor, gtsam.NonlinearFactor):
             raise _unusable(row, "a gtsam.NonlinearFactor", type(factor).__name__)
-        keys = list(factor.keys())
-        unknown = [key for key in keys if key not in keys_known]
-        if unknown:
-            raise _unusable(row, f"keys of {expected}", name(unknown[0]))
+        keys = keys_of_factor(factor)
+        unknown = keys[~np.isin(keys, keys_known)]
+        if len(unknown):
+            raise _unusable(row, f"keys of {expected}", name(int(unknown[0])))
         try:
-            linear = factor.linearize(_values_of(np.array(keys, np.intp), following, variables))
+            linear = factor.linearize(_values_of(keys, following, variables))
         except Exception as error:  # whatever a user's own function raises, or GTSAM where types differ
             raise _unusable(row, "a factor that can be linearized", error) from error
         if linear is not None and not all(np.isfinite(part).all() for part in linear.jacobian()):
@@ -308,31 +297,28 @@ def _unusable(row: int, expected: str, found: object) -> SettingsError:
     return SettingsError(f"factors, row {row}: expected {expected}, found {found}")
 
 
-def _linear(factors: Sequence[_UserFactor], variables: Variables) -> list[gtsam.GaussianFactor]:
-    return [linear for one in factors if (linear := _linearized(one, variables)) is not None]
-
-
-def _linearized(one: _UserFactor, variables: Variables) -> gtsam.GaussianFactor | None:
-    """Return `1/2 |A d - b|^2` with d = value - reference.
+def _linear(factors: Sequence[gtsam.NonlinearFactor], variables: Variables) -> list[gtsam.GaussianFactor]:
+    """Return `1/2 |A d - b|^2` with d = value - reference of each factor that is linearized to anything.
 
     The tangent of `gtsam.Pose2` is in the frame of the pose, so `A_xy` becomes `A_xy R'` in the map frame.
     """
-    linear = one.factor.linearize(variables.gtsam_values(one.keys))
-    if linear is None:
-        return None
-    keys = np.array(list(linear.keys()), np.intp)
-    matrix, right = linear.jacobian()
-    A, b = np.array(matrix, float), np.array(right, float).ravel()
-    A = A @ _rotations(keys, variables).T
-    return jacobian_factor(keys, A, b + A @ variables.change(variables.layout.entries(keys)))
+    found: list[gtsam.GaussianFactor] = []
+    for factor in factors:
+        linear = factor.linearize(variables.gtsam_values(keys_of_factor(factor)))
+        if linear is not None:
+            keys, (matrix, right) = keys_of_factor(linear), linear.jacobian()
+            A = np.array(matrix, float) @ _rotations(keys, variables).T
+            b = np.array(right, float).ravel()
+            found.append(jacobian_factor(keys, A, b + A @ variables.change(variables.layout.entries(keys))))
+    return found
 
 
 def as_nonlinear(factor: gtsam.GaussianFactor, variables: Variables) -> gtsam.LinearContainerFactor:
     """Return a linear factor on our unknowns as a factor of a nonlinear graph, about the variables' values.
 
-    The inverse of `_linearized`: `A_xy R` on each pose, and `b - A d_now`.
+    The inverse of `_linear`: `A_xy R` on each pose, and `b - A d_now`.
     """
-    layout = Layout(np.sort(np.array(list(factor.keys()), np.intp)))
+    layout = Layout(np.sort(keys_of_factor(factor)))
     information, vector = normal_equations(graph_of(factor), layout)
     turn = _rotations(layout.keys, variables)
     negative_gradient = vector - information @ variables.change(variables.layout.entries(layout.keys))

@@ -12,7 +12,6 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.graph.gaussian import (
     cholesky,
-    condition,
     eliminate,
     factorize,
     factors_of,
@@ -27,7 +26,7 @@ from pathspace_graph.graph.gaussian import (
     solve,
     square_root_form,
 )
-from pathspace_graph.graph.variables import POSE, Layout
+from pathspace_graph.graph.variables import Layout
 
 from ..scenes.graph import (
     KEYS,
@@ -292,19 +291,6 @@ def test_removing_information_keeps_the_covariance_of_the_others(unknown: bool) 
     np.testing.assert_allclose(np.linalg.solve(found, found_vector), mean, atol=1e-4)
 
 
-def test_conditioned_holds_one_variable_where_it_is_told() -> None:
-    rng = np.random.default_rng(15)
-    graph, hessian, vector = random_graph(rng, CHAIN)
-    held, value = int(POSE_KEYS[1]), rng.normal(size=POSE)
-    rest = np.setdiff1d(KEYS, [held])
-    own, known = columns_of(rest, KEYS), columns_of(np.array([held]), KEYS)
-    information, negative_gradient = condition(graph, Layout(rest), held, value)
-    np.testing.assert_allclose(information, hessian[np.ix_(own, own)], atol=1e-10)
-    np.testing.assert_allclose(
-        negative_gradient, vector[own] - hessian[np.ix_(own, known)] @ value, atol=1e-10
-    )
-
-
 def test_a_graph_of_graphs_nets_and_factors_has_all_of_their_factors() -> None:
     rng = np.random.default_rng(16)
     graph, hessian, vector = random_graph(rng, CHAIN)
@@ -342,10 +328,8 @@ def test_no_function_gives_a_view_of_a_factor_away() -> None:
     """Every array stays the same after its graph and factors are freed and their memory is overwritten."""
     rng = np.random.default_rng(19)
     graph, *_ = random_graph(rng, CHAIN)
-    rest = Layout(np.setdiff1d(KEYS, POSE_KEYS[:1]))
     found = [
         *normal_equations(graph, LAYOUT),
-        *condition(graph, rest, int(POSE_KEYS[0]), np.zeros(POSE)),
         factorize(graph, LAYOUT).covariance(LEFT_KEYS),
         keys_of(graph),
     ]
