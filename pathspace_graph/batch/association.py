@@ -8,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import project
-from pathspace_graph.factors.se2 import rotated, to_map, to_vehicle
+from pathspace_graph.factors.se2 import path_lengths, rotated, to_map, to_vehicle
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
@@ -87,11 +87,6 @@ def _along(square: Array, steps: Array) -> IntArray:
 def headings(poses: Array) -> Array:
     """Return the unit vectors (m, 2) of the headings of poses (m, 3)."""
     return np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
-
-
-def path_lengths(poses: Array) -> Array:
-    """Return the path length (P,) from the first of poses (P, 3) to each of them (m)."""
-    return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
 
 
 # --- detections on the curves ----------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.se2 import rotation, to_map
+from pathspace_graph.factors.se2 import path_lengths, rotation, to_map
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
@@ -46,7 +46,6 @@ from pathspace_graph.settings.batch import Start
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from .association import path_lengths
 from .lap import evidence, is_true_closure
 from .optimizer import LOOSE_GATE, Convergence, Optimizer
 from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplified

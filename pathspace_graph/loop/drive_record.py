@@ -15,12 +15,11 @@ from typing import Any, Final, cast
 import numpy as np
 from joblib.externals import loky
 
-from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_trying, solve_lap
 from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, to_map, to_vehicle, wrap_angle
+from pathspace_graph.factors.se2 import compose, path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.log_odometry import chained

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.batch.association import locate_poses, path_lengths
+from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import to_map, wrap_angle
+from pathspace_graph.factors.se2 import path_lengths, to_map, wrap_angle
 from pathspace_graph.graph.gaussian import half_solve
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.health import Evidence

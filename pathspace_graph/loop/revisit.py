@@ -2,22 +2,21 @@
 
 A lap closes where it began (`mapping.registration`). The second round of a skidpad does not, nor does a lane
 that leads into a circuit. There the cones of the last metres are laid on those seen in the earlier pass
-(`front_end.scan_matching`), which gives a factor between two poses (`mapping.revisit`). The open map is
-optimized with it as with a closed loop, but goes on to grow.
+(`front_end.scan_matching`), which gives a factor between two poses (`graph.relative:Revisit`). The open map
+is optimized with it as with a closed loop, but goes on to grow.
 """
 
 from typing import Final
 
 import numpy as np
 
-from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.start import unwrap
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.se2 import compose, inverse, relative, rotation, to_map, to_vehicle
+from pathspace_graph.factors.se2 import compose, inverse, path_lengths, relative, rotation, to_map, to_vehicle
 from pathspace_graph.front_end.scan_matching import ERRORS, REACHES, RecentDetections, match
+from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import HEADING
-from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.smoother import CurveSmoother
 
 from .closing import SIGMA_STEP

@@ -8,7 +8,7 @@ from typing import Final, Self
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import rotation, wrap_angle
+from pathspace_graph.factors.se2 import path_lengths, rotation, wrap_angle
 from pathspace_graph.settings.online import ClosingSettings
 
 from .curve_map import CurveMap
@@ -136,8 +136,7 @@ def register(
     stretches, centre, vector = _beginning(state), state.poses[-1, :2].copy(), np.zeros(3)
     lost = is_lost(covariance, settings)
     if lost:
-        along = np.hypot(*np.diff(beginning[:, :2], axis=0, prepend=beginning[:1, :2]).T).cumsum()
-        _, first = np.unique(along // START_STEP, return_index=True)
+        _, first = np.unique(path_lengths(beginning) // START_STEP, return_index=True)
         motions = beginning[first] - state.poses[-1]
         motions[:, 2] = wrap_angle(motions[:, 2])
         starts, curves = [vector, *(v for v in motions if v @ prior @ v < START_CHI2)], state.whole_curves

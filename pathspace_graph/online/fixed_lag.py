@@ -19,7 +19,7 @@ from pathspace_graph.health import GOOD
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
+from pathspace_graph.loop.closing import SIGMA_STEP, apply_correspondences, simplify
 from pathspace_graph.loop.track_loop import LoopRefusedError, TrackLoop
 from pathspace_graph.mapping.motion import known_noise, predict
 from pathspace_graph.mapping.path import DrivenPath
@@ -153,7 +153,7 @@ class FixedLagMapper(MapperEstimate):
         closes = self._close()
         watch.lap("close")
         if closes:
-            self._simplify()
+            simplify(self.smoother)
         watch.lap("simplify")
         jump, notice = self.loop.go_on(closes, watch.spent)
         if jump is not None:
@@ -277,12 +277,9 @@ class FixedLagMapper(MapperEstimate):
         found = register(track, times, covariance, self.path.beginning, settings)
         if found is None or not passes_start(track.state, self.path, found.motion):
             return False
-        apply_correspondences(self.smoother, found)
-        self.loop.record.bent(optimize_loop(self.smoother), self.smoother)
+        apply_correspondences(smoother, found)
+        self.loop.record.bent(smoother.solve_loop(settings.iterations, SIGMA_STEP), smoother)
         return True
-
-    def _simplify(self) -> None:
-        simplify(self.smoother)
 
     # --- off the closed map ------------------------------------------------------------------------------
 
