@@ -153,7 +153,7 @@ class FixedLagMapper(MapperEstimate):
         closes = self._close()
         watch.lap("close")
         if closes:
-            simplify(self.smoother)
+            self._simplify()
         watch.lap("simplify")
         jump, notice = self.loop.go_on(closes, watch.spent)
         if jump is not None:
@@ -280,6 +280,9 @@ class FixedLagMapper(MapperEstimate):
         apply_correspondences(smoother, found)
         self.loop.record.bent(smoother.solve_loop(settings.iterations, SIGMA_STEP), smoother)
         return True
+
+    def _simplify(self) -> None:
+        simplify(self.smoother)
 
     # --- off the closed map ------------------------------------------------------------------------------
 
