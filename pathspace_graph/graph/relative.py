@@ -236,7 +236,7 @@ class Submaps:
         return dict(zip((keys - pose_key(0)).tolist(), poses, strict=True))
 
 
-# --- a place that was met again ----------------------------------------------------------------------------
+# --- a place that was met again --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

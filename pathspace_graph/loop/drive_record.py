@@ -31,8 +31,6 @@ from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .recognition import RecognizedPlace
-
 
 def bend(poses: Array, known: Mapping[int, Array]) -> Array:
     """Return the poses (n, 3) of a path bent so that some of them have known values (3,), by index.
@@ -131,9 +129,9 @@ class DriveRecord:
         found = find_recurrence(np.array(self._reckoned), self.settings)
         return found if is_worth_trying(found, self.settings) else None
 
-    def recurrence_since(self, place: RecognizedPlace) -> Recurrence:
-        """Return the recurrence of the path driven since the vehicle was at a place before."""
-        poses, (label, u) = np.array(self._reckoned), next(iter(place.beside.items()))
+    def recurrence_since(self, label: int, u: float) -> Recurrence:
+        """Return the recurrence of the path driven since the vehicle was beside a place (m) of a boundary."""
+        poses = np.array(self._reckoned)
         before = int(np.nanargmin(np.abs(np.array(self._beside[label]) - u)))
         driven, turn = path_lengths(poses), float(poses[-1, 2] - poses[before, 2])
         return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)
