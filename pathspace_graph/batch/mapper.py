@@ -302,7 +302,7 @@ class BatchMapper:
             cost=convergence.cost,
             convergence=convergence,
             map_covariance=joint,
-            calibration=at.state.calibration.copy(),
+            calibration=at.state.variables.calibration.copy(),
             noise=judged.noise,
             vehicle=vehicle,
             online=online,

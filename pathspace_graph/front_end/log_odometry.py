@@ -11,7 +11,7 @@ from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.rows import OdometryChain, Rows, calibrated_delta, odometry_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, pose_key
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
-from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
+from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 
 
 @dataclass(frozen=True, eq=False)

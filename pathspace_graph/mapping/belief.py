@@ -17,7 +17,7 @@ from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
+from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 
 from .motion import MeasuredMotion
 

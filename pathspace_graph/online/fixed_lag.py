@@ -235,7 +235,7 @@ class FixedLagMapper(MapperEstimate):
     def _predict(self, reading: Reading) -> None:
         """Add the pose of the cycle by the calibrated odometry, and extend the driven path."""
         motion, t = reading.motion, reading.detections.t
-        predict(self.smoother, self.path, motion, t, self.settings)
+        predict(self.smoother, self.path, motion, t)
         cycle, twist = self.smoother.next_cycle - 1, motion.odometry.twist
         orange = Sighting(cycle, self.poses[-1].copy(), twist, reading.orange)
         self.orange.add(orange, self.smoother.variables.sensor)

@@ -4,18 +4,19 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.settings.online import (
+
+from .batch import BatchSettings, CenterlineSettings, CkfSettings, Knots, LandmarkSettings, OpenLapSettings
+from .checked import Positive
+from .online import (
+    CalibrationSettings,
     ClosingSettings,
     GrowthSettings,
     HealthSettings,
     LimitSettings,
     MotionSettings,
+    OdometrySettings,
     SidesSettings,
 )
-
-from .batch import BatchSettings, CenterlineSettings, CkfSettings, Knots, LandmarkSettings, OpenLapSettings
-from .calibration import CalibrationSettings, OdometrySettings
-from .checked import Positive
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.drive_record import DriveRecord, bend
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry, known_noise
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.calibration import OdometrySettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import OdometrySettings
 
 from ..scenes.maps import boundary_through
 
