@@ -8,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import project
-from pathspace_graph.factors.se2 import path_lengths, rotated, to_map, to_vehicle
+from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
@@ -195,7 +195,7 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
     if (sigma < SHARP).sum() >= SHARP_SHARE * len(rows):  # far detections are smeared
         rows = rows[sigma < SHARP]
-    cycles, covariances = detections.cycle[rows], covariances_map(detections, rows, state.poses)
+    cycles, covariances = detections.cycle[rows], detections.covariances_map(rows, state.variables)
     points = to_map(detections.point[rows], state.variables.poses_at(cycles))
     used = detections.used[rows] & (detections.boundary[rows] == label)
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
@@ -221,11 +221,6 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
 
 def cone_counts(state: State, detections: DetectionTable, settings: MapperSettings) -> list[int]:
     return [len(cones_of_curve(state, detections, label, settings).u) for label in state.boundaries]
-
-
-def covariances_map(detections: DetectionTable, rows: IntArray, poses: Array) -> Array:
-    """Return the covariances (m, 2, 2) of detections in the map frame (m^2), by the poses (P, 3)."""
-    return rotated(detections.covariance[rows], poses[detections.cycle[rows], 2])
 
 
 def first_parameter(state: State, label: int) -> float:

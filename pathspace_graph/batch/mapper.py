@@ -385,7 +385,7 @@ def _with_doubt(
     if believed == system.settings:
         return at, convergence, known
     system.settings = believed
-    system.chain = replace(system.chain, calibration_sigma=np.array(believed.odometry.sigmas_calibration))
+    system.chain = replace(system.chain, calibration_sigma=np.array(believed.odometry.sigmas))
     return _with_doubt(optimizer, *optimizer.find(at.state))
 
 

@@ -77,8 +77,8 @@ def chained(
         first_information=np.linalg.inv(steps[0].covariance + np.diag(settings.sigmas_start) ** 2),
         odometry=OdometryChain(steps[1:]),
         twists=np.array([step.twist for step in steps]),
-        calibration_mean=np.array(settings.calibration),
-        calibration_sigma=np.array(settings.sigmas_calibration),
+        calibration_mean=np.array(settings.means),
+        calibration_sigma=np.array(settings.sigmas),
         bias=mean_bias([motion.bias for motion in motions if motion.bias is not None]),
     )
 

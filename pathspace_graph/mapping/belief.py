@@ -94,9 +94,9 @@ class Belief:
 
         The priors of the sensor are wide: unlike a window, a filter cannot explain past errors anew.
         """
-        calibration = np.array([settings.sigma_scale, settings.sigma_bias, *sensor.widened().sigmas])
+        calibration = np.array([*settings.sigmas, *sensor.widened().sigmas])
         belief = cls(np.zeros(POSE), np.diag(np.square(settings.sigmas_start)), calibration)
-        known = np.array([*settings.calibration, *sensor.means])
+        known = np.array([*settings.means, *sensor.means])
         belief.mean[POSE : POSE + len(known)] = known
         return belief
 

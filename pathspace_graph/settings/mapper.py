@@ -169,12 +169,12 @@ class MapperSettings(Positive):
     @property
     def calibrations(self) -> tuple[float, ...]:
         """Prior means, (2,) or (7,), of odometry and sensor."""
-        return (*self.odometry.calibration, *self.calibration.means)
+        return (*self.odometry.means, *self.calibration.means)
 
     @property
     def sigmas_calibrations(self) -> tuple[float, ...]:
         """Prior standard deviations, (2,) or (7,), of odometry and sensor."""
-        return (*self.odometry.sigmas_calibration, *self.calibration.sigmas)
+        return (*self.odometry.sigmas, *self.calibration.sigmas)
 
 
 ODOMETRY_SIGMA = (0.25, 0.12, 0.035)

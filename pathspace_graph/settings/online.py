@@ -155,11 +155,27 @@ WIDE_ODOMETRY: Final = 10.0  # standard deviations of the odometry's wide priors
 WIDE_SENSOR: Final = 20.0  # standard deviations of the sensor's wide priors by those of a calibrated one
 
 
-@dataclass(frozen=True)
-class OdometrySettings(Positive):
-    """Priors of the odometry's constant errors."""
+class _Priors(Positive):
+    """Priors of constant errors: the signed settings are known errors, and each has a standard deviation."""
 
     UNLIMITED = ("doubt",)
+    sensor = True  # whether the errors are estimated
+
+    @property
+    def means(self) -> tuple[float, ...]:
+        """Known errors, (2,) of odometry or (5,) in the order of `factors.sensor:SENSOR`, or none."""
+        return tuple(getattr(self, name) for name in self.SIGNED if self.sensor)
+
+    @property
+    def sigmas(self) -> tuple[float, ...]:
+        """Standard deviations in the same order, or none."""
+        return tuple(getattr(self, f"sigma_{name}") for name in self.SIGNED if self.sensor)
+
+
+@dataclass(frozen=True)
+class OdometrySettings(_Priors):
+    """Priors of the odometry's constant errors."""
+
     SIGNED = ("scale", "bias")
 
     sigmas_start: ClassVar = (1e-4, 1e-4, 1e-5)
@@ -183,22 +199,11 @@ class OdometrySettings(Positive):
         scale = self.sigma_scale if self.hold_scale else WIDE_ODOMETRY * self.sigma_scale
         return replace(self, doubt=inf, sigma_scale=scale, sigma_bias=WIDE_ODOMETRY * self.sigma_bias)
 
-    @property
-    def sigmas_calibration(self) -> tuple[float, float]:
-        """Standard deviations of the scale error (-) and of the yaw-rate bias (rad/s)."""
-        return self.sigma_scale, self.sigma_bias
-
-    @property
-    def calibration(self) -> tuple[float, float]:
-        """Known scale error (-) and yaw-rate bias (rad/s)."""
-        return self.scale, self.bias
-
 
 @dataclass(frozen=True)
-class CalibrationSettings(Positive):
+class CalibrationSettings(_Priors):
     """Priors of the sensor's mounting, stamps and ranges."""
 
-    UNLIMITED = ("doubt",)
     SIGNED = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 
     sensor: bool = True
@@ -228,16 +233,6 @@ class CalibrationSettings(Positive):
     seen. By default the smoother one."""
     doubt: float = 4.0
     """Contradiction from which the priors become wide, standard deviations; `inf` to hold them always."""
-
-    @property
-    def sigmas(self) -> tuple[float, ...]:
-        """Standard deviations (5,) in the order of `factors.sensor:SENSOR`, or none."""
-        return tuple(getattr(self, f"sigma_{name}") for name in self.SIGNED if self.sensor)
-
-    @property
-    def means(self) -> tuple[float, ...]:
-        """Known errors (5,) in the order of `factors.sensor:SENSOR`, or none."""
-        return tuple(getattr(self, name) for name in self.SIGNED if self.sensor)
 
     def widened(self) -> Self:
         """Return the settings of wide priors, which are not doubted again.
