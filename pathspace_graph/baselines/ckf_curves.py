@@ -16,8 +16,7 @@ from pathspace_graph.mapping import path
 from pathspace_graph.mapping.belief import Belief, point_columns
 from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
-from pathspace_graph.settings.batch import CkfSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 

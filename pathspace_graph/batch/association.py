@@ -15,8 +15,7 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
-from pathspace_graph.settings.batch import AssociationSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import AssociationSettings, MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION
 
 DENSITY_STEP: Final = 0.1  # step at which the density of detections along a curve is sampled (m)

@@ -42,8 +42,7 @@ from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.scale import log_at_scale
-from pathspace_graph.settings.batch import Start
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.spline.boundary import Boundary
 
 from .lap import evidence, is_true_closure

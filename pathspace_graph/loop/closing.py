@@ -18,8 +18,7 @@ from pathspace_graph.factors.se2 import compose, left_of, relative
 from pathspace_graph.graph.variables import control_keys, pose_keys
 from pathspace_graph.mapping.registration import BEGINNING, RefinedMotion
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.settings.batch import Knots
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import Knots, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import curvature_weighted_breaks, refit, thin

@@ -19,8 +19,7 @@ from pathspace_graph.loop.closing import PeriodicCurve, make_periodic, substitut
 from pathspace_graph.mapping.registration import RefinedMotion, near_start, register
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.batch import Knots
-from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
+from pathspace_graph.settings.mapper import Knots, MapperSettings, SplineSettings
 from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 
