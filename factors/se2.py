@@ -68,6 +68,11 @@ def move_points(motion: Array, points: Array) -> Array:
     return np.asarray(points @ rotation(motion[2]).T + motion[:2])
 
 
+def path_lengths(path: Array) -> Array:
+    """Return the length (n,) of a path from its first point (n, 2), or pose (n, 3), to each of them (m)."""
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T)))
+
+
 @compiled
 def to_map(points_vehicle: Array, poses: Array) -> Array:
     """Return `p = R z + t` (m, 2), map frame: points z (m, 2) in the vehicle frames of poses (m, 3)."""

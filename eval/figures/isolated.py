@@ -16,7 +16,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.files import atomic_folder
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.mapping.belief import cubature_points, square_root
-from pathspace_graph.settings.batch import CkfSettings
+from pathspace_graph.settings.mapper import CkfSettings
 from pathspace_graph.sim.curves import left_normals, unit
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 from pathspace_graph.spline.knots import fit_spline

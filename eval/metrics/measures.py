@@ -6,8 +6,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.mapper import BatchResult
+from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary

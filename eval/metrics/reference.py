@@ -15,8 +15,8 @@ from pathspace_graph.io.log import Detections, Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
-from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import CalibrationSettings
 from pathspace_graph.spline.knots import fit_spline
 
 from . import accuracy

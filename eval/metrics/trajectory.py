@@ -6,9 +6,8 @@ from typing import Final
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.se2 import to_map, to_vehicle, wrap_angle
+from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import VehicleState

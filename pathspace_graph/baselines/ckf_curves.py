@@ -8,7 +8,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
-from pathspace_graph.factors.se2 import rotated, rotation, to_map
+from pathspace_graph.factors.se2 import path_lengths, rotated, rotation, to_map
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
@@ -16,8 +16,7 @@ from pathspace_graph.mapping import path
 from pathspace_graph.mapping.belief import Belief, point_columns
 from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
-from pathspace_graph.settings.batch import CkfSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
@@ -95,7 +94,7 @@ class CurveState:
         belief, p, k = self.belief, self.settings.spline.degree, len(detections)
         count = len(belief.points)
         belief.add_points(detections, covariances)
-        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(detections, axis=0).T)))
+        along = path_lengths(detections)
         at = np.linspace(0.0, along[-1], p + 1)
         matrix = np.column_stack([np.interp(at, along, row) for row in np.eye(k)])
         belief.transform_points(count, count + k, matrix, np.full(p + 1, SIGMA_START))

@@ -18,7 +18,7 @@ from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.belief import SENSOR_COLUMNS, to_vehicle_rows, transform
-from pathspace_graph.settings.batch import CkfSettings
+from pathspace_graph.settings.mapper import CkfSettings
 
 from .ckf_curves import CurveState
 

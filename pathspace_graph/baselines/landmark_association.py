@@ -13,8 +13,7 @@ from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.tentative import nearest_within
-from pathspace_graph.settings.batch import LandmarkSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import LandmarkSettings, MapperSettings
 from pathspace_graph.settings.online import GrowthSettings
 
 from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother, LandmarkState, two_rows

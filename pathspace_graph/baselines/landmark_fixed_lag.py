@@ -66,7 +66,7 @@ class LandmarkFixedLag:
             return cycle.counted(self._use_late(cycle.detections, watch))
         reading = self.front_end.update(cycle.odometry, cycle.detections)
         motion, detections = reading.motion, reading.detections
-        predict(self.smoother, self.path, motion, detections.t, self.settings)
+        predict(self.smoother, self.path, motion, detections.t)
         watch.lap("predict")
         new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
         self._use(new, detections.t, watch)

@@ -8,15 +8,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import project
-from pathspace_graph.factors.se2 import rotated, to_map, to_vehicle
+from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
-from pathspace_graph.settings.batch import AssociationSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import AssociationSettings, MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION
 
 DENSITY_STEP: Final = 0.1  # step at which the density of detections along a curve is sampled (m)
@@ -87,11 +86,6 @@ def _along(square: Array, steps: Array) -> IntArray:
 def headings(poses: Array) -> Array:
     """Return the unit vectors (m, 2) of the headings of poses (m, 3)."""
     return np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
-
-
-def path_lengths(poses: Array) -> Array:
-    """Return the path length (P,) from the first of poses (P, 3) to each of them (m)."""
-    return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
 
 
 # --- detections on the curves ----------------------------------------------------------------------------
@@ -200,7 +194,7 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     sigma = np.sqrt(0.5 * np.trace(detections.covariance[rows], axis1=1, axis2=2))
     if (sigma < SHARP).sum() >= SHARP_SHARE * len(rows):  # far detections are smeared
         rows = rows[sigma < SHARP]
-    cycles, covariances = detections.cycle[rows], covariances_map(detections, rows, state.poses)
+    cycles, covariances = detections.cycle[rows], detections.covariances_map(rows, state.variables)
     points = to_map(detections.point[rows], state.variables.poses_at(cycles))
     used = detections.used[rows] & (detections.boundary[rows] == label)
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
@@ -226,11 +220,6 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
 
 def cone_counts(state: State, detections: DetectionTable, settings: MapperSettings) -> list[int]:
     return [len(cones_of_curve(state, detections, label, settings).u) for label in state.boundaries]
-
-
-def covariances_map(detections: DetectionTable, rows: IntArray, poses: Array) -> Array:
-    """Return the covariances (m, 2, 2) of detections in the map frame (m^2), by the poses (P, 3)."""
-    return rotated(detections.covariance[rows], poses[detections.cycle[rows], 2])
 
 
 def first_parameter(state: State, label: int) -> float:

@@ -15,7 +15,7 @@ from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.se2 import rotation, to_map
+from pathspace_graph.factors.se2 import path_lengths, rotation, to_map
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
@@ -42,11 +42,9 @@ from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.scale import log_at_scale
-from pathspace_graph.settings.batch import Start
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.spline.boundary import Boundary
 
-from .association import path_lengths
 from .lap import evidence, is_true_closure
 from .optimizer import LOOSE_GATE, Convergence, Optimizer
 from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplified
@@ -303,7 +301,7 @@ class BatchMapper:
             cost=convergence.cost,
             convergence=convergence,
             map_covariance=joint,
-            calibration=at.state.calibration.copy(),
+            calibration=at.state.variables.calibration.copy(),
             noise=judged.noise,
             vehicle=vehicle,
             online=online,
@@ -386,7 +384,7 @@ def _with_doubt(
     if believed == system.settings:
         return at, convergence, known
     system.settings = believed
-    system.chain = replace(system.chain, calibration_sigma=np.array(believed.odometry.sigmas_calibration))
+    system.chain = replace(system.chain, calibration_sigma=np.array(believed.odometry.sigmas))
     return _with_doubt(optimizer, *optimizer.find(at.state))
 
 

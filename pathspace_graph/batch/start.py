@@ -13,9 +13,10 @@ from scipy.fft import fft, ifft, next_fast_len
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import path_lengths, rotated, to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph, owners
+from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, pose_keys
 from pathspace_graph.io.log import Log
@@ -24,14 +25,13 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
 from pathspace_graph.mapping.registration import HEADING
-from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from .association import MIN_CONES, add_drive, cluster, covariances_map, path_lengths
+from .association import MIN_CONES, add_drive, cluster
 from .simplification import boundary_of, exact_settings, fit_through
 
 ComplexArray = NDArray[np.complex128]
@@ -251,7 +251,7 @@ def _begin_boundary(
     side, ahead = SIDES[label] * lateral, station - recurrence.driven[cycles]
     kept = (side > MIN_LATERAL) & (side < MAX_LATERAL)
     kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead) & (station >= 0.0) & (station < length)
-    covariances = covariances_map(detections, rows[kept], poses)
+    covariances = rotated(detections.covariance[rows[kept]], poses[cycles[kept], 2])
     cones = cluster(points[kept], station[kept], covariances, length, recurrence.recurs, settings)
     if len(cones.u) >= MIN_CONES:
         spline = fit_through(cones.points, recurrence.recurs, settings, settings.batch.size_share)

@@ -11,7 +11,7 @@ from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.rows import OdometryChain, Rows, calibrated_delta, odometry_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, pose_key
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
-from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
+from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +77,8 @@ def chained(
         first_information=np.linalg.inv(steps[0].covariance + np.diag(settings.sigmas_start) ** 2),
         odometry=OdometryChain(steps[1:]),
         twists=np.array([step.twist for step in steps]),
-        calibration_mean=np.array(settings.calibration),
-        calibration_sigma=np.array(settings.sigmas_calibration),
+        calibration_mean=np.array(settings.means),
+        calibration_sigma=np.array(settings.sigmas),
         bias=mean_bias([motion.bias for motion in motions if motion.bias is not None]),
     )
 

@@ -18,8 +18,7 @@ from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR
-from pathspace_graph.settings.calibration import CalibrationSettings
-from pathspace_graph.settings.online import MotionSettings
+from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
 
 ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
 SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting

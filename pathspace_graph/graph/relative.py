@@ -16,7 +16,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.factors.se2 import compose, relative
+from pathspace_graph.factors.se2 import compose, relative, wrap_angle
 
 from .gaussian import (
     graph_of,
@@ -27,7 +27,8 @@ from .gaussian import (
     remove_information,
     square_root_form,
 )
-from .variables import ORIGIN_KEY, POSE, Layout, Variables, pose_key, rotation_blocks
+from .rows import Rows
+from .variables import ORIGIN_KEY, POSE, Layout, Variables, pose_key, pose_keys, rotation_blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,3 +215,38 @@ class Submaps:
             key: (pose, self.keyframes[key][1]) for key, pose in zip(keys.tolist(), poses, strict=True)
         }
         return dict(zip((keys - pose_key(0)).tolist(), poses, strict=True))
+
+
+# --- a place that was met again --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Revisit:
+    """The pose of one cycle in the frame of an earlier one's, by cones seen from both: `A (y(x) - y0)`.
+
+    Where a drive meets its road again without a lap, as on a skidpad, a pose may slide along both boundaries,
+    but the cones themselves hold it in every direction.
+    """
+
+    earlier: int  # cycle in whose frame the pose is
+    later: int
+    local: Array  # (3,) the measured pose y0 (m, m, rad)
+    root: Array  # (3, 3) A, a square root of its information
+
+    def factor(self) -> RelativeFactor:
+        earlier, later = pose_keys(np.array([self.earlier, self.later]))
+        return RelativeFactor(int(earlier), Layout(np.array([later])), self.root, np.zeros(POSE), self.local)
+
+    def residual(self, poses: Array) -> Array:
+        """Return the whitened residual (3,) at the poses (P, 3) of all cycles."""
+        seen = relative(poses[self.earlier], poses[self.later]) - self.local
+        return np.asarray(self.root @ [*seen[:2], wrap_angle(seen[2])])
+
+    def rows(self, poses: Array) -> Rows:
+        """Return the rows on [earlier pose | later pose], linearized at the poses (P, 3) of all cycles."""
+        frame, values = poses[self.earlier], poses[self.later]
+        layout = Layout(pose_keys(np.array([self.later])))
+        jacobian = [by_frame_of(values, frame, layout), rotations(layout, frame[2]).T]
+        keys = np.tile(pose_keys(np.array([self.earlier, self.later])), (POSE, 1))
+        owner = np.full(POSE, -1 - self.later)  # a factor of its own, since its poses are far apart
+        return Rows(keys, self.root @ np.concatenate(jacobian, axis=1), self.residual(poses), owner)

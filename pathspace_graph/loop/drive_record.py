@@ -15,12 +15,11 @@ from typing import Any, Final, cast
 import numpy as np
 from joblib.externals import loky
 
-from pathspace_graph.batch.association import path_lengths
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_trying, solve_lap
 from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, to_map, to_vehicle, wrap_angle
+from pathspace_graph.factors.se2 import compose, path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.log_odometry import chained
@@ -31,8 +30,6 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
-
-from .recognition import RecognizedPlace
 
 
 def bend(poses: Array, known: Mapping[int, Array]) -> Array:
@@ -132,9 +129,9 @@ class DriveRecord:
         found = find_recurrence(np.array(self._reckoned), self.settings)
         return found if is_worth_trying(found, self.settings) else None
 
-    def recurrence_since(self, place: RecognizedPlace) -> Recurrence:
-        """Return the recurrence of the path driven since the vehicle was at a place before."""
-        poses, (label, u) = np.array(self._reckoned), next(iter(place.beside.items()))
+    def recurrence_since(self, label: int, u: float) -> Recurrence:
+        """Return the recurrence of the path driven since the vehicle was beside a place (m) of a boundary."""
+        poses = np.array(self._reckoned)
         before = int(np.nanargmin(np.abs(np.array(self._beside[label]) - u)))
         driven, turn = path_lengths(poses), float(poses[-1, 2] - poses[before, 2])
         return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)

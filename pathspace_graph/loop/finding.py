@@ -5,22 +5,23 @@ which is laid rigidly beside each place of the loop, and the best places are ref
 one is clearly better than all others, twice in a row, the window starts anew there.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.batch.association import locate_poses, path_lengths
+from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import to_map, wrap_angle
+from pathspace_graph.factors.se2 import path_lengths, to_map, wrap_angle
 from pathspace_graph.graph.gaussian import half_solve
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.health import Evidence
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.mapping.registration import Motion, RefinedMotion, Sightings, refine, worst_sigma
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.registration import Motion, RefinedMotion, Registration, Sightings, worst_sigma
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.spline.boundary import Boundary
@@ -100,12 +101,14 @@ def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) 
     return np.asarray(near_end | (steps <= gap * np.median(steps))[before])
 
 
-def lay_out_loop(state: State, is_mapped_on: Callable[[int, Array], BoolArray] | None = None) -> Loop:
-    """Return the loop between two closed curves, mapped at parameters (m,) where `is_mapped_on` says so."""
-    u, points = {}, {}
-    for label, boundary in state.boundaries.items():
+def lay_out_loop(track: CurveMap) -> Loop:
+    """Return the loop between two closed curves."""
+    u, points, mapped, margin = {}, {}, {}, track.settings.growth.merge_radius
+    for label, boundary in track.state.boundaries.items():
         u[label] = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
-        points[label] = boundary.evaluate(state.control_points(label), u[label])
+        points[label] = boundary.evaluate(track.state.control_points(label), u[label])
+        cones = track.cones.get(label, np.zeros(0))
+        mapped[label] = is_mapped(u[label], cones, boundary.length, GAP, margin)
     curves = {label: KDTree(curve) for label, curve in points.items()}
     every = max(int(STEP / SAMPLE), 1)
     left = points[LEFT][::every]
@@ -114,7 +117,6 @@ def lay_out_loop(state: State, is_mapped_on: Callable[[int, Array], BoolArray] |
     steps = np.hypot(*np.diff(middle, axis=0, append=middle[:1]).T)
     stations = np.concatenate([[0.0], steps.cumsum()[:-1]])
     beside = {LEFT: u[LEFT][::every], RIGHT: u[RIGHT][opposite]}
-    mapped = {b: is_mapped_on(b, at) if is_mapped_on else np.ones(len(at), bool) for b, at in u.items()}
     return Loop(middle, stations, float(steps.sum()), beside, curves, mapped)
 
 
@@ -132,7 +134,7 @@ class KnownLoop:
         if self._laid_out is None or self._laid_out[0] != boundaries:
             values = state.variables.values.copy()
             self._smoother.refresh()
-            self._laid_out = boundaries, lay_out_loop(state, self._lie_between_cones)
+            self._laid_out = boundaries, lay_out_loop(self._smoother.map)
             state.variables.values[:] = values
         return self._laid_out[1]
 
@@ -151,11 +153,6 @@ class KnownLoop:
         low = self._smoother.map.state.boundaries[label].tables.low
         nearest = np.rint((u - low) / SAMPLE).astype(np.intp)
         return self.get().mapped[label].take(nearest, mode="wrap")
-
-    def _lie_between_cones(self, label: int, u: Array) -> BoolArray:
-        track = self._smoother.map
-        cones, length = track.cones.get(label, np.zeros(0)), track.state.boundaries[label].length
-        return is_mapped(u, cones, length, GAP, track.settings.growth.merge_radius)
 
 
 def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_again: BoolArray) -> Evidence:
@@ -234,7 +231,7 @@ class Search:
         if best is None:
             return None
         moved = best.motion.apply(newest)[0]
-        agrees = last is not None and _distance(moved, last.apply(newest)[0]) < APART
+        agrees = last is not None and np.hypot(*(moved - last.apply(newest)[0])) < APART
         self._agreed = self._agreed + 1 if agrees else 1
         return best if self._agreed >= CONFIRMATIONS else None
 
@@ -250,7 +247,7 @@ class Search:
             return None
         self._smoother.refresh()  # the map goes on to relax from the detections that were taken out of use
         state = self._smoother.map.state
-        self.loop = lay_out_loop(state)
+        self.loop = lay_out_loop(self._smoother.map)
         centre = self._poses[-1][:2]
         places = [self._refined(state, seen, Motion(centre, vector), i) for vector, i in self._starts(seen)]
         places.sort(key=lambda place: -place[0])
@@ -260,7 +257,7 @@ class Search:
         self._missed = 0
         most, best = places[0]
         at = best.motion.vector[:2]
-        rivals = [score for score, found in places if _distance(found.motion.vector[:2], at) >= APART]
+        rivals = [one for one, found in places if np.hypot(*(found.motion.vector[:2] - at)) >= APART]
         if rivals and rivals[0] > most - MARGIN:
             return None
         return best if worst_sigma(best.covariance) < SIGMA_MAX else None
@@ -326,14 +323,10 @@ class Search:
             high = float(u[i]) + gate.view_ahead + gate.station_room
             whole = high - low >= tables.high - tables.low
             stretches[label] = (tables.low, tables.high) if whole else (low, high)
-        prior = start.vector, np.diag(np.array(SIGMAS_PLACE) ** -2)
-        found = refine(state, seen, start, stretches, prior, self.settings.closing)
+        registration = Registration(state, seen, stretches, self.settings.closing)
+        found = registration.refine(start, start.vector, np.diag(np.array(SIGMAS_PLACE) ** -2))
         distance = self.loop.distances(seen.labels, found.motion.apply(seen.points), REACH)
         return float(np.exp(-0.5 * (distance / SIGMA_FIT) ** 2).mean()), found
-
-
-def _distance(a: Array, b: Array) -> float:
-    return float(np.hypot(*(a - b)))
 
 
 def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) -> Array:

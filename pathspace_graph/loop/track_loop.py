@@ -26,8 +26,7 @@ from .closing import go_on_from, hold_gauge
 from .drive_record import LATE, DriveRecord, LapBatch
 from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .mending import Mending
-from .recognition import recognize
-from .revisit import Revisits
+from .revisit import Revisits, recognize
 
 OWN_PRIOR: Final = "the map goes on from the window's own prior"  # begins the notice where no batch came
 LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cycle before it was
@@ -308,7 +307,7 @@ class TrackLoop:
         if recurrence is None and length >= self._recognition_tried:
             self._recognition_tried = length + RECOGNITION_INTERVAL * apart
             place = recognize(self._smoother)
-            recurrence = None if place is None else self.record.recurrence_since(place)
+            recurrence = None if place is None else self.record.recurrence_since(place.label, place.u)
         if recurrence is not None:
             self._loop_tried = length + self.settings.open_lap.retry
             self._begin_batch(recurrence)

@@ -12,12 +12,12 @@ from scipy.linalg import block_diag, lapack
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
-from pathspace_graph.factors.se2 import compose
+from pathspace_graph.factors.se2 import compose, to_map, to_vehicle
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
+from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 
 from .motion import MeasuredMotion
 
@@ -94,9 +94,9 @@ class Belief:
 
         The priors of the sensor are wide: unlike a window, a filter cannot explain past errors anew.
         """
-        calibration = np.array([settings.sigma_scale, settings.sigma_bias, *sensor.widened().sigmas])
+        calibration = np.array([*settings.sigmas, *sensor.widened().sigmas])
         belief = cls(np.zeros(POSE), np.diag(np.square(settings.sigmas_start)), calibration)
-        known = np.array([*settings.calibration, *sensor.means])
+        known = np.array([*settings.means, *sensor.means])
         belief.mean[POSE : POSE + len(known)] = known
         return belief
 
@@ -231,14 +231,11 @@ def point_columns(points: IntArray) -> IntArray:
 
 def to_map_rows(poses: Array, detections: Array) -> Array:
     """Return `R z + t` (k, 2 r), map frame, of r detections (k, 2 r) from each of k poses (k, 3)."""
-    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    x, y = detections[:, 0::2], detections[:, 1::2]
-    placed = np.stack([c * x - s * y + poses[:, :1], s * x + c * y + poses[:, 1:2]], axis=2)
-    return placed.reshape(len(poses), -1)
+    repeated = np.repeat(poses, detections.shape[1] // POINT, axis=0)
+    return to_map(detections.reshape(-1, POINT), repeated).reshape(len(poses), -1)
 
 
 def to_vehicle_rows(poses: Array, points: Array) -> Array:
     """Return `R' (p - t)` (k, 2 r), vehicle frame, of r map points (k, 2 r) from each of k poses (k, 3)."""
-    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    x, y = points[:, 0::2] - poses[:, :1], points[:, 1::2] - poses[:, 1:2]
-    return np.stack([c * x + s * y, c * y - s * x], axis=2).reshape(len(poses), -1)
+    repeated = np.repeat(poses, points.shape[1] // POINT, axis=0)
+    return to_vehicle(points.reshape(-1, POINT), repeated).reshape(len(poses), -1)

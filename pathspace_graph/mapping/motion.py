@@ -16,6 +16,7 @@ from pathspace_graph.graph.window import MapRows, SmootherSettings
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.online import OdometrySettings
 
 from .path import DrivenPath
 
@@ -88,15 +89,9 @@ def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> Integr
     return integrate_twists(np.diff(np.append(odometry.t, until)), odometry.twist, sigma)
 
 
-def predict(
-    smoother: FixedLagSmoother[MapRows],
-    path: DrivenPath,
-    motion: MeasuredMotion,
-    t: float,
-    settings: MapperSettings,
-) -> None:
+def predict(smoother: FixedLagSmoother[MapRows], path: DrivenPath, motion: MeasuredMotion, t: float) -> None:
     """Add the pose at t (s) by the calibrated motion since the newest one, and extend the driven path."""
-    path.update(smoother.predict(t, motion.odometry, settings.odometry.sigmas_start))
+    path.update(smoother.predict(t, motion.odometry, OdometrySettings.sigmas_start))
     path.steer(motion.twists)
     if motion.bias is not None:
         smoother.measure_bias(motion.bias.value, motion.bias.sigma)

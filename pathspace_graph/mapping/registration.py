@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import hypot, sqrt
 from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import rotation, wrap_angle
+from pathspace_graph.factors.se2 import path_lengths, rotation, wrap_angle
 from pathspace_graph.settings.online import ClosingSettings
 
 from .curve_map import CurveMap
@@ -92,6 +93,51 @@ class RefinedMotion:
     covariance: Array  # (3, 3) covariance of the motion (m, m, rad)
 
 
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Detections, and the stretch (low, high) of each curve, by label, that they are registered with."""
+
+    state: State
+    seen: Sightings
+    stretches: Mapping[int, tuple[float, float]]
+    settings: ClosingSettings
+
+    @cached_property
+    def curves(self) -> Curves:
+        return self.state.whole_curves
+
+    def refine(self, start: Motion, mean: Array, information: Array) -> RefinedMotion:
+        """Refine a motion by iterated closest points; its prior has a mean (3,) and an information (3, 3)."""
+        vector = start.vector
+        for iteration in range(ITERATIONS):
+            reach = max(self.settings.inlier_distance, REACH * SHRINK**iteration)
+            matches = self.match(Motion(start.centre, vector), reach)
+            negative_gradient = matches.negative_gradient - information @ (vector - mean)
+            vector = vector + np.linalg.solve(matches.hessian + information, negative_gradient)
+        covariance = np.asarray(np.linalg.inv(matches.hessian + information), np.float64)
+        return RefinedMotion(Motion(start.centre, vector), matches, covariance)
+
+    def match(self, motion: Motion, reach: float) -> Matches:
+        """Match moved detections with their stretches, and linearize those within `reach` (m)."""
+        seen, curves = self.seen, self.curves
+        moved, curve = motion.apply(seen.points), curves.labels.searchsorted(seen.labels)
+        low, high = np.array([self.stretches[label] for label in curves.labels.tolist()])[curve].T
+        foot = curves.find(self.state.map_points, moved, curve, low, high)
+        inside, used = foot.interior, foot.interior & (np.abs(foot.distance) < reach)
+        n, arm = foot.normal_unit[used], moved[used] - motion.centre - motion.vector[:2]
+        variance = np.einsum("mi,mij,mj->m", n, seen.covariances[used], n) + self.settings.sigma_reading**2
+        jacobian = by_motion(n, arm) / np.sqrt(variance)[:, None]
+        return Matches(
+            seen.rows[inside],
+            seen.labels[inside],
+            foot.u[inside],
+            np.abs(foot.distance[inside]) < self.settings.inlier_distance,
+            seen.explained[inside],
+            jacobian.T @ jacobian,
+            -jacobian.T @ (foot.distance[used] / np.sqrt(variance)),
+        )
+
+
 def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool:
     """Return whether a pose (3,) may be on the beginning again: after a long path, near it, and along it."""
     if path.length < settings.min_path:
@@ -131,62 +177,25 @@ def register(
     the motion free. If P is larger than the iteration can bridge, it starts from the best pose of the
     `beginning` (k, 3) of the drive. `times` are the stamps of the poses (s).
     """
-    recent, state = _recent(track, times), track.state
+    registration, state = _with_beginning(track, times, settings), track.state
     prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
-    stretches, centre, vector = _beginning(state), state.poses[-1, :2].copy(), np.zeros(3)
-    lost = is_lost(covariance, settings)
+    centre, vector, lost = state.poses[-1, :2].copy(), np.zeros(3), is_lost(covariance, settings)
     if lost:
-        along = np.hypot(*np.diff(beginning[:, :2], axis=0, prepend=beginning[:1, :2]).T).cumsum()
-        _, first = np.unique(along // START_STEP, return_index=True)
+        _, first = np.unique(path_lengths(beginning) // START_STEP, return_index=True)
         motions = beginning[first] - state.poses[-1]
         motions[:, 2] = wrap_angle(motions[:, 2])
-        starts, curves = [vector, *(v for v in motions if v @ prior @ v < START_CHI2)], state.whole_curves
-        inliers = [
-            _match(state, curves, settings, recent, Motion(centre, v), stretches, REACH).inlier.sum()
-            for v in starts
-        ]
+        starts = [vector, *(v for v in motions if v @ prior @ v < START_CHI2)]
+        inliers = [registration.match(Motion(centre, v), REACH).inlier.sum() for v in starts]
         vector = starts[int(np.argmax(inliers))]
-    found = refine(state, recent, Motion(centre, vector), stretches, (np.zeros(3), prior), settings)
+    found = registration.refine(Motion(centre, vector), np.zeros(3), prior)
     agree = agrees(found.matches, list(state.boundaries), settings)
     return found if agree and is_certain(found.matches, found.covariance, settings, lost) else None
 
 
 def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
     """Return whether the newest detections reach the beginning: otherwise only a lost vehicle registers."""
-    recent, state = _recent(track, times), track.state
-    unmoved = Motion(state.poses[-1, :2], np.zeros(3))
-    found = _match(state, state.whole_curves, settings, recent, unmoved, _beginning(state), REACH)
-    return bool(found.hessian.any())
-
-
-def _beginning(state: State) -> dict[int, tuple[float, float]]:
-    return {
-        label: (0.0, min(BEGINNING, BEGINNING_SHARE * boundary.confirmed_end))
-        for label, boundary in state.boundaries.items()
-    }
-
-
-def refine(
-    state: State,
-    seen: Sightings,
-    start: Motion,
-    stretches: Mapping[int, tuple[float, float]],
-    prior: tuple[Array, Array],
-    settings: ClosingSettings,
-) -> RefinedMotion:
-    """Refine a motion by iterated closest points on a stretch (low, high) of each curve, by label.
-
-    The prior of the motion has the mean (3,) and the information (3, 3).
-    """
-    (mean, information), vector, curves = prior, start.vector, state.whole_curves
-    for iteration in range(ITERATIONS):
-        reach = max(settings.inlier_distance, REACH * SHRINK**iteration)
-        motion = Motion(start.centre, vector)
-        matches = _match(state, curves, settings, seen, motion, stretches, reach)
-        negative_gradient = matches.negative_gradient - information @ (vector - mean)
-        vector = vector + np.linalg.solve(matches.hessian + information, negative_gradient)
-    covariance = np.asarray(np.linalg.inv(matches.hessian + information), np.float64)
-    return RefinedMotion(Motion(start.centre, vector), matches, covariance)
+    unmoved = Motion(track.state.poses[-1, :2], np.zeros(3))
+    return bool(_with_beginning(track, times, settings).match(unmoved, REACH).hessian.any())
 
 
 def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
@@ -195,44 +204,18 @@ def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
     return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < REACH**-2)
 
 
-def _recent(track: CurveMap, times: Sequence[float]) -> Sightings:
-    """Return the coloured detections of the newest poses."""
+def _with_beginning(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> Registration:
+    """Return the registration of the coloured detections of the newest poses with the curves' beginning."""
     detections, variables, stamps = track.detections, track.variables, np.asarray(times)
     rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - WINDOW)
     rows = rows[np.isin(detections.label[rows], list(track.state.boundaries))]
-    points, covariances = (
-        detections.points_map(rows, variables),
-        detections.covariances_map(rows, variables),
-    )
-    return Sightings(rows, detections.label[rows], points, covariances, detections.used[rows])
-
-
-def _match(
-    state: State,
-    curves: Curves,
-    settings: ClosingSettings,
-    seen: Sightings,
-    motion: Motion,
-    stretches: Mapping[int, tuple[float, float]],
-    reach: float,
-) -> Matches:
-    """Match moved detections with a stretch of each curve, and linearize those within `reach` (m)."""
-    moved, curve = motion.apply(seen.points), curves.labels.searchsorted(seen.labels)
-    low, high = np.array([stretches[label] for label in curves.labels.tolist()])[curve].T
-    foot = curves.find(state.map_points, moved, curve, low, high)
-    inside, used = foot.interior, foot.interior & (np.abs(foot.distance) < reach)
-    n, arm = foot.normal_unit[used], moved[used] - motion.centre - motion.vector[:2]
-    variance = np.einsum("mi,mij,mj->m", n, seen.covariances[used], n) + settings.sigma_reading**2
-    jacobian = by_motion(n, arm) / np.sqrt(variance)[:, None]
-    return Matches(
-        seen.rows[inside],
-        seen.labels[inside],
-        foot.u[inside],
-        np.abs(foot.distance[inside]) < settings.inlier_distance,
-        seen.explained[inside],
-        jacobian.T @ jacobian,
-        -jacobian.T @ (foot.distance[used] / np.sqrt(variance)),
-    )
+    points, covariances = detections.points_map(rows, variables), detections.covariances_map(rows, variables)
+    recent = Sightings(rows, detections.label[rows], points, covariances, detections.used[rows])
+    stretches = {
+        label: (0.0, min(BEGINNING, BEGINNING_SHARE * boundary.confirmed_end))
+        for label, boundary in track.state.boundaries.items()
+    }
+    return Registration(track.state, recent, stretches, settings)
 
 
 def by_motion(normals: Array, arms: Array) -> Array:

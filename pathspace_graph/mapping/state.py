@@ -130,11 +130,6 @@ class State:
         """Return a view of the poses (P, 3), the oldest first."""
         return self.variables.poses
 
-    @property
-    def calibration(self) -> Array:
-        """Return a view of the calibration: (scale error [-], yaw-rate bias [rad/s])."""
-        return self.variables.calibration
-
     # --- the curves --------------------------------------------------------------------------------------
 
     @property

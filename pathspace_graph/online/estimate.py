@@ -12,6 +12,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors import gtsam_factors
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.graph.gaussian import factors_of
+from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import odometry_factor
 from pathspace_graph.graph.variables import POINT, POSE, control_keys, name, pose_key, pose_keys
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
@@ -22,7 +23,6 @@ from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.motion import vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.revisit import Revisit
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones
 from pathspace_graph.run import Readings

@@ -19,7 +19,7 @@ from pathspace_graph.health import GOOD
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.loop.closing import apply_correspondences, optimize_loop, simplify
+from pathspace_graph.loop.closing import SIGMA_STEP, apply_correspondences, simplify
 from pathspace_graph.loop.track_loop import LoopRefusedError, TrackLoop
 from pathspace_graph.mapping.motion import known_noise, predict
 from pathspace_graph.mapping.path import DrivenPath
@@ -235,7 +235,7 @@ class FixedLagMapper(MapperEstimate):
     def _predict(self, reading: Reading) -> None:
         """Add the pose of the cycle by the calibrated odometry, and extend the driven path."""
         motion, t = reading.motion, reading.detections.t
-        predict(self.smoother, self.path, motion, t, self.settings)
+        predict(self.smoother, self.path, motion, t)
         cycle, twist = self.smoother.next_cycle - 1, motion.odometry.twist
         orange = Sighting(cycle, self.poses[-1].copy(), twist, reading.orange)
         self.orange.add(orange, self.smoother.variables.sensor)
@@ -277,8 +277,8 @@ class FixedLagMapper(MapperEstimate):
         found = register(track, times, covariance, self.path.beginning, settings)
         if found is None or not passes_start(track.state, self.path, found.motion):
             return False
-        apply_correspondences(self.smoother, found)
-        self.loop.record.bent(optimize_loop(self.smoother), self.smoother)
+        apply_correspondences(smoother, found)
+        self.loop.record.bent(smoother.solve_loop(settings.iterations, SIGMA_STEP), smoother)
         return True
 
     def _simplify(self) -> None:

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
 from pathspace_graph.mapping import path
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -65,7 +66,7 @@ class Growth:
         found = self._candidates(label, path_ahead, None)
         if len(found.points) < 2:
             return
-        u = np.append(0.0, np.cumsum(_distances(found.points)))
+        u = path_lengths(found.points)
         boundary = open_boundary(self._map.settings.spline, self._map.settings.gauge)
         self._state.add_boundary(label, boundary, boundary.grow(np.zeros((0, 2)), u, found.points))
         self._consume(label, found, u)
@@ -114,7 +115,7 @@ class Growth:
     def _extend_through(self, label: int, end: Array, points: Array) -> Array:
         """Extend a curve from its end (2,) through points (k, 2); return their parameters (k,)."""
         boundary, known = self._state.boundaries[label], self._state.control_points(label)
-        u = boundary.confirmed_end + np.cumsum(_distances(np.concatenate([end[None], points])))
+        u = boundary.confirmed_end + path_lengths(np.concatenate([end[None], points]))[1:]
         control_points = boundary.grow(known.copy(), u, points)
         known[:] = control_points[: len(known)]
         if len(control_points) > len(known):
@@ -280,8 +281,3 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
 def newest(path_ahead: PathAhead, station: float = np.inf) -> PathAhead:
     """Return the path without earlier rounds: from `RECALL` before the vehicle, or before a station (m)."""
     return path_ahead.since(min(station, path_ahead.driven) - RECALL)
-
-
-def _distances(points: Array) -> Array:
-    """Return the distances (k - 1,) between neighbouring points (k, 2), in m."""
-    return np.asarray(np.hypot(*np.diff(points, axis=0).T))

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -66,8 +67,7 @@ class Row:
     @property
     def lengths(self) -> Array:
         """Return the lengths (c,) in m along the row from the known end to the tracks that continue it."""
-        new = self.line[-len(self.chosen) - 1 :]
-        return np.asarray(np.cumsum(np.hypot(*np.diff(new, axis=0).T)))
+        return path_lengths(self.line[-len(self.chosen) - 1 :])[1:]
 
     def choose(self, index: int) -> None:
         """Continue the row through a candidate."""
@@ -118,7 +118,7 @@ def _next(row: Row, other: Row, driven: Array, threshold: float) -> int | None:
 
 def _has_width(row: Row, other: Row, points: Array) -> BoolArray:
     """Return whether points (k, 2) are about as far from the other row as the end of their own row."""
-    stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(other.line, axis=0).T)))
+    stations = path_lengths(other.line)
     station, width = along_and_across(np.concatenate([row.end[None], points]), other.line, stations)
     width, beyond = row.side * width, station[1:] > stations[-1]
     widest = WIDTH_RATIO * abs(width[0]) + WIDTH_SLACK

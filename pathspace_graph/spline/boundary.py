@@ -11,7 +11,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_joint_foot_points
 from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
-from pathspace_graph.factors.se2 import move_points
+from pathspace_graph.factors.se2 import move_points, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
@@ -290,8 +290,7 @@ def at_level_crossing(points: Array, path: Array) -> BoolArray:
     """Return whether each point (m, 2) is at a place where a driven path (n, 2) crosses itself."""
     if len(points) == 0 or len(path) < 2:
         return np.zeros(len(points), bool)
-    station = np.append(0.0, np.hypot(*np.diff(path, axis=0).T).cumsum())
-    _, kept = np.unique(station // PATH_STEP, return_index=True)
+    _, kept = np.unique(path_lengths(path) // PATH_STEP, return_index=True)
     places = KDTree(crossings(path[kept], path[kept], LEVEL_SINE))
     return np.asarray(places.query(points)[0] < LEVEL_CROSSING)
 

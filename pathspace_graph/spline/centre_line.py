@@ -14,7 +14,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
-from pathspace_graph.factors.se2 import left_of
+from pathspace_graph.factors.se2 import left_of, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline, segments_cross
 
@@ -197,7 +197,7 @@ def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPAC
     for u, k, (low, high) in zip(samples, (i, j), (left.domain, right.domain), strict=True):
         paired.append(u[k % len(u)] + (high - low) * (k // len(u)))  # indices go on past the end of a loop
     values = np.column_stack([0.5 * (a + b), 0.5 * np.hypot(*(a - b).T)])
-    lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(values[:, :2], axis=0).T)))
+    lengths = path_lengths(values)
     blank = Ribbon.even(0.0, lengths[-1], max(round(lengths[-1] / spacing), _FEWEST), closed)
     count = max(int(np.ceil(lengths[-1] / SAMPLE_STEP)), RIBBON * (len(blank.breaks) - 1))
     u = np.linspace(0.0, lengths[-1], count + 1)[: count if closed else None]

@@ -11,6 +11,7 @@ from scipy.linalg.blas import dger
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import foot_points
+from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.spline.bspline import BSpline
 
 DEGREE: Final = 3  # of a curve, where none is given
@@ -238,7 +239,7 @@ def chosen_breaks(points: Array, periodic: bool, degree: int, least: int, most: 
     The largest is chosen, unless a smaller one predicts a point left out better by `MARGIN`. BIC takes a knot
     for every cone, since rss vanishes; knots by curvature leave 0.107 m to cones where these leave 0.066 m.
     """
-    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+    along = path_lengths(points)
     high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
     path = list(thin(points, along, high, periodic, degree, least))
     within = [curve for curve in path if curve.size <= most] or path[-1:]

@@ -111,7 +111,7 @@ def test_a_path_that_does_not_recur_is_dead_reckoned() -> None:
     chain = judge_log(log, log.noise, SETTINGS).chain
     state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
     np.testing.assert_array_equal(state.poses, chain.dead_reckoned(np.zeros(2)))
-    np.testing.assert_array_equal(state.calibration, 0.0)
+    np.testing.assert_array_equal(state.variables.calibration, 0.0)
     for label, y in ((LEFT, 2.0), (RIGHT, -2.0)):
         assert not state.boundaries[label].periodic
         np.testing.assert_allclose(state.control_points(label)[:, 1], y, atol=1e-6)

@@ -91,7 +91,7 @@ def test_the_marginal_and_the_window_are_the_whole_problem() -> None:
     state, first = at.state, len(log().cycles) - WINDOW
     unchanged = np.eye(state.map_points.size)
     information, mean = marginal_of(system, at, state, unchanged, first)
-    here = np.concatenate([state.calibration, state.map_points.ravel(), state.poses[first]])
+    here = np.concatenate([state.variables.calibration, state.map_points.ravel(), state.poses[first]])
     keys = np.concatenate([[CALIBRATION_KEY], state.map_keys, pose_keys(np.array([first]))])
     root = np.linalg.cholesky(information).T
     window = [later(rows, first) for rows in system.rows(at) if len(rows) and not is_slide(rows)]

@@ -27,7 +27,7 @@ from pathspace_graph.io.map import SplineBoundary, read_map
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.settings.batch import Start
+from pathspace_graph.settings.mapper import Start
 
 from ..scenes.drives import ahead, bean_track, corridor, exact_log, lap_log, noisy, true_poses
 

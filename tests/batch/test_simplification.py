@@ -40,7 +40,7 @@ def test_the_poses_stay_and_the_curves_have_fewer_control_points_on_the_same_lin
     state, detections, settings = dense_scene()
     few, _ = simplified(state, detections, settings)
     np.testing.assert_array_equal(few.poses, state.poses)
-    np.testing.assert_array_equal(few.calibration, state.calibration)
+    np.testing.assert_array_equal(few.variables.calibration, state.variables.calibration)
     for label, boundary in few.boundaries.items():
         assert boundary.size < state.boundaries[label].size
         u = np.linspace(boundary.tables.low, boundary.tables.high, 50)

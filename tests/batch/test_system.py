@@ -140,7 +140,7 @@ def test_a_step_of_the_poses_leaves_the_rest() -> None:
     after = moved(state, step)
     np.testing.assert_array_equal(after.poses, state.poses + 1.0)
     np.testing.assert_array_equal(after.map_points, state.map_points)
-    np.testing.assert_array_equal(after.calibration, state.calibration)
+    np.testing.assert_array_equal(after.variables.calibration, state.variables.calibration)
 
 
 def test_the_weight_is_the_slope_of_the_loss() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from pathspace_graph.front_end.log_odometry import half_square, sensor_prior
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, control_keys, pose_keys
-from pathspace_graph.settings.calibration import CalibrationSettings
+from pathspace_graph.settings.online import CalibrationSettings
 
 KNOWN, ESTIMATED = CalibrationSettings(sensor=False), CalibrationSettings()
 

@@ -15,8 +15,8 @@ from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.log import Log
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online, split_odometry
-from pathspace_graph.settings.calibration import CalibrationSettings, OdometrySettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 
 from ..scenes.drives import detections, short_drive
 

@@ -142,7 +142,7 @@ def test_older_detections_are_tested_again_only_where_a_curve_has_grown() -> Non
     table.release(released)
     odometry, cycle = next_cycle(mapper, at([]), [])
     motion = MeasuredMotion(integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA), odometry.twist)
-    predict(smoother, mapper.path, motion, cycle.t, mapper.settings)
+    predict(smoother, mapper.path, motion, cycle.t)
     smoother.associate(frozenset())
     assert not table.used[released].any()
     for label in (LEFT, RIGHT):  # the newest pose's parameter was appended; it is found anew

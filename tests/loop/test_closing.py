@@ -15,13 +15,11 @@ from pathspace_graph.graph.variables import Layout, control_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
-from pathspace_graph.loop.closing import substitute
+from pathspace_graph.loop.closing import PeriodicCurve, make_periodic, substitute
 from pathspace_graph.mapping.registration import RefinedMotion, near_start, register
-from pathspace_graph.mapping.seam import PeriodicCurve, make_periodic
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.batch import Knots
-from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
+from pathspace_graph.settings.mapper import Knots, MapperSettings, SplineSettings
 from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 

@@ -18,12 +18,10 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.drive_record import DriveRecord, bend
-from pathspace_graph.loop.recognition import RecognizedPlace
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry, known_noise
-from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.calibration import OdometrySettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import OdometrySettings
 
 from ..scenes.maps import boundary_through
 
@@ -67,8 +65,7 @@ def test_the_drive_recurs_since_it_was_beside_the_place(back: float) -> None:
     """The place is `back` laps behind; the path length and the turn since then are those of the odometry."""
     drift, before = 0.004, 2.0 * np.pi * (1.5 - back)
     record = driven(1.5, drift)
-    beside = {LEFT: before * (RADIUS - 2.0), RIGHT: before * (RADIUS + 2.0)}
-    found = record.recurrence_since(RecognizedPlace(Motion(np.zeros(2), np.zeros(3)), beside))
+    found = record.recurrence_since(LEFT, before * (RADIUS - 2.0))
     assert found.lap == pytest.approx(back * LAP, abs=2.5 * SPEED * CYCLE)
     assert found.turn == pytest.approx(found.lap * (1.0 / RADIUS + drift), abs=1e-2)
     assert found.driven[-1] == pytest.approx(1.5 * LAP, abs=4.0)
@@ -92,9 +89,8 @@ def test_a_record_that_was_given_up_keeps_the_first_reason() -> None:
 
 def test_the_chain_of_the_lap_is_the_odometry_that_was_measured() -> None:
     record = driven(0.5, 0.0)
-    place = RecognizedPlace(Motion(np.zeros(2), np.zeros(3)), {LEFT: 0.0})
     settings = MapperSettings(odometry=OdometrySettings(sigma_scale=0.1, sigma_bias=0.2))
-    chain = record.lap(3, record.recurrence_since(place), settings).chain
+    chain = record.lap(3, record.recurrence_since(LEFT, 0.0), settings).chain
     np.testing.assert_array_equal(chain.calibration_sigma, [0.1, 0.2])
     poses = chain.dead_reckoned(np.zeros(2))
     angle = len(poses) * SPEED * CYCLE / RADIUS

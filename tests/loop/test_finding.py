@@ -148,7 +148,7 @@ def test_a_wrong_colour_says_nothing_about_the_vehicle() -> None:
 def test_the_middle_of_the_loop_lies_between_the_curves() -> None:
     _, mapper, _ = clean()
     state = mapper.smoother.map.state
-    loop = lay_out_loop(state)
+    loop = lay_out_loop(mapper.smoother.map)
     for label, u in loop.beside.items():
         points = state.boundaries[label].evaluate(mapper.control_points(label), u)
         across = np.hypot(*(points - loop.middle).T)

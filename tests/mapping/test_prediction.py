@@ -22,8 +22,8 @@ from pathspace_graph.mapping.motion import (
 )
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.calibration import OdometrySettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import OdometrySettings
 
 from ..scenes.drives import DT, ODOMETRY_SIGMA, ahead, exact_log, true_poses
 
@@ -50,7 +50,7 @@ def test_every_cycle_adds_its_pose_and_extends_the_path(log: Log) -> None:
     smoother, path = FixedLagSmoother(smoother_settings(settings), CurveMap(settings)), DrivenPath()
     for odometry, cycle in split_odometry(log):
         motion = MeasuredMotion(integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA), odometry.twist)
-        predict(smoother, path, motion, cycle.t, settings)
+        predict(smoother, path, motion, cycle.t)
     np.testing.assert_allclose(smoother.variables.poses, true_poses(log), atol=1e-9)
     assert smoother.times == [cycle.t for cycle in log.cycles]
     driven = np.hypot(*np.diff(true_poses(log)[:, :2], axis=0).T).sum()

@@ -18,8 +18,8 @@ from pathspace_graph.mapping.registration import (
     Matches,
     Motion,
     RefinedMotion,
+    Registration,
     Sightings,
-    _match,
     agrees,
     is_certain,
     is_within_reach,
@@ -304,7 +304,7 @@ def _match_at(scene: Window, seen: Sightings) -> Array:
     """Returns the information about a motion from sightings where they are."""
     stretches = dict.fromkeys(SIDES, (0.0, 60.0))
     state, unmoved = scene.track.state, motion(0.0, 0.0, 0.0)
-    found = _match(state, state.whole_curves, ClosingSettings(), seen, unmoved, stretches, 1.0)
+    found = Registration(state, seen, stretches, ClosingSettings()).match(unmoved, 1.0)
     return found.hessian
 
 

@@ -20,8 +20,8 @@ from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import CalibrationSettings
 from pathspace_graph.sim.vehicle import integrate
 from pathspace_graph.spline.knots import fit_spline
 

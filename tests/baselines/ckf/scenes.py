@@ -9,8 +9,7 @@ from pathspace_graph.baselines.ckf_curves import CurveState
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import HEAD, Belief
-from pathspace_graph.settings.batch import CkfSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.knots import fit_spline
 
 Array = NDArray[np.float64]

@@ -14,8 +14,7 @@ from pathspace_graph.baselines.filters import REACH
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.path import CARRIED_TO, DrivenPath, PathAhead
-from pathspace_graph.settings.batch import CkfSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 
 from .scenes import detections_of, straight_rows
 

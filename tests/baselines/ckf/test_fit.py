@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.baselines.ckf_update import fit_detections, regularization, ridge_gain
-from pathspace_graph.settings.batch import CkfSettings
+from pathspace_graph.settings.mapper import CkfSettings
 from pathspace_graph.spline.bspline import BSpline
 
 Array = NDArray[np.float64]

@@ -16,8 +16,8 @@ from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.motion import smoother_settings
-from pathspace_graph.settings.calibration import CalibrationSettings
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
+from pathspace_graph.settings.online import CalibrationSettings
 
 from ...scenes.drives import ODOMETRY_SIGMA, beginning, see
 

@@ -24,7 +24,7 @@ from pathspace_graph.baselines.landmark_map import AMBIGUOUS, UNASSOCIATED
 from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.settings.batch import LandmarkSettings
+from pathspace_graph.settings.mapper import LandmarkSettings
 from pathspace_graph.settings.online import GrowthSettings
 
 from ...scenes.drives import detections

@@ -19,8 +19,7 @@ from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.settings.batch import LandmarkSettings
-from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
+from pathspace_graph.settings.mapper import LandmarkSettings, MapperSettings, RelinearizeSettings
 
 from .scenes import QUADRATIC, driven, oracle_system
 

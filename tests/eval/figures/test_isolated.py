@@ -23,7 +23,7 @@ from pathspace_graph.eval.figures.isolated import (
 )
 from pathspace_graph.io.manifest import MANIFEST_FILE
 from pathspace_graph.mapping.belief import cubature_points, square_root
-from pathspace_graph.settings.batch import CkfSettings
+from pathspace_graph.settings.mapper import CkfSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 

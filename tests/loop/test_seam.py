@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.mapping.seam import Overlap, find_overlap, make_periodic
-from pathspace_graph.settings.batch import Knots
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.loop.closing import Overlap, find_overlap, make_periodic
+from pathspace_graph.settings.mapper import Knots, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 from ..scenes.maps import boundary_through

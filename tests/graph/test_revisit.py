@@ -8,8 +8,8 @@ import pytest
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, relative
 from pathspace_graph.graph.gaussian import graph_of, normal_equations
+from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.variables import Layout, Variables, pose_keys
-from pathspace_graph.mapping.revisit import Revisit
 
 from ..scenes.jacobians import numeric_jacobian
 
