@@ -108,7 +108,7 @@ class Plan:
 def make_plan(study: Study) -> Plan:
     """Read and generate the tracks, and return the cells, grouped by the log that they share."""
     tracks, points = tuple(load_tracks(study.tracks)), study.points
-    measured = {"marginals": True, "yardsticks": study.yardsticks}
+    measured = {"marginals": True, "yardsticks": study.yardsticks, "whole": False}
     drives = product(study.noise, tracks, study.seeds)
     cells = tuple(
         Cell(drive, estimator, settings, variant, measured)
