@@ -123,7 +123,6 @@ def run_study(study: Study, out: Path | str | None = None, **how: Any) -> pd.Dat
 
     Finished cells are kept in the folder `out`, if there is one. `how` is that of `run_plan`.
     """
-    check_jobs(how.get("jobs", 1))
     with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
         return run_plan(make_plan(study), Path(folder), **how)
 

@@ -47,7 +47,7 @@ def uncertainty(rng: np.random.Generator, samples: int = 2000) -> Uncertainty:
     boundary, u = SplineBoundary(spline, covariance), np.linspace(*spline.domain, 301)
     drawn = rng.multivariate_normal(spline.control_points.ravel(), covariance, samples)
     curves = np.einsum("nm,smd->snd", spline.basis_matrix(u), drawn.reshape(samples, -1, 2))
-    across = np.einsum("snd,nd->sn", curves - spline.evaluate(u), style.normals(spline, u))
+    across = np.einsum("snd,nd->sn", curves - spline.evaluate(u), spline.normal_unit(u))
     without_cross_terms = covariance * np.kron(np.eye(spline.size), np.ones((2, 2)))
     return Uncertainty(
         boundary,
@@ -69,8 +69,8 @@ def posterior(
     R maps control points to the displacement across the curve at the parameters `seen` (k,), and D to second
     differences. The sigmas are in m.
     """
-    normals = style.normals(spline, seen)
-    rows = (spline.basis_matrix(seen)[:, :, None] * normals[:, None, :]).reshape(len(seen), -1)
+    across = spline.basis_matrix(seen)[:, :, None] * spline.normal_unit(seen)[:, None, :]
+    rows = across.reshape(len(seen), -1)
     bend = np.kron(smoothness_matrix(greville(spline.knots, spline.degree), None), np.eye(2))
     information = rows.T @ rows / sigma_detection**2 + bend.T @ bend / sigma_bend**2
     return np.asarray(np.linalg.inv(information + np.eye(len(information)) / sigma_anchor**2))

@@ -168,7 +168,7 @@ def fit() -> Fit:
     curve = BSpline.open_uniform(points, interval=3.5).clamp()
     beside = curve.parameters_at(np.array([0.36, 0.47, 0.58, 0.68]) * curve.length())
     offsets = np.array([[0.5], [1.2], [1.3], [0.6]])
-    detections = curve.evaluate(beside) + offsets * style.normals(curve, beside)
+    detections = curve.evaluate(beside) + offsets * curve.normal_unit(beside)
     along = unit(detections - np.array([2.0, 5.5]))
     covariances = np.zeros((len(along), 2, 2))
     for sigma, axis in ((0.45, along), (0.15, left_normals(along))):

@@ -22,7 +22,6 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import atomic_file, is_stream, replacing
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
-from pathspace_graph.sim.curves import left_normals
 from pathspace_graph.spline.bspline import BSpline
 
 WIDTH: Final = 7.0  # width of a figure (in): two columns of a paper
@@ -138,18 +137,13 @@ def curve_parameters(spline: BSpline, samples_per_span: int = 24) -> Array:
     return np.append(inner.ravel(), breaks[-1])
 
 
-def normals(spline: BSpline, u: Array) -> Array:
-    """Return the unit normals (k, 2) at parameters u (k,), to the left of the direction of travel."""
-    return left_normals(spline.tangent_unit(u))
-
-
 def uncertainty_band(
     boundary: SplineBoundary, u: Array, scale: float = 1.0, widest: float = np.inf
 ) -> tuple[Array, Array]:
     """Return the left and right edge (k, 2), S(u) +- 2 scale sigma(u) n(u), at most `widest` m off."""
     spline = boundary.spline
     half = np.minimum(SIGMAS * scale * spline.normal_sigma(u, boundary.covariance), widest)
-    offsets = half[:, None] * normals(spline, u)
+    offsets = half[:, None] * spline.normal_unit(u)
     centre = spline.evaluate(u)
     return centre + offsets, centre - offsets
 

@@ -108,7 +108,7 @@ def measure(
         values |= {f"{name}_by_prior": value for name, value in by_prior(run.vehicle, run.settings).items()}
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
-    if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):
+    if isinstance(run, BatchResult) and has_cones(log.truth):
         joint = joint_cone_error(run, log.truth)
         values |= {"normalized_error_joint": joint.ratio, "normalized_error_joint_inside": joint.honest}
     if yardsticks:
@@ -142,7 +142,7 @@ def _map_values(
     """Return the metrics of a map as it stands; without true cones only those that need none."""
     values: dict[str, float] = {"size": track.size, "closed": bool(track.closed)}
     values |= {"bytes": map_bytes(track), "bytes_covariance": covariance_bytes(track)}
-    if truth is None or not has_cones(truth):
+    if not has_cones(truth):
         return values
     values |= accuracy.cone_errors(track, truth) | accuracy.curve_distance(track, truth)
     values |= accuracy.ghosts(track, truth, ghost_settings)

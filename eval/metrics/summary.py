@@ -4,7 +4,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 import numpy as np
 
@@ -130,7 +130,7 @@ def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
     Without a true path the laps are the estimated ones; without true cones there is no row. The snapshots of
     `result` are those at `lap_times`. A batch has one row.
     """
-    if log.truth is None or not has_cones(log.truth):
+    if not has_cones(log.truth):
         return []
     if isinstance(result, BatchRun):
         return [_metrics(result.map, log.truth, result.laps, result.scale)]
@@ -156,8 +156,9 @@ def not_mapped(track: Map, log: Log) -> list[str]:
     return lines
 
 
-def has_cones(truth: Truth) -> bool:
-    return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
+def has_cones(truth: Truth | None) -> TypeGuard[Truth]:
+    """Return whether there is a truth that holds cones of a boundary."""
+    return truth is not None and bool(np.isin(truth.cone_labels, BOUNDARIES).any())
 
 
 def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:

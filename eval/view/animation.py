@@ -268,7 +268,7 @@ def _moments(cycle: ObservedCycle, seconds: Sequence[float]) -> dict[str, str]:
 
 
 def _against_truth(track: Map, truth: Truth | None) -> dict[str, str]:
-    if truth is None or not has_cones(truth):
+    if not has_cones(truth):
         return {}
     metrics = lap_metrics(track, truth, 0)
     rmse = "" if np.isnan(metrics.rmse) else f"{metrics.rmse:.2f} m"
