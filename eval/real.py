@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Final
 
@@ -87,10 +88,8 @@ def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Ar
     start = [_cones(first, label, noise, np.zeros(3)) for label in BOUNDARIES]
     end = [_cones(last, label, noise, poses[-1]) for label in BOUNDARIES]
     tries = [
-        _registered(start, end, compose(poses[-1], np.array([ahead, left, turn])))
-        for ahead in (-4.0, -2.0, 0.0, 2.0, 4.0)
-        for left in (-2.0, 0.0, 2.0)
-        for turn in (-0.1, 0.0, 0.1)
+        _registered(start, end, compose(poses[-1], np.array(offset)))
+        for offset in product((-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-0.1, 0.0, 0.1))
     ]
     count, _, pose = max(tries, key=lambda one: one[:2])
     return pose if count >= LEAST else None
@@ -170,12 +169,11 @@ def runs_table(drives: Sequence[RealDrive]) -> View:
 def maps_table(drives: Sequence[RealDrive]) -> View:
     """Return the distance between the maps of each two drives around the same cones: under a metre."""
     rows = []
-    for k, first in enumerate(drives):
-        for second in drives[k + 1 :]:
-            both = zip(first.runs.values(), second.runs.values(), strict=True)
-            apart = [aligned_distance(one.map, other.map) for one, other in both]
-            if min(apart) < 1.0:
-                rows.append((f"{first.name}, {second.name}", Figure.row(apart, 2)))
+    for first, second in combinations(drives, 2):
+        both = zip(first.runs.values(), second.runs.values(), strict=True)
+        apart = [aligned_distance(one.map, other.map) for one, other in both]
+        if min(apart) < 1.0:
+            rows.append((f"{first.name}, {second.name}", Figure.row(apart, 2)))
     return ("maps", *(f"{name} [m]" for name in RUNS)), tuple(rows)
 
 

@@ -118,12 +118,12 @@ def _entries(panels: Iterable[Axes]) -> dict[str, Any]:
     return entries
 
 
-def fit_height(figure: Figure, margin: float = 0.05) -> None:
-    """Make a figure as high as what is drawn on it, plus a margin (in) on both sides."""
+def fit_height(figure: Figure) -> None:
+    """Make a figure as high as what is drawn on it, plus a margin of 0.05 in on both sides."""
     for _ in range(2):  # the layout moves a little when the height changes
         figure.draw_without_rendering()
         width, _ = figure.get_size_inches()
-        figure.set_size_inches(width, figure.get_tightbbox().height + 2.0 * margin)
+        figure.set_size_inches(width, figure.get_tightbbox().height + 0.1)
 
 
 # --- marks -----------------------------------------------------------------------------------------------
@@ -208,13 +208,13 @@ def draw_band(
     axes.add_patch(PathPatch(outline, facecolor=color, label=label, **look))
 
 
-def ellipse_outlines(points: Array, joint: Array, corners: int = 16) -> Array:
-    """Return the 2-sigma ellipse of each point (m, 2) as a closed line (m, corners + 1, 2).
+def ellipse_outlines(points: Array, joint: Array) -> Array:
+    """Return the 2-sigma ellipse of each point (m, 2) as a closed line (m, 17, 2).
 
     The joint covariance (2m, 2m) is over x0, y0, x1, y1 and so on.
     """
     variances, vectors = np.linalg.eigh(point_blocks(joint))
-    angles = np.linspace(0.0, 2.0 * np.pi, corners + 1)
+    angles = np.linspace(0.0, 2.0 * np.pi, 17)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     axes = vectors * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
     return np.asarray(points[:, None] + SIGMAS * np.einsum("cj,mij->mci", circle, axes))
