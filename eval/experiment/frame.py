@@ -51,15 +51,10 @@ def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
     """
     batches = {tuple(row[name] for name in names): row for row in rows if row["estimator"] == DEFAULT_BATCH}
     for row in rows:
-        batch = batches.get(tuple(row[name] for name in names))
-        if (
-            batch is None
-            or row["estimator"] == DEFAULT_BATCH
-            or not {"turn", "rmse"} <= set(row) & set(batch)
-        ):
-            continue
-        row["turn_from_batch"] = float(row["turn"] - batch["turn"])
-        row["rmse_by_batch"] = float(row["rmse"] / batch["rmse"])
+        batch = batches.get(tuple(row[name] for name in names), {})
+        if row["estimator"] != DEFAULT_BATCH and {"turn", "rmse"} <= set(row) & set(batch):
+            row["turn_from_batch"] = float(row["turn"] - batch["turn"])
+            row["rmse_by_batch"] = float(row["rmse"] / batch["rmse"])
 
 
 def _settings_row(study: Study, cell: Cell[Drive]) -> dict[str, Any]:
