@@ -153,15 +153,16 @@ def driving_order(truth: Truth, label: int) -> Array:
     return min(cones, by_path, key=lambda of: np.linalg.norm(of - np.roll(of, 1, axis=0), axis=1).sum())
 
 
-@lru_cache(maxsize=4)  # several metrics ask for the same ones
 def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
     """Return points (k, 2) in m on a curve, equal lengths of at most `step` apart, or the landmarks.
 
-    The array is cached and must not be written to.
+    The array may be shared and must not be written to.
     """
-    if not isinstance(boundary, SplineBoundary):
-        return boundary.points
-    spline = boundary.spline
+    return _along(boundary.spline, step) if isinstance(boundary, SplineBoundary) else boundary.points
+
+
+@lru_cache(maxsize=4)  # several metrics ask for the same points
+def _along(spline: BSpline, step: float) -> Array:
     length = spline.length()
     count = max(int(np.ceil(length / step - 1e-9)), 1)  # round-off makes no further one
     return spline.evaluate(spline.parameters_at((np.arange(count) + 0.5) * length / count))
