@@ -22,10 +22,11 @@ from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import PathspaceError, SolveError, check_name
 from pathspace_graph.estimators import DEFAULT, make_online
 from pathspace_graph.eval.experiment.cells import load_tracks
+from pathspace_graph.eval.experiment.frame import write_csv
 from pathspace_graph.eval.experiment.run import OnCell, WorkerDiedError, run_cells
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
-from pathspace_graph.io.files import atomic_folder, check_target
+from pathspace_graph.io.files import atomic_folder, check_target, write_text
 from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.io.overrides import Overrides, override
 from pathspace_graph.labels import LEFT
@@ -216,8 +217,8 @@ class HintStudy:
             frame = self.measure(advance)
         table = summary(frame)
         with atomic_folder(self.out, MARKER) as folder:
-            frame.to_csv(folder / MARKER, index=False, lineterminator="\n")
-            (folder / "hints.md").write_text(table.markdown(), encoding="utf-8")
+            write_csv(folder / MARKER, frame)
+            write_text(folder / "hints.md", table.markdown())
         return table
 
 

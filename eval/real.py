@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Final
 
@@ -87,10 +88,8 @@ def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Ar
     start = [_cones(first, label, noise, np.zeros(3)) for label in BOUNDARIES]
     end = [_cones(last, label, noise, poses[-1]) for label in BOUNDARIES]
     tries = [
-        _registered(start, end, compose(poses[-1], np.array([ahead, left, turn])))
-        for ahead in (-4.0, -2.0, 0.0, 2.0, 4.0)
-        for left in (-2.0, 0.0, 2.0)
-        for turn in (-0.1, 0.0, 0.1)
+        _registered(start, end, compose(poses[-1], np.array(offset)))
+        for offset in product((-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-0.1, 0.0, 0.1))
     ]
     count, _, pose = max(tries, key=lambda one: one[:2])
     return pose if count >= LEAST else None
@@ -140,9 +139,9 @@ def ends_table(drives: Sequence[RealDrive]) -> View:
     rows = []
     for drive in drives:
         poses = [*(run.trajectory[-1] for run in drive.runs.values()), drive.dead_reckoned]
-        rows.append((drive.name, tuple(Figure.known(drive.off(pose)[0], 2) for pose in poses)))
+        rows.append((drive.name, Figure.row((drive.off(pose)[0] for pose in poses), 2)))
     closed = [sum(drive.runs[name].map.closed for drive in drives) for name in RUNS]
-    counts = (*(Figure.known(float(count), 0) for count in closed), Figure(None))
+    counts = (*Figure.row(closed, 0), Figure(None))
     header = ("last pose off by [m]", *RUNS, "dead reckoning")
     return header, (*rows, (f"loops closed, of {len(drives)}", counts))
 
@@ -163,22 +162,18 @@ def runs_table(drives: Sequence[RealDrive]) -> View:
             ms = np.nan if name == "batch" else 1e3 * float(np.mean([r.seconds for r in run.cycles]))
             values = [100.0 * run.map.closed, *drive.off(run.trajectory[-1]), *reckoned, *crossed]
             values += [*(shares if any(health) else (np.nan, np.nan)), ms]
-            figures = zip(values, (0, 2, 1, 2, 1, 0, 0, 1, 1, 1), strict=True)
-            row = tuple(Figure.known(float(value), digits) for value, digits in figures)
-            rows.append((f"{drive.name}, {name}", row))
+            rows.append((f"{drive.name}, {name}", Figure.row(values, 0, 2, 1, 2, 1, 0, 0, 1, 1, 1)))
     return header, tuple(rows)
 
 
 def maps_table(drives: Sequence[RealDrive]) -> View:
     """Return the distance between the maps of each two drives around the same cones: under a metre."""
     rows = []
-    for k, first in enumerate(drives):
-        for second in drives[k + 1 :]:
-            both = zip(first.runs.values(), second.runs.values(), strict=True)
-            apart = [aligned_distance(one.map, other.map) for one, other in both]
-            if min(apart) < 1.0:
-                figures = tuple(Figure.known(distance, 2) for distance in apart)
-                rows.append((f"{first.name}, {second.name}", figures))
+    for first, second in combinations(drives, 2):
+        both = zip(first.runs.values(), second.runs.values(), strict=True)
+        apart = [aligned_distance(one.map, other.map) for one, other in both]
+        if min(apart) < 1.0:
+            rows.append((f"{first.name}, {second.name}", Figure.row(apart, 2)))
     return ("maps", *(f"{name} [m]" for name in RUNS)), tuple(rows)
 
 
@@ -196,12 +191,11 @@ def measured_table(drives: Sequence[RealDrive]) -> View:
             continue
         rays = (found.along, found.across)
         values = [*found.odometry, *(ray.sigmas(at)[0] for ray in rays), *(100.0 * ray.share for ray in rays)]
-        digits = (4, 4, 4, 2, 2, 0, 0)
-        known = [Figure.known(float(v), n) for v, n in zip(values, digits, strict=True)]
         errors.append(found.sensor[places] * units)
         halves = 1.96 * found.sensor_sigma[places] * units
         pairs = zip(errors[-1].tolist(), halves.tolist(), strict=True)
-        rows.append((drive.name, (*known, *(Figure(round(v, 6), round(h, 6), 1) for v, h in pairs))))
+        found_errors = (Figure(round(v, 6), round(h, 6), 1) for v, h in pairs)
+        rows.append((drive.name, (*Figure.row(values, 4, 4, 4, 2, 2, 0, 0), *found_errors)))
     if len(errors) > 1:
         means = (Figure.of(column, 1) for column in np.transpose(errors))
         rows.append(("all drives", (*[Figure(None)] * 7, *means)))

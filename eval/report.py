@@ -25,7 +25,7 @@ from .benchmark.roads import QUICK, ScalingSettings, make_drives
 from .benchmark.scaling import measure_scaling, scaling_figures
 from .experiment.cells import ESTIMATORS as ESTIMATOR_ROOMS
 from .experiment.cells import code_digest
-from .experiment.faults import kinds, of_middle_strength, only, suite
+from .experiment.faults import at_strength, kinds, only, suite
 from .experiment.run import run_study
 from .experiment.study import Baseline, Study, find_study, read_study
 from .experiment.tables import TextTable
@@ -167,7 +167,7 @@ class Plan:
 
     def faults(self, folder: Path) -> Views:
         """Drive the suite of faults at the middle strengths."""
-        study = of_middle_strength(suite())
+        study = at_strength(suite(), 0.5)
         if self.quick:
             study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
         frame = self._run(study, folder)
@@ -205,9 +205,7 @@ class Plan:
     def scale(self, _: Path) -> Views:
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
         header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
-        rows = (
-            (f"`{name}`", tuple(Figure.known(value, 2) for value, _ in row)) for name, row in found.items()
-        )
+        rows = ((f"`{name}`", Figure.row((value for value, _ in row), 2)) for name, row in found.items())
         return {"results-scaling": (header, tuple(rows))}
 
     def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:

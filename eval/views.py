@@ -1,7 +1,8 @@
 """Views of the measured frames: the figures of each table of the pages."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from math import isfinite, isnan
 from typing import Final, Self
 
@@ -55,7 +56,12 @@ class Figure:
     @classmethod
     def known(cls, value: float, digits: int = 3) -> Self:
         """Return a value without an interval, or none where it is NaN."""
-        return cls(None if isnan(value) else round(value, 6), None, digits)
+        return cls(None if isnan(value) else round(float(value), 6), None, digits)
+
+    @classmethod
+    def row(cls, values: Iterable[float], *digits: int) -> tuple[Self, ...]:
+        """Return known values, each with its own digits, or all with the same."""
+        return tuple(map(cls.known, values, digits if len(digits) > 1 else repeat(*digits)))
 
     @property
     def text(self) -> str:
@@ -75,13 +81,12 @@ def lap_columns(frame: pd.DataFrame, laps: Sequence[int], keys: Sequence[str]) -
     drives = len(online[online["lap"] == online["lap"].min()])
     columns = {f"lap {lap}": online[online["lap"] == lap] for lap in laps}
     columns |= {"batch": last_laps(batch)} if len(batch) else {}
-    return (f"mean over {drives} drives, at the end of", *columns), _by_metric(keys, columns)
+    return _by_metric(f"mean over {drives} drives, at the end of", keys, columns)
 
 
 def compared_table(frame: pd.DataFrame) -> View:
     """Return every estimator at the end of its last lap."""
-    keys = ("rmse", "missed", "size", "ate")
-    return _header("estimator, last lap", keys, TITLES), _by_part(_estimators(frame), keys)
+    return _by_part("estimator, last lap", _estimators(frame), ("rmse", "missed", "size", "ate"))
 
 
 def tracks_table(frame: pd.DataFrame) -> View:
@@ -117,15 +122,13 @@ def laps_table(frame: pd.DataFrame) -> View:
 
 def metrics_table(frame: pd.DataFrame, keys: Sequence[str], names: Sequence[str] = ESTIMATORS) -> View:
     """Return metrics of every estimator at the end of its last lap."""
-    parts = _estimators(frame, names)
-    return ("last lap", *parts), _by_metric(keys, parts)
+    return _by_metric("last lap", keys, _estimators(frame, names))
 
 
 def skidpad_table(frame: pd.DataFrame) -> View:
     """Return every estimator: its trajectory error over the whole drive, and its map at the end."""
     square = (frame["ate"] ** 2).groupby([frame[name] for name in RUN_OF]).transform("mean")
-    keys, parts = ("ate", "rmse", "missed"), _estimators(frame.assign(ate=square**0.5))
-    return _header("estimator", keys, TITLES), _by_part(parts, keys)
+    return _by_part("estimator", _estimators(frame.assign(ate=square**0.5)), ("ate", "rmse", "missed"))
 
 
 def camera_table(frame: pd.DataFrame) -> View:
@@ -135,8 +138,8 @@ def camera_table(frame: pd.DataFrame) -> View:
     stated = {DEFAULT: "stated"}  # since a simulated log states its own noise
     parts = {f"`{estimator}`, {stated.get(noise, noise)}": part for (estimator, noise), part in runs}
     oracle = (_figure("l", last.drop_duplicates([*RUN])), *[Figure(None)] * (len(keys) - 1))  # one a drive
-    rows = (*_by_part(parts, keys), ("landmarks, told all", oracle))
-    return _header("estimator, noise", keys, TITLES_CAMERA), rows
+    header, rows = _by_part("estimator, noise", parts, keys, TITLES_CAMERA)
+    return header, (*rows, ("landmarks, told all", oracle))
 
 
 def study_table(study: Study, frame: pd.DataFrame) -> View:
@@ -171,10 +174,8 @@ def hints_table(rows: pd.DataFrame) -> View:
     spoiled, good = rows[rows["kind"] == "spoiled"], rows[rows["kind"] == "good"]
     groups = {str(name): of["told"] for name, of in spoiled.groupby("name", sort=False)}
     groups |= {"**all mistakes**": spoiled["told"], "**good logs, accused of any**": good["said"]}
-    shares = {name: (float(np.sum(told)), float(len(told))) for name, told in groups.items()}
-    return ("mistake", "told", "logs"), tuple(
-        (name, tuple(Figure.known(count, 0) for count in counts)) for name, counts in shares.items()
-    )
+    rows = tuple((name, Figure.row((told.sum(), len(told)), 0)) for name, told in groups.items())
+    return ("mistake", "told", "logs"), rows
 
 
 def faults_table(study: Study, frame: pd.DataFrame, columns: Mapping[str, tuple[str, int]] = FAULTS) -> View:
@@ -196,16 +197,19 @@ def _estimators(frame: pd.DataFrame, names: Sequence[str] = ESTIMATORS) -> dict[
     return {name: part for name, part in parts.items() if len(part)}
 
 
-def _header(label: str, keys: Sequence[str], titles: Mapping[str, str]) -> tuple[str, ...]:
-    return (label, *(titles.get(key, METRICS[key].heading) for key in keys))
+def _by_part(
+    label: str,
+    parts: Mapping[str, pd.DataFrame],
+    keys: Sequence[str],
+    titles: Mapping[str, str] = TITLES,
+) -> View:
+    rows = tuple((name, tuple(_figure(key, part) for key in keys)) for name, part in parts.items())
+    return (label, *(titles.get(key, METRICS[key].heading) for key in keys)), rows
 
 
-def _by_part(parts: Mapping[str, pd.DataFrame], keys: Sequence[str]) -> Rows:
-    return tuple((name, tuple(_figure(key, part) for key in keys)) for name, part in parts.items())
-
-
-def _by_metric(keys: Sequence[str], parts: Mapping[str, pd.DataFrame]) -> Rows:
-    return tuple((METRICS[key].heading, tuple(_figure(key, part) for part in parts.values())) for key in keys)
+def _by_metric(label: str, keys: Sequence[str], parts: Mapping[str, pd.DataFrame]) -> View:
+    figures = ((key, tuple(_figure(key, part) for part in parts.values())) for key in keys)
+    return (label, *parts), tuple((METRICS[key].heading, row) for key, row in figures)
 
 
 def _figure(key: str, part: pd.DataFrame) -> Figure:

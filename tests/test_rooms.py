@@ -166,7 +166,7 @@ ASSIGNED = {
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "commands.estimate": {"column.justify"},  # of rich
-    "eval.view.animation": {"self.writer.fig"},  # of matplotlib
+    "eval.view.animation": {"writer.fig"},  # of matplotlib
     "front_end.motion": {"self._rest.sigma"},
     "front_end.sides": {"near.judged"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},

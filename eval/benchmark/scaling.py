@@ -26,12 +26,13 @@ from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.estimators import make_online
+from pathspace_graph.eval.experiment.frame import write_csv
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.style import MARKERS, PALETTE, WIDTH
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.files import atomic_folder, write_json
+from pathspace_graph.io.files import atomic_folder, write_json, write_text
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry, timed_update, timed_wait
 from pathspace_graph.settings.mapper import MapperSettings
@@ -285,8 +286,8 @@ def write_scaling(out: Path, scaling: Scaling) -> None:
         "versions": versions(),
     }
     with atomic_folder(out, MARKER) as folder:
-        scaling.points.to_csv(folder / "points.csv", index=False, lineterminator="\n")
-        (folder / "table.md").write_text(scaling_table(scaling).markdown(), encoding="utf-8")
+        write_csv(folder / "points.csv", scaling.points)
+        write_text(folder / "table.md", scaling_table(scaling).markdown())
         write_json(folder / MARKER, content)
         style.save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
 

@@ -223,12 +223,10 @@ def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
     """Run an online estimator, with its reach and its map at the end of each true lap, or a batch one."""
     if name not in registry.ONLINE:
         return registry.make_batch(name, settings, log).solve(log)
-    estimator, times = registry.make_online(name, settings, log), lap_times(log)
-    if log.truth is None or not has_cones(log.truth) or len(log.truth.poses) == 0:
-        return run_online(log, estimator, name=name, snapshot_times=times)
-    observer = ReachObserver(log.truth)
-    result = run_online(log, estimator, name=name, snapshot_times=times, observers=[observer])
-    return replace(result, reach=observer.rows)
+    estimator, truth = registry.make_online(name, settings, log), log.truth
+    observers = [ReachObserver(truth)] if has_cones(truth) and len(truth.poses) else []
+    result = run_online(log, estimator, name=name, snapshot_times=lap_times(log), observers=observers)
+    return replace(result, reach=observers[0].rows) if observers else result
 
 
 def record_cell(cell: Cell[Drive]) -> Record:

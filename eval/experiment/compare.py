@@ -11,14 +11,14 @@ import numpy as np
 import pandas as pd
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.errors import InputError, check_name
 from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
 from pathspace_graph.eval.metrics.measures import online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.eval.metrics.summary import has_cones, summarize, versions
-from pathspace_graph.io.files import atomic_folder, is_temporary, write_json
+from pathspace_graph.io.files import atomic_folder, is_temporary, write_json, write_text
 from pathspace_graph.io.log import LOG_FILE
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
@@ -27,7 +27,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
 from .cells import Cell, NamedLog, Outcome, run_cell
-from .frame import add_batch, difference
+from .frame import add_batch, difference, write_csv
 from .plots import blind_spot_figure, plot_maps
 from .run import OnCell, run_cells
 from .study import known_estimators
@@ -79,7 +79,7 @@ class Comparison:
 
     @property
     def has_truth(self) -> bool:
-        return any(n.log.truth is not None and has_cones(n.log.truth) for n in self.logs)
+        return any(has_cones(named.log.truth) for named in self.logs)
 
     @property
     def paired(self) -> bool:
@@ -121,7 +121,7 @@ def choose(names: Sequence[str]) -> tuple[str, ...]:
     """Return estimators by name, or all that are known if none is named; SettingsError if one is unknown."""
     known = known_estimators()
     for name in names:
-        _check(name, known, "--estimators: expected known ones")
+        check_name(name, known, "--estimators: expected a known estimator")
     return tuple(dict.fromkeys(names or known))
 
 
@@ -129,13 +129,8 @@ def choose_reference(name: str | None, estimators: Sequence[str]) -> str:
     """Return the named one, or the default estimator if it is compared, or else the first."""
     if name is None:
         return registry.DEFAULT if registry.DEFAULT in estimators else estimators[0]
-    _check(name, estimators, "--reference: expected one that is compared")
+    check_name(name, estimators, "--reference: expected an estimator that is compared")
     return name
-
-
-def _check(name: str, known: Sequence[str], expected: str) -> None:
-    if name not in known:
-        raise SettingsError(f"{expected} ({', '.join(known)}), found '{name}'")
 
 
 def compare(
@@ -279,10 +274,10 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
         frames["paired"] = paired_frame(comparison)
     with atomic_folder(out, MARKER) as folder:
         for name, table in tables(comparison).items():
-            (folder / f"{name}.md").write_text(table.markdown(), encoding="utf-8")
-            (folder / f"{name}.tex").write_text(table.latex(), encoding="utf-8")
+            write_text(folder / f"{name}.md", table.markdown())
+            write_text(folder / f"{name}.tex", table.latex())
         for name, frame in frames.items():
-            frame.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
+            write_csv(folder / f"{name}.csv", frame)
         for named in comparison.logs:
             _write_log(folder if len(comparison.logs) == 1 else folder / named.name, named, comparison)
         about = {

@@ -79,14 +79,10 @@ def only(study: Study, wanted: Sequence[str]) -> Study:
     return _with(study, [noise for noise in study.noise if fault_of(noise).kind in keep])
 
 
-def strongest(study: Study) -> Study:
-    """Return the suite with the clean run and each fault at the last of its strengths."""
-    return _with(study, [noises[-1] for noises in by_kind(study)])
-
-
-def of_middle_strength(study: Study) -> Study:
-    """Return the suite with the clean run and each fault at the middle one of its strengths."""
-    return _with(study, [noises[len(noises) // 2] for noises in by_kind(study)])
+def at_strength(study: Study, share: float) -> Study:
+    """Return the suite with one strength of each fault: the middle one at 0.5, the greatest at 1."""
+    groups = ((noises, len(noises)) for noises in by_kind(study))
+    return _with(study, [noises[min(int(share * count), count - 1)] for noises, count in groups])
 
 
 def _with(study: Study, noises: Sequence[str]) -> Study:

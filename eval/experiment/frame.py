@@ -13,7 +13,6 @@ from scipy import stats
 
 from pathspace_graph.estimators import DEFAULT_BATCH
 from pathspace_graph.eval.metrics.metric import METRICS
-from pathspace_graph.eval.metrics.reference import from_batch
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import replacing
@@ -46,12 +45,16 @@ def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -
 
 
 def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
-    """Add how each run compares with the last row of the batch of the same `names`, if it ran."""
+    """Add the turn (rad) of each map from that of the batch with the same `names`, and the rmse by its own.
+
+    The turns are from the truth, since small turns add up. Rows that lack a metric, like the batch, are left.
+    """
     batches = {tuple(row[name] for name in names): row for row in rows if row["estimator"] == DEFAULT_BATCH}
     for row in rows:
-        batch = batches.get(tuple(row[name] for name in names))
-        if batch is not None and row["estimator"] != DEFAULT_BATCH:
-            row.update(from_batch(row, batch))
+        batch = batches.get(tuple(row[name] for name in names), {})
+        if row["estimator"] != DEFAULT_BATCH and {"turn", "rmse"} <= set(row) & set(batch):
+            row["turn_from_batch"] = float(row["turn"] - batch["turn"])
+            row["rmse_by_batch"] = float(row["rmse"] / batch["rmse"])
 
 
 def _settings_row(study: Study, cell: Cell[Drive]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from .cells import Outcome
 
 COLUMNS: Final = (2, 3, 4)  # maps side by side; the first with which the figure fits a page is taken
 MAX_HEIGHT: Final = 10.0  # height of a page (in)
+HALF_SIZE: Final = np.array([17.0, 13.0])  # half width and half height of a blind spot's stretch (m)
 DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)  # distances (m) of a missed cone, as they are tried
 # style of a panel that shows a short stretch of a track
 CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
@@ -33,15 +34,12 @@ class BlindSpot:
     """Stretch of the track, and the true cones in it that maps miss."""
 
     centre: Array  # (2,) centre of the stretch, map frame (m)
-    half_size: tuple[float, float]  # its half width and half height (m)
     distance: float  # distance (m) within which nothing is mapped at a missed cone
     cones: int
     missed: tuple[Array, ...]  # positions (k, 2) of the cones that each map misses in the stretch
 
 
-def find_blind_spot(
-    truth: Truth, spline_map: Map, landmark_map: Map, half_size: tuple[float, float] = (17.0, 13.0)
-) -> BlindSpot | None:
+def find_blind_spot(truth: Truth, spline_map: Map, landmark_map: Map) -> BlindSpot | None:
     """Return the stretch where the landmark map misses the most cones that the spline map doesn't, if any.
 
     They are missed at the largest of `DISTANCES` at which a stretch misses several, else at the largest at
@@ -54,12 +52,12 @@ def find_blind_spot(
         bridged = (distances[0] <= distance) & (distances[1] > distance)
         if bridged.any():
             points, weights = cones[bridged], np.minimum(distances[1][bridged], 10.0)
-            near: Any = KDTree(points / half_size).query_ball_point(points / half_size, 1.0, p=np.inf)
+            near: Any = KDTree(points / HALF_SIZE).query_ball_point(points / HALF_SIZE, 1.0, p=np.inf)
             chosen = points[max(near, key=lambda members: (len(members), weights[members].sum()))]
             centre = 0.5 * (chosen.min(axis=0) + chosen.max(axis=0))
-            inside = (np.abs(cones - centre) <= half_size).all(axis=1)
+            inside = (np.abs(cones - centre) <= HALF_SIZE).all(axis=1)
             missed = tuple(cones[inside & (d > distance)] for d in distances)
-            spot = BlindSpot(centre, half_size, distance, int(inside.sum()), missed)
+            spot = BlindSpot(centre, distance, int(inside.sum()), missed)
             if len(spot.missed[1]) > 1:
                 return spot
             best = best or spot
@@ -98,18 +96,17 @@ def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:
 
 def plot_blind_spot(spot: BlindSpot, maps: Sequence[tuple[str, Map]], truth: Truth) -> Figure:
     """Draw the same area of several maps side by side, with rings around the cones that a map misses."""
-    half_size = np.array(spot.half_size)
     with style.figure_context():
-        figure, panels, columns = _panels(len(maps), half_size)
+        figure, panels, columns = _panels(len(maps), HALF_SIZE)
         for axes, (name, track), missed in zip(panels, maps, spot.missed, strict=False):
             _draw_map(axes, track, truth, CLOSE_UP)
-            if (np.abs(spot.centre) < half_size).all():
+            if (np.abs(spot.centre) < HALF_SIZE).all():
                 map_plot.draw_start(axes, CLOSE_UP)
             ring = {"markersize": 8.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "zorder": 8}
             text = f"missed: nothing within {spot.distance:g} m"
             style.draw_points(axes, missed, "o", RED, text, **ring)
             axes.set_title(f"{name}\n{len(missed)} of {spot.cones} true cones missed here")
-            style.set_frame(axes, spot.centre - half_size, spot.centre + half_size)
+            style.set_frame(axes, spot.centre - HALF_SIZE, spot.centre + HALF_SIZE)
         _finish(figure, panels, len(maps), columns)
     return figure
 

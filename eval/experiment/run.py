@@ -108,7 +108,7 @@ class Plan:
 def make_plan(study: Study) -> Plan:
     """Read and generate the tracks, and return the cells, grouped by the log that they share."""
     tracks, points = tuple(load_tracks(study.tracks)), study.points
-    measured = {"marginals": True, "yardsticks": study.yardsticks}
+    measured = {"marginals": True, "yardsticks": study.yardsticks, "whole": False}
     drives = product(study.noise, tracks, study.seeds)
     cells = tuple(
         Cell(drive, estimator, settings, variant, measured)
@@ -123,7 +123,6 @@ def run_study(study: Study, out: Path | str | None = None, **how: Any) -> pd.Dat
 
     Finished cells are kept in the folder `out`, if there is one. `how` is that of `run_plan`.
     """
-    check_jobs(how.get("jobs", 1))
     with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
         return run_plan(make_plan(study), Path(folder), **how)
 

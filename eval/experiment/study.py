@@ -48,7 +48,6 @@ class Study:
     question: str = ""
     estimators: tuple[str, ...] = (registry.DEFAULT,)
     """Estimators to run, online and batch ones; `all` stands for every one."""
-    # overrides of the simulation by the name of a noise, and of the settings by that of a variant
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
     """Overrides of the simulation by the name of a noise."""
     variants: Mapping[str, Overrides] = field(default_factory=dict)

@@ -22,7 +22,6 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import atomic_file, is_stream, replacing
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
-from pathspace_graph.sim.curves import left_normals
 from pathspace_graph.spline.bspline import BSpline
 
 WIDTH: Final = 7.0  # width of a figure (in): two columns of a paper
@@ -119,12 +118,12 @@ def _entries(panels: Iterable[Axes]) -> dict[str, Any]:
     return entries
 
 
-def fit_height(figure: Figure, margin: float = 0.05) -> None:
-    """Make a figure as high as what is drawn on it, plus a margin (in) on both sides."""
+def fit_height(figure: Figure) -> None:
+    """Make a figure as high as what is drawn on it, plus a margin of 0.05 in on both sides."""
     for _ in range(2):  # the layout moves a little when the height changes
         figure.draw_without_rendering()
         width, _ = figure.get_size_inches()
-        figure.set_size_inches(width, figure.get_tightbbox().height + 2.0 * margin)
+        figure.set_size_inches(width, figure.get_tightbbox().height + 0.1)
 
 
 # --- marks -----------------------------------------------------------------------------------------------
@@ -138,18 +137,13 @@ def curve_parameters(spline: BSpline, samples_per_span: int = 24) -> Array:
     return np.append(inner.ravel(), breaks[-1])
 
 
-def normals(spline: BSpline, u: Array) -> Array:
-    """Return the unit normals (k, 2) at parameters u (k,), to the left of the direction of travel."""
-    return left_normals(spline.tangent_unit(u))
-
-
 def uncertainty_band(
     boundary: SplineBoundary, u: Array, scale: float = 1.0, widest: float = np.inf
 ) -> tuple[Array, Array]:
     """Return the left and right edge (k, 2), S(u) +- 2 scale sigma(u) n(u), at most `widest` m off."""
     spline = boundary.spline
     half = np.minimum(SIGMAS * scale * spline.normal_sigma(u, boundary.covariance), widest)
-    offsets = half[:, None] * normals(spline, u)
+    offsets = half[:, None] * spline.normal_unit(u)
     centre = spline.evaluate(u)
     return centre + offsets, centre - offsets
 
@@ -214,13 +208,13 @@ def draw_band(
     axes.add_patch(PathPatch(outline, facecolor=color, label=label, **look))
 
 
-def ellipse_outlines(points: Array, joint: Array, corners: int = 16) -> Array:
-    """Return the 2-sigma ellipse of each point (m, 2) as a closed line (m, corners + 1, 2).
+def ellipse_outlines(points: Array, joint: Array) -> Array:
+    """Return the 2-sigma ellipse of each point (m, 2) as a closed line (m, 17, 2).
 
     The joint covariance (2m, 2m) is over x0, y0, x1, y1 and so on.
     """
     variances, vectors = np.linalg.eigh(point_blocks(joint))
-    angles = np.linspace(0.0, 2.0 * np.pi, corners + 1)
+    angles = np.linspace(0.0, 2.0 * np.pi, 17)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     axes = vectors * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
     return np.asarray(points[:, None] + SIGMAS * np.einsum("cj,mij->mci", circle, axes))

@@ -9,7 +9,7 @@ import scipy  # which imports its modules when they are used
 from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
@@ -17,7 +17,7 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.settings.checked import Positive
 from pathspace_graph.sim.curves import along_polyline, arc_lengths
-from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.bspline import BSpline, segments_cross
 
 MISSED_DISTANCE: Final = 3.0  # distance from its boundary beyond which a cone is missed (m; Table 1)
 TRUE_STEP: Final = 0.02  # largest step on a true curve (m): 0.1 m is at most 0.5 mm too long
@@ -38,19 +38,26 @@ class LapMetrics:
 
 def lap_metrics(track: Map, truth: Truth, lap: int) -> LapMetrics:
     """Return rmse = sqrt(mean d^2) over true cones with d <= 3 m, and the share of those with d > 3 m."""
+    found = cone_errors(track, truth)
+    return LapMetrics(lap, found["rmse"], found["missed"], track.size)
+
+
+def cone_errors(track: Map, truth: Truth) -> dict[str, float]:
+    """Return the metrics of the distances d of the true cones, NaN without any.
+
+    In `rmse_capped`, sqrt(mean min(d, 3 m)^2), a missed cone counts as 3 m, so that missing it never pays.
+    """
     distances = cone_distances(track, truth)
-    rmse = root_mean_square(distances[distances <= MISSED_DISTANCE])
-    return LapMetrics(lap, rmse, missed_share(distances), track.size)
-
-
-def missed_share(distances: Array, threshold: float = MISSED_DISTANCE) -> float:
-    """Return the share of the distances (K,) with d > threshold (m); NaN without any."""
-    return mean_of(distances > threshold)
-
-
-def capped_rmse(distances: Array, cap: float = MISSED_DISTANCE) -> float:
-    """Return sqrt(mean min(d, cap)^2) in m: a missed cone counts as `cap`, so that missing it never pays."""
-    return root_mean_square(np.minimum(distances, cap))
+    count = len(distances)
+    return {
+        "rmse": root_mean_square(distances[distances <= MISSED_DISTANCE]),
+        "missed": mean_of(distances > MISSED_DISTANCE),
+        "cones": count,
+        "size_share": track.size / count if count else float("nan"),
+        "missed_2m": mean_of(distances > 2.0),
+        "missed_1m": mean_of(distances > 1.0),
+        "rmse_capped": root_mean_square(np.minimum(distances, MISSED_DISTANCE)),
+    }
 
 
 def cone_distances(track: Map, truth: Truth) -> Array:
@@ -96,7 +103,18 @@ def root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-@lru_cache(maxsize=16)  # every map of a log is compared with the same ones
+def cones_of(truth: Truth, label: int) -> Array:
+    """Return the true cones (k, 2) of one boundary, m."""
+    return np.asarray(truth.cones[truth.cone_labels == label])
+
+
+@lru_cache(maxsize=16)  # asked for by every map and every curve of a log, as are the functions below
+def true_lap_ends(truth: Truth) -> IntArray:
+    """Return the index of the true pose (k,) at which each lap ends; cached, and not to be written to."""
+    return lap_end_indices(truth.poses)
+
+
+@lru_cache(maxsize=16)
 def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     """Return points (k, 2) in m, at most `step` apart, on the curve through the true cones of a boundary.
 
@@ -107,7 +125,7 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     cones = driving_order(truth, label)
     if len(cones) < 2:
         return cones
-    closed = len(cones) > _OVERLAP and len(truth.poses) > 0 and len(lap_end_indices(truth.poses)) > 0
+    closed = len(cones) > _OVERLAP and len(true_lap_ends(truth)) > 0
     nodes = np.concatenate([cones[-_OVERLAP:], cones, cones[: _OVERLAP + 1]]) if closed else cones
     nodes = nodes[np.append(True, np.linalg.norm(np.diff(nodes, axis=0), axis=1) > 0.0)]
     length = arc_lengths(nodes)
@@ -116,16 +134,17 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
     return np.asarray(scipy.interpolate.Akima1DInterpolator(length, nodes)(samples), dtype=float)
 
 
+@lru_cache(maxsize=16)
 def driving_order(truth: Truth, label: int) -> Array:
-    """Return the true cones (k, 2) of one boundary in driving order.
+    """Return the true cones (k, 2) of one boundary in driving order; cached like `true_curve`.
 
     Sorted by the nearest point of the true path's first lap, or as in the file where that gives the shorter
     polygon (inside a hairpin several cones share a nearest point) or there is no true path.
     """
-    cones: Array = truth.cones[truth.cone_labels == label]
+    cones = cones_of(truth, label)
     if len(truth.poses) < 2 or len(cones) == 0:
         return cones
-    ends = lap_end_indices(truth.poses)
+    ends = true_lap_ends(truth)
     path = truth.poses[: ends[0] + 1 if len(ends) else None, :2]
     length = arc_lengths(path)
     samples = np.linspace(0.0, length[-1], int(np.ceil(length[-1] / 0.1)) + 1)  # every 0.1 m
@@ -135,10 +154,15 @@ def driving_order(truth: Truth, label: int) -> Array:
 
 
 def mapped_points(boundary: MapBoundary, step: float = MAPPED_STEP) -> Array:
-    """Return points (k, 2) in m on a curve, equal lengths of at most `step` apart, or the landmarks."""
-    if not isinstance(boundary, SplineBoundary):
-        return boundary.points
-    spline = boundary.spline
+    """Return points (k, 2) in m on a curve, equal lengths of at most `step` apart, or the landmarks.
+
+    The array may be shared and must not be written to.
+    """
+    return _along(boundary.spline, step) if isinstance(boundary, SplineBoundary) else boundary.points
+
+
+@lru_cache(maxsize=4)  # several metrics ask for the same points
+def _along(spline: BSpline, step: float) -> Array:
     length = spline.length()
     count = max(int(np.ceil(length / step - 1e-9)), 1)  # round-off makes no further one
     return spline.evaluate(spline.parameters_at((np.arange(count) + 0.5) * length / count))
@@ -188,17 +212,10 @@ def crossings(track: Map) -> tuple[int, int]:
     of = np.concatenate(owner)
     other = own = 0
     for k, (a, b) in enumerate(zip(begin, end, strict=True)):
-        crossed = _apart(a, b, begin[k:], end[k:]) & _apart(begin[k:], end[k:], a, b)
+        crossed = segments_cross(a, b, begin[k:], end[k:])
         other += int((crossed & (of[k:] != of[k])).sum())
         own += int((crossed & (of[k:] == of[k])).sum())
     return other, own
-
-
-def _apart(begin: Array, end: Array, a: Array, b: Array) -> BoolArray:
-    way, first, second = end - begin, a - begin, b - begin
-    sides = way[..., 0] * first[..., 1] - way[..., 1] * first[..., 0]
-    others = way[..., 0] * second[..., 1] - way[..., 1] * second[..., 0]
-    return np.asarray(sides * others < 0.0)
 
 
 def centre_line_errors(track: Map, truth: Truth) -> dict[str, tuple[Array, Array]]:
@@ -272,7 +289,7 @@ def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> d
             metres += float(np.mean(is_ghost)) * boundary.spline.length()
             continue
         landmarks += int(is_ghost.sum())
-        cones = truth.cones[truth.cone_labels == label]
+        cones = cones_of(truth, label)
         if len(cones) and boundary.size:
             distances, nearest = KDTree(cones).query(boundary.points)
             matched = np.asarray(nearest)[np.asarray(distances) <= settings.distance]

@@ -1,6 +1,5 @@
 """Whether a covariance is honest: NEES of the map, errors at the true cones, and the turn about the start."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -13,12 +12,11 @@ from scipy.spatial.distance import cdist
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.residuals import chi2_quantile, greville
-from pathspace_graph.factors.se2 import left_of, rotation
+from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
-from pathspace_graph.labels import BOUNDARIES
 
-from .accuracy import MISSED_DISTANCE, closest_points, mean_of, true_curve
+from .accuracy import MISSED_DISTANCE, closest_points, cones_of, mean_of, true_curve
 
 LEVEL: Final = 0.95  # probability with which an honest map's NEES lies in the interval
 
@@ -77,7 +75,7 @@ def map_nees(track: Map, truth: Truth) -> NormalizedError:
         if isinstance(boundary, SplineBoundary):
             error, covariance = curve_errors(boundary, true_curve(truth, label))
         else:
-            error, covariance = landmark_errors(boundary, truth.cones[truth.cone_labels == label])
+            error, covariance = landmark_errors(boundary, cones_of(truth, label))
         value += _squared(error, covariance)
         dof += len(error)
     return NormalizedError(value, dof)
@@ -96,7 +94,7 @@ def curve_errors(boundary: SplineBoundary, curve_true: Array) -> tuple[Array, Ar
     u = greville(spline.knots, spline.degree)[: spline.size]
     low, high = spline.domain
     u = low + np.mod(u - low, high - low) if spline.periodic else np.unique(np.clip(u, low, high))
-    normal, position = left_of(spline.tangent_unit(u)), spline.evaluate(u)
+    normal, position = spline.normal_unit(u), spline.evaluate(u)
     nearest = curve_true[KDTree(curve_true).query(position)[1]]
     error = np.einsum("kd,kd->k", normal, nearest - position)
     design = np.einsum("km,kd->kmd", spline.basis_matrix(u), normal).reshape(len(u), -1)
@@ -118,35 +116,28 @@ def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array
     return error, boundary.covariance[np.ix_(columns, columns)]
 
 
-@dataclass(frozen=True, eq=False)
-class NormalErrors:
-    """Errors of a map's curves at k true cones along the normals at their foot points, left positive."""
+def consistency_at_cones(track: Map, truth: Truth) -> dict[str, float]:
+    """Return the share of the cones with |error| <= 2 sigma, and the mean of (error / sigma)^2.
 
-    errors: Array  # (k,) in m
-    sigmas: Array  # (k,) their claimed standard deviations (m)
-
-    def share_inside(self, factor: float = 2.0) -> float:
-        """Return the share of the cones with |error| <= factor * sigma; NaN without cones."""
-        return mean_of(np.abs(self.errors) <= factor * self.sigmas)
-
-    def mean_squared(self) -> float:
-        """Return mean (error / sigma)^2, without correlations: 1 is honest; NaN without cones."""
-        return mean_of((self.errors / self.sigmas) ** 2)
+    The mean leaves correlations out: 1 is honest. Both are NaN without cones.
+    """
+    errors, sigmas = normal_errors(track, truth)
+    inside = mean_of(np.abs(errors) <= 2.0 * sigmas)
+    return {"inside": inside, "normalized_error": mean_of((errors / sigmas) ** 2)}
 
 
-def normal_errors(track: Map, truth: Truth) -> NormalErrors:
-    """Return e = n . (cone - S(u)), sigma^2 = n' B Sigma B' n at the foot point u of each true cone.
+def normal_errors(track: Map, truth: Truth) -> tuple[Array, Array]:
+    """Return e = n . (cone - S(u)), sigma = sqrt(n' B Sigma B' n) at the foot points u of k true cones, m.
 
     Only splines count. Missed cones count as the large errors that they are.
     """
     errors, sigmas = [np.zeros(0)], [np.zeros(0)]
     for label, boundary in track.boundaries.items():
         if isinstance(boundary, SplineBoundary):
-            cones = truth.cones[truth.cone_labels == label]
-            feet = closest_points(boundary.spline, cones)
+            feet = closest_points(boundary.spline, cones_of(truth, label))
             errors.append(feet.distance)
             sigmas.append(boundary.spline.normal_sigma(feet.u, boundary.covariance))
-    return NormalErrors(np.concatenate(errors), np.concatenate(sigmas))
+    return np.concatenate(errors), np.concatenate(sigmas)
 
 
 def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
@@ -159,7 +150,7 @@ def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
     size = len(result.map_covariance)
     for label, boundary in sorted(result.map.boundaries.items()):
         assert isinstance(boundary, SplineBoundary)
-        feet = closest_points(boundary.spline, truth.cones[truth.cone_labels == label])
+        feet = closest_points(boundary.spline, cones_of(truth, label))
         design = np.zeros((len(feet.u), size))
         by_point = np.einsum("km,kd->kmd", boundary.spline.basis_matrix(feet.u), feet.normal_unit)
         design[:, offset : offset + 2 * boundary.size] = by_point.reshape(len(feet.u), -1)
@@ -196,25 +187,21 @@ class Turn:
 
 
 def turn_from_truth(track: Map, truth: Truth) -> Turn:
-    return turn(track, {label: truth.cones[truth.cone_labels == label] for label in BOUNDARIES})
-
-
-def turn(track: Map, points: Mapping[int, Array]) -> Turn:
-    """Return the angle a that minimizes `sum (n . (R(a) p - S))^2` over points (k, 2) by their label.
+    """Return the angle a that minimizes `sum (n . (R(a) p - S))^2` over the true cones p.
 
     S is the foot point of R(a) p on the map's own boundary, found anew in every round, and n is the normal
-    there; a landmark has both axes for normals. Points farther than 3 m from the map, and those beyond the
+    there; a landmark has both axes for normals. Cones farther than 3 m from the map, and those beyond the
     ends of an open curve, don't count. The angle is linear in the map's points near the solution, so their
     joint covariance gives its variance.
     """
-    angle, (error, lever, gradient) = 0.0, _rows(track, points, 0.0)
+    angle, (error, lever, gradient) = 0.0, _rows(track, truth, 0.0)
     for _ in range(50):
         moment = float(lever @ lever)
         if moment == 0.0:
             return Turn(float("nan"), float("nan"))
         change = -float(lever @ error) / moment
         angle += change
-        error, lever, gradient = _rows(track, points, angle)
+        error, lever, gradient = _rows(track, truth, angle)
         if abs(change) < 1e-9:
             break
     joint = track.joint_covariance
@@ -222,15 +209,15 @@ def turn(track: Map, points: Mapping[int, Array]) -> Turn:
     return Turn(angle, float(np.sqrt(variance)) / float(lever @ lever))
 
 
-def _rows(track: Map, points: Mapping[int, Array], angle: float) -> tuple[Array, Array, Array]:
-    """Return the offsets from the map of points p that are turned by an angle (rad), and two derivatives.
+def _rows(track: Map, truth: Truth, angle: float) -> tuple[Array, Array, Array]:
+    """Return the offsets from the map of cones p that are turned by an angle (rad), and two derivatives.
 
     The offsets are n . (p - S) (r,) in m, their derivatives by the angle n . J p (r,) in m/rad. The third is
     the derivative (2m,) of `sum lever n . S` by the points of the map's boundaries.
     """
     error, lever, gradient = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for label, boundary in sorted(track.boundaries.items()):
-        turned = points.get(label, np.zeros((0, 2))) @ rotation(angle).T
+        turned = cones_of(truth, label) @ rotation(angle).T
         if len(turned) == 0 or boundary.size == 0:
             gradient.append(np.zeros(2 * boundary.size))
             continue

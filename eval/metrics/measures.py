@@ -12,13 +12,18 @@ from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
-from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import by_prior
 
 from . import accuracy, trajectory
-from .accuracy import GhostSettings
-from .consistency import joint_cone_error, map_nees, normal_errors, turn_from_truth, with_marginals
+from .accuracy import GhostSettings, true_lap_ends
+from .consistency import (
+    consistency_at_cones,
+    joint_cone_error,
+    map_nees,
+    turn_from_truth,
+    with_marginals,
+)
 from .reference import limit
 from .summary import has_cones, lap_times
 
@@ -75,6 +80,7 @@ def measure(
     *,
     marginals: bool = False,
     yardsticks: bool = False,
+    whole: bool = True,
 ) -> list[Row]:
     """Return a row for each complete lap, and one for the whole run as the last; lengths are over the scale.
 
@@ -82,15 +88,18 @@ def measure(
     ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and so one
     row, that of the last lap. `seconds` is the wall time of the whole run. `marginals` asks for the metrics
     of the paper's squared basis, `yardsticks` for `l`, `f` and `limit`, by a batch with oracle association
-    (ValueError without associations).
+    (ValueError without associations). Without `whole` the last row has the metrics that laps have only where
+    there is no lap.
     """
     run, log = run.at_scale_one(), scaled(log, 1.0 / run.scale)
     rows = []
     for lap, track, begin, end in _laps(run, log):
-        values = _map_values(track, log.truth, ghost_settings, marginals)
-        rows.append(Row(lap, values | _drive_values(run, log.truth, begin, end)))
-    values = _map_values(run.map, log.truth, ghost_settings, marginals)
-    values |= _drive_values(run, log.truth, -np.inf, np.inf)
+        of_map = _map_values(track, log.truth, ghost_settings, marginals)
+        rows.append(Row(lap, of_map | _drive_values(run, log.truth, begin, end)))
+    values: dict[str, float] = {}
+    if whole or not rows:
+        values |= _map_values(run.map, log.truth, ghost_settings, marginals)
+        values |= _drive_values(run, log.truth, -np.inf, np.inf)
     values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
     health = [record.health for record in run.cycles]
     if any(health):
@@ -99,7 +108,7 @@ def measure(
         values |= {f"{name}_by_prior": value for name, value in by_prior(run.vehicle, run.settings).items()}
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
-    if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):
+    if isinstance(run, BatchResult) and has_cones(log.truth):
         joint = joint_cone_error(run, log.truth)
         values |= {"normalized_error_joint": joint.ratio, "normalized_error_joint_inside": joint.honest}
     if yardsticks:
@@ -133,19 +142,10 @@ def _map_values(
     """Return the metrics of a map as it stands; without true cones only those that need none."""
     values: dict[str, float] = {"size": track.size, "closed": bool(track.closed)}
     values |= {"bytes": map_bytes(track), "bytes_covariance": covariance_bytes(track)}
-    if truth is None or not has_cones(truth):
+    if not has_cones(truth):
         return values
-    distances = accuracy.cone_distances(track, truth)
-    values |= {
-        "rmse": accuracy.root_mean_square(distances[distances <= accuracy.MISSED_DISTANCE]),
-        "missed": accuracy.missed_share(distances),
-        "cones": len(distances),
-        "size_share": track.size / len(distances),
-        "missed_2m": accuracy.missed_share(distances, 2.0),
-        "missed_1m": accuracy.missed_share(distances, 1.0),
-        "rmse_capped": accuracy.capped_rmse(distances),
-    }
-    values |= accuracy.curve_distance(track, truth) | accuracy.ghosts(track, truth, ghost_settings)
+    values |= accuracy.cone_errors(track, truth) | accuracy.curve_distance(track, truth)
+    values |= accuracy.ghosts(track, truth, ghost_settings)
     values |= _consistency_values(track, truth) | _centre_values(track, truth)
     turn = turn_from_truth(track, truth)
     turns = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
@@ -157,11 +157,11 @@ def _map_values(
 
 
 def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
-    nees, at_cones = map_nees(track, truth), normal_errors(track, truth)
+    nees = map_nees(track, truth)
     low, high = nees.interval
     values = {"nees": nees.ratio, "nees_low": low, "nees_high": high}
     values |= {} if np.isnan(nees.ratio) else {"nees_inside": nees.honest}
-    return values | {"inside": at_cones.share_inside(), "normalized_error": at_cones.mean_squared()}
+    return values | consistency_at_cones(track, truth)
 
 
 def _centre_values(track: Map, truth: Truth) -> dict[str, float]:
@@ -195,7 +195,7 @@ def closes_falsely(run: RunResult, truth: Truth) -> bool:
     """Return whether the loop closed, a batch at its end, before the true drive was back at the start."""
     if not run.map.closed:
         return False
-    t, ends = closing_stamp(run), lap_end_indices(truth.poses)
+    t, ends = closing_stamp(run), true_lap_ends(truth)
     if len(ends) == 0:
         return True
     driven = path_lengths(truth.poses)

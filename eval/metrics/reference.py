@@ -1,9 +1,7 @@
 """What a run is held against: the least error to be expected of its log, and another run."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import repeat
-from typing import Any
 
 import numpy as np
 
@@ -150,17 +148,6 @@ class Gap:
     along: float  # rms error along (m), in the frames of the reference
     across: float  # (m)
     heading: float  # (rad)
-
-
-def from_batch(values: Mapping[str, Any], batch: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the turn (rad) of a map from that of the batch over the same log, and the rmse by the batch's.
-
-    The turns are from the truth, since small turns add up. Empty where either map lacks a metric.
-    """
-    if not {"turn", "rmse"} <= set(values) & set(batch):
-        return {}
-    turn, rmse = values["turn"] - batch["turn"], values["rmse"] / batch["rmse"]
-    return {"turn_from_batch": float(turn), "rmse_by_batch": float(rmse)}
 
 
 def gap(run: RunResult, reference: RunResult) -> Gap:

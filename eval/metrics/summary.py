@@ -4,7 +4,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 import numpy as np
 
@@ -17,14 +17,13 @@ from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
-from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.scale import scale_of
 
-from .accuracy import LapMetrics, lap_metrics, root_mean_square
-from .consistency import normal_errors
+from .accuracy import LapMetrics, lap_metrics, root_mean_square, true_lap_ends
+from .consistency import consistency_at_cones
 from .trajectory import position_rms, trajectory_errors
 
 GATE: Final = ("dropped", "late", "refused")  # counts of the gate in each cycle
@@ -122,7 +121,7 @@ def lap_times(log: Log) -> Array:
     """Return the stamps (s) at which true laps end; without a true path there are none."""
     if log.truth is None or len(log.truth.poses) == 0:
         return np.zeros(0)
-    return log.truth.pose_t[lap_end_indices(scaled(log.truth, 1.0 / scale_of(log)).poses)]
+    return log.truth.pose_t[true_lap_ends(scaled(log.truth, 1.0 / scale_of(log)))]
 
 
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
@@ -131,7 +130,7 @@ def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
     Without a true path the laps are the estimated ones; without true cones there is no row. The snapshots of
     `result` are those at `lap_times`. A batch has one row.
     """
-    if log.truth is None or not has_cones(log.truth):
+    if not has_cones(log.truth):
         return []
     if isinstance(result, BatchRun):
         return [_metrics(result.map, log.truth, result.laps, result.scale)]
@@ -157,8 +156,9 @@ def not_mapped(track: Map, log: Log) -> list[str]:
     return lines
 
 
-def has_cones(truth: Truth) -> bool:
-    return bool(np.isin(truth.cone_labels, BOUNDARIES).any())
+def has_cones(truth: Truth | None) -> TypeGuard[Truth]:
+    """Return whether there is a truth that holds cones of a boundary."""
+    return truth is not None and bool(np.isin(truth.cone_labels, BOUNDARIES).any())
 
 
 def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
@@ -166,9 +166,9 @@ def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
         return {}
     final = asdict(_metrics(result.map, truth, result.laps, result.scale))
     del final["lap"]
-    inside = normal_errors(result.at_scale_one().map, scaled(truth, 1.0 / result.scale)).share_inside()
+    at_cones = consistency_at_cones(result.at_scale_one().map, scaled(truth, 1.0 / result.scale))
     laps = [asdict(row) for row in laps_of(result, log)]
-    return {"laps": laps, "final": final, "inside_two_sigma": inside}
+    return {"laps": laps, "final": final, "inside_two_sigma": at_cones["inside"]}
 
 
 def _trajectory_errors(result: RunResult, truth: Truth) -> dict[str, float]:

@@ -12,11 +12,10 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.run import ObservedCycle
 from pathspace_graph.sim.curves import arc_lengths
 
-from .accuracy import boundary_distances, root_mean_square
+from .accuracy import boundary_distances, root_mean_square, true_lap_ends
 
 LOST, ASTRAY = 5.0, 1.0  # position errors beyond which a vehicle is lost, or astray (m)
 MOST: Final = 35.0  # greatest length of a reach (m)
@@ -114,7 +113,7 @@ class ReachObserver:
     def __init__(self, truth: Truth) -> None:
         path, heading = truth.poses[:, :2], np.unwrap(truth.poses[:, 2])
         driven, own = arc_lengths(path), np.isin(truth.cone_labels, BOUNDARIES)
-        ends = driven[lap_end_indices(truth.poses)]
+        ends = driven[true_lap_ends(truth)]
         stations, cone = _passes(path, driven, truth.cones[own], ends)
         order = np.argsort(stations, kind="stable")
         self._t, self._drive = truth.pose_t, np.column_stack([driven, path, heading])

@@ -1,10 +1,10 @@
 """The film of a run: the map as it grows, with the vehicle and what is known by then, as .gif or .mp4."""
 
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, Protocol, cast
+from typing import Any, Final, cast
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter
@@ -57,11 +57,8 @@ def lap_seconds(log: Log) -> float:
     return ((end - begin) / (turns if turns > 0.75 else 1.0)) or 1.0
 
 
-class Film(Protocol):
-    """Film that takes its frames one after the other."""
-
-    def add(self, figure: Figure, seconds: float) -> None:
-        """Add a figure as a frame that is shown for a time (s)."""
+Film = Callable[[Figure, float], None]
+"""Function that takes a figure as the next frame of a film, which is shown for a time (s)."""
 
 
 def check_film_file(file: Path | str) -> None:
@@ -80,41 +77,28 @@ def check_film_file(file: Path | str) -> None:
 def film(file: Path | str, frames_per_second: float) -> Iterator[Film]:
     """Yield a film that is at `file` on success; an earlier one is kept as a numbered backup."""
     check_film_file(file)
-    with atomic_file(file) as temporary:
-        if Path(file).suffix.lower() == ".gif":
-            frames = GifFilm()
-            yield frames
-            frames.write(temporary)
-            return
-        encoder = _FfmpegFilm(temporary, frames_per_second)
-        try:
-            yield encoder
-            encoder.writer.finish()
-        except (subprocess.CalledProcessError, BrokenPipeError) as error:
-            raise OutputError(f"{temporary.name}: ffmpeg could not write the film: {error}") from error
+    written = _gif if Path(file).suffix.lower() == ".gif" else _mp4
+    with atomic_file(file) as temporary, written(temporary, frames_per_second) as add:
+        yield add
 
 
-class GifFilm:
-    """Collects the frames of a .gif, each in colours of its own, for Pillow's writer."""
+@contextmanager
+def _gif(file: Path, _: float) -> Iterator[Film]:
+    """Collect the frames, each in colours of its own, for Pillow's writer."""
+    frames, times = list[Image.Image](), [0.0]
 
-    def __init__(self) -> None:
-        self._frames: list[Image.Image] = []
-        self._durations: list[int] = []
-        self._time = 0.0
-
-    def add(self, figure: Figure, seconds: float) -> None:
-        """Add a figure as a frame, whose time (s) is rounded to 0.01 s so that errors do not add up."""
-        picture = Image.fromarray(pixels_of(figure))
+    def add(figure: Figure, seconds: float) -> None:
         # one index of the palette is left for what does not change
-        self._frames.append(picture.quantize(255, dither=Image.Dither.NONE))
-        before, self._time = self._time, self._time + seconds
-        self._durations.append(10 * (round(100.0 * self._time) - round(100.0 * before)))
+        frames.append(Image.fromarray(pixels_of(figure)).quantize(255, dither=Image.Dither.NONE))
+        times.append(times[-1] + seconds)
 
-    def write(self, file: Path) -> None:
-        if not self._frames:
-            raise OutputError(f"{file.name}: expected a film of at least one frame, found none")
-        first, *others = self._frames
-        first.save(file, format="GIF", save_all=True, append_images=others, duration=self._durations, loop=0)
+    yield add
+    if not frames:
+        raise OutputError(f"{file.name}: expected a film of at least one frame, found none")
+    # rounded to 0.01 s so that errors do not add up
+    durations = (10 * np.diff(np.round(100.0 * np.array(times)).astype(int))).tolist()
+    options: dict[str, Any] = {"save_all": True, "append_images": frames[1:], "duration": durations}
+    frames[0].save(file, format="GIF", loop=0, **options)
 
 
 def pixels_of(figure: Figure) -> Pixels:
@@ -124,20 +108,23 @@ def pixels_of(figure: Figure) -> Pixels:
     return np.array(canvas.buffer_rgba(), np.uint8)[:, :, :3]
 
 
-class _FfmpegFilm:
-    """Hands frames to ffmpeg by matplotlib's writer."""
+@contextmanager
+def _mp4(file: Path, frames_per_second: float) -> Iterator[Film]:
+    """Hand the frames to ffmpeg by matplotlib's writer."""
+    writer = FFMpegWriter(fps=cast(int, frames_per_second))  # ffmpeg takes any number
 
-    def __init__(self, file: Path, frames_per_second: float) -> None:
-        self.writer = FFMpegWriter(fps=cast(int, frames_per_second))  # ffmpeg takes any number
-        self._file, self._begun = file, False
+    def add(figure: Figure, seconds: float) -> None:
+        if not hasattr(writer, "fig"):
+            writer.setup(figure, str(file), figure.dpi)
+        writer.fig = figure
+        for _ in range(max(1, round(seconds * writer.fps))):
+            writer.grab_frame()
 
-    def add(self, figure: Figure, seconds: float) -> None:
-        if not self._begun:
-            self.writer.setup(figure, str(self._file), figure.dpi)
-            self._begun = True
-        self.writer.fig = figure
-        for _ in range(max(1, round(seconds * self.writer.fps))):
-            self.writer.grab_frame()
+    try:
+        yield add
+        writer.finish()
+    except (subprocess.CalledProcessError, BrokenPipeError) as error:
+        raise OutputError(f"{file.name}: ffmpeg could not write the film: {error}") from error
 
 
 class Animation:
@@ -183,12 +170,12 @@ class Animation:
         due = int(film_time * self.settings.frames_per_second) + 1 - self._frames
         if due > 0:
             self._draw(cycle, film_time)
-            self._film.add(self._figure, due / self.settings.frames_per_second)
+            self._film(self._figure, due / self.settings.frames_per_second)
             self._frames += due
 
     def finish(self) -> None:
         if self._frames:
-            self._film.add(self._figure, self.settings.hold)
+            self._film(self._figure, self.settings.hold)
 
     def _listen(self, cycle: ObservedCycle, film_time: float) -> None:
         result, told = cycle.result, [cycle.result.notice] if cycle.result.notice else []
@@ -268,7 +255,7 @@ def _moments(cycle: ObservedCycle, seconds: Sequence[float]) -> dict[str, str]:
 
 
 def _against_truth(track: Map, truth: Truth | None) -> dict[str, str]:
-    if truth is None or not has_cones(truth):
+    if not has_cones(truth):
         return {}
     metrics = lap_metrics(track, truth, 0)
     rmse = "" if np.isnan(metrics.rmse) else f"{metrics.rmse:.2f} m"

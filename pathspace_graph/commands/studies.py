@@ -17,7 +17,7 @@ from pathspace_graph.estimators import DEFAULT, ONLINE, check_online
 from pathspace_graph.eval.benchmark import scaling as timing
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import measure_scaling
-from pathspace_graph.eval.experiment.faults import only, strongest, suite, write_suite
+from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
 from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study
 from pathspace_graph.eval.experiment.tables import write_study
@@ -104,7 +104,7 @@ class FaultSuite(StudyCommand):
 
     def run(self) -> None:
         chosen = replace(only(suite(), self.only), estimators=(self.estimator,))
-        self.execute(strongest(chosen) if self.quick else chosen, write_suite)
+        self.execute(at_strength(chosen, 1.0) if self.quick else chosen, write_suite)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.experiment.faults import of_middle_strength, suite
+from pathspace_graph.eval.experiment.faults import at_strength, suite
 from pathspace_graph.eval.experiment.study import Baseline, Study
 from pathspace_graph.eval.report import (
     COMPARED,
@@ -144,7 +144,7 @@ def test_the_table_of_the_camera_has_each_noise_and_the_landmarks_that_are_told_
 
 
 def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength() -> None:
-    study = of_middle_strength(suite())
+    study = at_strength(suite(), 0.5)
     assert list(study.noise)[:2] == ["clean", "latency of detections: 50 ms"]
     late = list(study.noise)[1]
     runs = [

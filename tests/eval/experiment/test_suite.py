@@ -7,7 +7,7 @@ import re
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.experiment.faults import CLEAN, Fault, fault_of, kinds, only, strongest, suite
+from pathspace_graph.eval.experiment.faults import CLEAN, Fault, at_strength, fault_of, kinds, only, suite
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.sim.faults import Faults
 from pathspace_graph.sim.simulate import SimulationSettings
@@ -73,7 +73,7 @@ def test_only_some_faults_are_chosen_beside_the_clean_run() -> None:
 
 def test_the_quick_suite_has_the_greatest_strength_of_each_fault() -> None:
     study = suite()
-    quick = strongest(study)
+    quick = at_strength(study, 1.0)
     assert kinds(quick) == kinds(study)
     assert len(quick.noise) == 1 + len(kinds(study))
     assert "range bias: 0.4 m" in quick.noise and "range bias: 0.2 m" not in quick.noise

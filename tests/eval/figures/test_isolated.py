@@ -11,8 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.baselines.ckf_curves import beyond_end
 from pathspace_graph.cli import main
-from pathspace_graph.eval.figures.curves import BLIND, simplification, uncertainty
 from pathspace_graph.eval.figures.isolated import (
+    BLIND,
     FIGURES,
     MARKER,
     RIDGE,
@@ -20,6 +20,8 @@ from pathspace_graph.eval.figures.isolated import (
     expansion,
     extend,
     fit,
+    simplification,
+    uncertainty,
 )
 from pathspace_graph.io.manifest import MANIFEST_FILE
 from pathspace_graph.mapping.belief import cubature_points, square_root

@@ -13,6 +13,7 @@ from pathspace_graph.batch.simplification import Scatter
 from pathspace_graph.eval.metrics.accuracy import true_curve
 from pathspace_graph.eval.metrics.consistency import (
     NormalizedError,
+    consistency_at_cones,
     curve_errors,
     joint_cone_error,
     landmark_errors,
@@ -82,14 +83,14 @@ def test_normal_errors_carry_sign_and_the_joint_covariance() -> None:
     across = np.tile([0.0, 1.0], 4)
     track = Map(False, {LEFT: SplineBoundary(line(2.0).spline, 0.2**2 * np.outer(across, across))})
     true = truth(np.array([[2.0, 2.3], [5.0, 1.5], [8.0, 2.39]]), row(0.0))
-    found = normal_errors(track, true)
-    np.testing.assert_allclose(found.errors, [0.3, -0.5, 0.39], atol=1e-12)
-    np.testing.assert_allclose(found.sigmas, 0.2, atol=1e-12)
-    assert found.share_inside() == pytest.approx(2 / 3)
-    assert found.share_inside(3.0) == 1.0
-    assert found.mean_squared() == pytest.approx((0.3**2 + 0.5**2 + 0.39**2) / (3 * 0.2**2))
-    of_landmarks = normal_errors(Map(False, {LEFT: landmarks((0, 0))}), true)
-    assert np.isnan(of_landmarks.share_inside()) and np.isnan(of_landmarks.mean_squared())
+    errors, sigmas = normal_errors(track, true)
+    np.testing.assert_allclose(errors, [0.3, -0.5, 0.39], atol=1e-12)
+    np.testing.assert_allclose(sigmas, 0.2, atol=1e-12)
+    mean_squared = (0.3**2 + 0.5**2 + 0.39**2) / (3 * 0.2**2)
+    found = consistency_at_cones(track, true)
+    assert found == pytest.approx({"inside": 2 / 3, "normalized_error": mean_squared})
+    of_landmarks = consistency_at_cones(Map(False, {LEFT: landmarks((0, 0))}), true)
+    assert np.isnan([*of_landmarks.values()]).all()
 
 
 def test_marginals_are_the_squared_basis_of_the_paper() -> None:
@@ -101,7 +102,7 @@ def test_marginals_are_the_squared_basis_of_the_paper() -> None:
     joint = half @ half.T
     track = Map(False, {LEFT: SplineBoundary(spline, joint)})
     cones = spline.evaluate(np.linspace(3.5, 7.5, 9)) + 0.1
-    found = normal_errors(with_marginals(track), truth(cones))
+    _, sigmas = normal_errors(with_marginals(track), truth(cones))
     u = np.linspace(3.0, 8.0, 20001)
     nearest = np.argmin(np.linalg.norm(cones[:, None] - spline.evaluate(u), axis=2), axis=1)
     basis = spline.basis_matrix(u[nearest])
@@ -109,8 +110,8 @@ def test_marginals_are_the_squared_basis_of_the_paper() -> None:
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     blocks = joint.reshape(8, 2, 8, 2)[np.arange(8), :, np.arange(8), :]
     expected = np.einsum("kj,kj,ka,jab,kb->k", basis, basis, normal, blocks, normal)
-    np.testing.assert_allclose(found.sigmas**2, expected, rtol=1e-2)
-    assert not np.allclose(normal_errors(track, truth(cones)).sigmas, found.sigmas, rtol=0.1)
+    np.testing.assert_allclose(sigmas**2, expected, rtol=1e-2)
+    assert not np.allclose(normal_errors(track, truth(cones))[1], sigmas, rtol=0.1)
 
 
 # --- jointly at the true cones, by the batch itself ------------------------------------------------------

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.reference import aligned_distance, from_batch, gap
+from pathspace_graph.eval.metrics.reference import aligned_distance, gap
 from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.residuals import greville
 from pathspace_graph.factors.se2 import move_points
@@ -78,12 +78,6 @@ def test_landmarks_are_points_of_the_curve() -> None:
     landmarks = PointBoundary(points, np.zeros((2 * len(points), 2 * len(points))))
     found = gap(run({LEFT: landmarks}, drive()), run({LEFT: line(2.0)}, drive()))
     np.testing.assert_allclose(found.curves["left"], 0.5, atol=1e-2)
-
-
-def test_a_turn_and_an_rmse_are_compared_with_those_of_the_batch() -> None:
-    found = from_batch({"turn": 0.003, "rmse": 0.3, "size": 4}, {"turn": -0.001, "rmse": 0.2})
-    assert found == {"turn_from_batch": 0.004, "rmse_by_batch": 0.3 / 0.2}
-    assert from_batch({"rmse": 0.3}, {"turn": -0.001, "rmse": 0.2}) == {}
 
 
 def bend(motion: Array, width: float = 4.0) -> Map:

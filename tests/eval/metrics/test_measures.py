@@ -98,6 +98,15 @@ def test_without_truth_only_what_needs_none_is_measured() -> None:
     assert set(measure(run(true), bare)[0].values) == keys | {"ate", "along", "across"}
 
 
+def test_the_whole_run_may_be_left_with_what_no_lap_has() -> None:
+    true = circle_truth()
+    (lap, whole), (same, bare) = (measure(run(true), log(true), whole=chosen) for chosen in (True, False))
+    assert same == lap
+    assert bare.values == {key: value for key, value in whole.values.items() if METRICS[key].scope == "run"}
+    made = replace(run(true), laps=0, lap_maps=(), snapshots=())
+    assert measure(made, log(None), whole=False) == measure(made, log(None))
+
+
 def test_marginals_and_yardsticks_are_measured_where_they_are_asked_for() -> None:
     true = circle_truth()
     (*_, whole) = measure(run(true), log(true), marginals=True)

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.accuracy import (
     boundary_distances,
-    capped_rmse,
     cone_distances,
+    cone_errors,
     lap_metrics,
-    missed_share,
 )
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
@@ -93,8 +92,12 @@ def test_the_closest_point_is_no_farther_than_any_sample(seed: int) -> None:
 
 
 def test_missed_at_a_distance_and_rmse_with_a_missed_cone_as_three_metres() -> None:
-    distances = np.array([0.0, 0.9, 1.5, 2.5, 4.0, np.inf])
-    assert [missed_share(distances, d) for d in (1.0, 2.0, 3.0)] == [4 / 6, 3 / 6, 2 / 6]
-    assert missed_share(np.array([2.0]), 2.0) == 0.0
-    assert capped_rmse(distances) == pytest.approx(np.sqrt((0.81 + 2.25 + 6.25 + 9 + 9) / 6))
-    assert np.isnan(missed_share(np.zeros(0))) and np.isnan(capped_rmse(np.zeros(0)))
+    track = Map(False, {LEFT: PointBoundary(np.zeros((1, 2)), np.eye(2))})
+    at = (0.0, 0.9, 1.5, 2.5, 4.0)
+    found = cone_errors(track, truth([*((x, 0.0, LEFT) for x in at), (0.0, 0.0, RIGHT)]))
+    assert [found[key] for key in ("missed_1m", "missed_2m", "missed")] == [4 / 6, 3 / 6, 2 / 6]
+    assert (found["cones"], found["size_share"]) == (6, 1 / 6)
+    assert found["rmse_capped"] == pytest.approx(np.sqrt((0.81 + 2.25 + 6.25 + 9 + 9) / 6))
+    assert cone_errors(track, truth([(2.0, 0.0, LEFT)]))["missed_2m"] == 0.0
+    nothing = cone_errors(track, truth([]))
+    assert nothing.pop("cones") == 0 and np.isnan([*nothing.values()]).all()

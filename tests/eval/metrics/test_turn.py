@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.consistency import turn, turn_from_truth
+from pathspace_graph.eval.metrics.consistency import turn_from_truth
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
@@ -49,7 +49,7 @@ def test_a_turned_map_has_its_angle(angle: float) -> None:
 def test_landmarks_turn_as_curves_do() -> None:
     points = np.array([[5.0, 2.0], [20.0, 2.0], [40.0, -3.0]])
     turned = PointBoundary(points @ rotation(0.02).T, np.eye(6))
-    found = turn(Map(False, {LEFT: turned}, 0.1**2 * np.eye(6)), {LEFT: points})
+    found = turn_from_truth(Map(False, {LEFT: turned}, 0.1**2 * np.eye(6)), truth(points))
     assert found.angle == pytest.approx(0.02, abs=1e-9)
     # each landmark moves by 0.1 m, and the lever arms are their distances from the start
     assert found.sigma == pytest.approx(0.1 / np.sqrt(29.0 + 404.0 + 1609.0))

@@ -29,7 +29,7 @@ class Reel:
         self.words: list[set[str]] = []
         self.seconds: list[float] = []
 
-    def add(self, figure: Figure, seconds: float) -> None:
+    def __call__(self, figure: Figure, seconds: float) -> None:
         self.words.append({text.get_text() for axes in figure.axes for text in axes.texts})
         self.seconds.append(seconds)
 
@@ -99,7 +99,7 @@ def test_orange_cones_are_drawn(short_log: Log) -> None:
     figures: list[Figure] = []
 
     class Kept(Reel):
-        def add(self, figure: Figure, seconds: float) -> None:
+        def __call__(self, figure: Figure, seconds: float) -> None:
             figures.append(figure)
 
     animation = Animation(Kept(), lap_seconds(short_log), FILM)

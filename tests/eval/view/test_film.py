@@ -51,7 +51,7 @@ def test_every_frame_of_a_gif_comes_back(tmp_path: Path) -> None:
     figures = [blank(), with_line(0.2), with_line(0.8), blank("#CC0000")]
     with film(tmp_path / "a.gif", 12.0) as reel:
         for figure in figures:
-            reel.add(figure, 0.1)
+            reel(figure, 0.1)
     pictures, durations = frames(tmp_path / "a.gif")
     assert len(pictures) == len(figures)
     for picture, figure in zip(pictures, figures, strict=True):
@@ -63,7 +63,7 @@ def test_every_frame_of_a_gif_comes_back(tmp_path: Path) -> None:
 def test_the_times_of_frames_do_not_add_up_rounding(tmp_path: Path) -> None:
     with film(tmp_path / "a.gif", 30.0) as reel:
         for x in np.linspace(0.1, 0.9, 30):
-            reel.add(with_line(x), 1.0 / 30.0)
+            reel(with_line(x), 1.0 / 30.0)
     _, durations = frames(tmp_path / "a.gif")
     assert set(durations) == {0.03, 0.04}
     assert sum(durations) == pytest.approx(1.0)
@@ -73,7 +73,7 @@ def test_only_what_has_changed_is_written(tmp_path: Path) -> None:
     for count in (1, 11):
         with film(tmp_path / f"{count}.gif", 10.0) as reel:
             for k in range(count):
-                reel.add(with_line(0.5 if k % 2 else 0.6), 0.1)
+                reel(with_line(0.5 if k % 2 else 0.6), 0.1)
     one, eleven = ((tmp_path / f"{count}.gif").stat().st_size for count in (1, 11))
     assert eleven < 11 * one
 
@@ -87,12 +87,12 @@ def test_a_film_without_a_frame_is_refused(tmp_path: Path) -> None:
 def test_a_film_that_fails_leaves_nothing_and_an_earlier_one_is_kept(tmp_path: Path) -> None:
     file = tmp_path / "a.gif"
     with pytest.raises(ZeroDivisionError), film(file, 10.0) as reel:
-        reel.add(blank(), 0.1)
+        reel(blank(), 0.1)
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
     for _ in range(2):
         with film(file, 10.0) as reel:
-            reel.add(blank(), 0.1)
+            reel(blank(), 0.1)
     assert {path.name for path in tmp_path.iterdir()} == {"a.gif", "a.gif.~1~"}
 
 
@@ -113,8 +113,8 @@ def test_ffmpeg_is_given_every_frame_as_often_as_it_is_shown(tmp_path: Path) -> 
         mpl.rc_context({"animation.ffmpeg_path": str(program)}),
         film(tmp_path / "a.mp4", 10.0) as reel,
     ):
-        reel.add(blank(), 0.1)
-        reel.add(with_line(0.5), 0.3)
+        reel(blank(), 0.1)
+        reel(with_line(0.5), 0.3)
     pixels = np.frombuffer((tmp_path / "a.mp4").read_bytes(), np.uint8).reshape(4, 80, 120, 4)
     assert (pixels[0] == 255).all()
     np.testing.assert_array_equal(pixels[3, :, :, :3], pixels_of(with_line(0.5)))
@@ -131,5 +131,5 @@ def test_ffmpeg_that_fails_is_an_output_error(tmp_path: Path) -> None:
         pytest.raises(OutputError, match="ffmpeg could not write the film"),
         written as reel,
     ):
-        reel.add(blank(), 0.1)
+        reel(blank(), 0.1)
     assert {path.name for path in tmp_path.iterdir()} == {"ffmpeg"}
