@@ -335,6 +335,11 @@ def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
     return np.asarray(weights[0])
 
 
+def dot(a: Array, b: Array) -> Array:
+    """Return the scalar products (k,) of plane vectors (k, 2)."""
+    return np.asarray(np.einsum("kd,kd->k", a, b))
+
+
 def cross(a: Array, b: Array) -> Array:
     """Return the cross products (...) of plane vectors (..., 2)."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
