@@ -112,8 +112,9 @@ def time_at(driven: Drive, distance: float) -> float:
     return float(driven.t[reached[0]]) if len(reached) else np.inf
 
 
-def _is_within(t: FloatArray, begin: float, time: float) -> NDArray[np.bool_]:
-    return np.asarray((t >= begin) & (t < begin + time))
+def _is_during(driven: Drive, distance: float, time: float) -> NDArray[np.bool_]:
+    begin = time_at(driven, distance)
+    return np.asarray((driven.t >= begin) & (driven.t < begin + time))
 
 
 def turned_round(track: Track) -> Track:
@@ -143,8 +144,8 @@ def measure_odometry(
     measured, calibration = measure_twists(_slipping(driven, faults), dt, noise, rng)
     bias = np.array([0.0, 0.0, faults.yaw_rate_bias])
     measured = measured + bias if faults.yaw_rate_bias else measured
-    measured[_is_within(driven.t, time_at(driven, faults.zero_at * lap), faults.zero)] = 0.0
-    kept = ~_is_within(driven.t, time_at(driven, faults.gap_at * lap), faults.gap)
+    measured[_is_during(driven, faults.zero_at * lap, faults.zero)] = 0.0
+    kept = ~_is_during(driven, faults.gap_at * lap, faults.gap)
     kept[0] = True  # the first stamp is the beginning of the log
     return Odometry(driven.t[kept], measured[kept]), calibration + bias[1:]
 

@@ -15,7 +15,7 @@ from .curves import FloatArray, IntArray
 from .faults import Faults, SensorFaults, colours, faulty, measure_odometry, put_down, turned_round
 from .sensor import ConeSensor, OdometryNoise, SensorSettings
 from .track import Track, to_map_frame
-from .vehicle import Drive, VehicleSettings, drive, integrate
+from .vehicle import Drive, VehicleSettings, displacements, drive
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,12 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     driven = put_down(drive(track, settings.laps, settings.vehicle, wander_rng), lap, faults.vehicle)
     odometry, calibration = measure_odometry(driven, lap, settings.odometry, faults.odometry, odometry_rng)
     cycles, associations = _perceive(track, driven, settings, *sensor_rngs)
+    stamps = np.union1d(driven.t, [cycle.t for cycle in cycles])
+    poses = _poses_at(driven, stamps)
+    poses[:, 2] = np.pi - (np.pi - poses[:, 2]) % (2 * np.pi)
     errors = np.array([getattr(faults.sensor, name) for name in SENSOR])
-    truth = replace(
-        _truth(track, driven, cycles, associations),
+    truth = Truth(
+        *(stamps, poses, track.cones, track.cone_labels, associations),
         calibration=calibration,
         sensor=errors if errors.any() else None,
         noise=_noise(settings),
@@ -109,20 +112,8 @@ def _perceive(
 def _poses_at(driven: Drive, stamps: FloatArray) -> FloatArray:
     """Return true poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
     index = np.searchsorted(driven.t, stamps, side="right") - 1
-    since = stamps - driven.t[index]
-    poses = driven.poses[index].copy()
-    for k in np.flatnonzero(since):
-        x, y, turn = integrate(driven.twists[index[k], None], float(since[k]))[1]
-        cos, sin = np.cos(poses[k, 2]), np.sin(poses[k, 2])
-        poses[k] += (cos * x - sin * y, sin * x + cos * y, turn)
-    return poses
-
-
-def _truth(track: Track, driven: Drive, cycles: list[Detections], associations: IntArray) -> Truth:
-    stamps = np.union1d(driven.t, [cycle.t for cycle in cycles])
-    poses = _poses_at(driven, stamps)
-    poses[:, 2] = np.pi - (np.pi - poses[:, 2]) % (2 * np.pi)
-    return Truth(stamps, poses, track.cones, track.cone_labels, associations)
+    poses = driven.poses[index]
+    return poses + displacements(poses[:, 2], driven.twists[index], stamps - driven.t[index])
 
 
 CAMERA: Final = SensorSettings(

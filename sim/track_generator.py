@@ -158,7 +158,10 @@ def _curve(layout: _Layout, rng: Generator) -> FloatArray:
         end = corners[following] - direction * tangent[following]
         pieces.append(_straight(corners[k] + direction * tangent[k], end, rng))
         pieces.append(_arc(end, direction, radii[following], turns[following]))
-    curve = _evenly(np.vstack(pieces))
+    polyline = ring(np.vstack(pieces))
+    s = arc_lengths(polyline)
+    even = np.linspace(0.0, s[-1], int(s[-1] / curves.STEP), endpoint=False)
+    curve = curves.along_polyline(even, s, polyline)
     return np.asarray(gaussian_filter1d(curve, curves.SMOOTHING / curves.STEP, axis=0, mode="wrap"))
 
 
@@ -211,14 +214,6 @@ def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
     depth = min(2 * (shift / np.pi) ** 2 / rng.uniform(4.5, 8.0), rng.uniform(2.0, 4.5))
     part = np.clip(np.minimum(s, total - s) / shift, 0.0, 1.0)
     return np.asarray(rng.choice([-1.0, 1.0]) * depth * (1 - np.cos(np.pi * part)) / 2)
-
-
-def _evenly(points: FloatArray) -> FloatArray:
-    polyline = ring(points)
-    s = arc_lengths(polyline)
-    return curves.along_polyline(
-        np.linspace(0.0, s[-1], int(s[-1] / curves.STEP), endpoint=False), s, polyline
-    )
 
 
 def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettings) -> bool:

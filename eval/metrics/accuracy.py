@@ -17,7 +17,7 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.settings.checked import Positive
 from pathspace_graph.sim.curves import along_polyline, arc_lengths
-from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.bspline import BSpline, segments_cross
 
 MISSED_DISTANCE: Final = 3.0  # distance from its boundary beyond which a cone is missed (m; Table 1)
 TRUE_STEP: Final = 0.02  # largest step on a true curve (m): 0.1 m is at most 0.5 mm too long
@@ -188,17 +188,10 @@ def crossings(track: Map) -> tuple[int, int]:
     of = np.concatenate(owner)
     other = own = 0
     for k, (a, b) in enumerate(zip(begin, end, strict=True)):
-        crossed = _apart(a, b, begin[k:], end[k:]) & _apart(begin[k:], end[k:], a, b)
+        crossed = segments_cross(a, b, begin[k:], end[k:])
         other += int((crossed & (of[k:] != of[k])).sum())
         own += int((crossed & (of[k:] == of[k])).sum())
     return other, own
-
-
-def _apart(begin: Array, end: Array, a: Array, b: Array) -> BoolArray:
-    way, first, second = end - begin, a - begin, b - begin
-    sides = way[..., 0] * first[..., 1] - way[..., 1] * first[..., 0]
-    others = way[..., 0] * second[..., 1] - way[..., 1] * second[..., 0]
-    return np.asarray(sides * others < 0.0)
 
 
 def centre_line_errors(track: Map, truth: Truth) -> dict[str, tuple[Array, Array]]:

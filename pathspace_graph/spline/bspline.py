@@ -1,6 +1,6 @@
 """Plane B-spline curves: evaluation, arc length, exact changes of the ends, and covariance."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Self
 
@@ -121,6 +121,13 @@ class BSpline:
         return cls(periodic_knots(breaks, degree), unwrapped, degree, periodic=True)
 
     @classmethod
+    def on(cls, tables: SpanPolynomials, control_points: Array) -> Self:
+        """Return a curve that shares a basis; its control points (n, 2) are unwrapped."""
+        spline = cls(tables.knots, control_points, tables.degree, tables.periodic)
+        spline.__dict__["tables"] = tables
+        return spline
+
+    @classmethod
     def even(cls, low: float, high: float, intervals: int, periodic: bool, degree: int = 3) -> Self:
         """Return a curve of zeros on equally spaced knots; the ends of an open one float."""
         if periodic:
@@ -157,9 +164,7 @@ class BSpline:
     def with_points(self, distinct: Array) -> Self:
         """Return the spline of the same basis with other distinct control points (m, 2)."""
         points = np.concatenate([distinct, distinct[: self.degree]]) if self.periodic else distinct
-        spline = replace(self, control_points=points)
-        spline.__dict__["tables"] = self.tables
-        return spline
+        return type(self).on(self.tables, points)
 
     def local_basis(self, u: Array, derivative: int = 0) -> tuple[Array, IntArray]:
         """Return the basis (k, p + 1) at u (k,) and the distinct control points (k, p + 1) it multiplies."""

@@ -35,9 +35,7 @@ class Ribbon(BSpline):
 
     @cached_property
     def centre(self) -> BSpline:
-        centre = BSpline(self.knots, self.control_points[:, :2], self.degree, self.periodic)
-        centre.__dict__["tables"] = self.tables
-        return centre
+        return BSpline.on(self.tables, self.control_points[:, :2])
 
     def half_width(self, u: Array) -> Array:
         """Return half the width (k,) of the track in m."""
