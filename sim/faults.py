@@ -179,7 +179,10 @@ def faulty(
     unseen = np.flatnonzero(sides == NAMES.index(faults.blind_side))
 
     def detect(t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
-        detections, cones = sensor.detect(t, mounted(pose, faults), faults.range_scale, faults.range_bias)
+        x, y, theta = pose
+        left = faults.lateral
+        mounted = np.array([x - np.sin(theta) * left, y + np.cos(theta) * left, theta + faults.yaw])
+        detections, cones = sensor.detect(t, mounted, faults.range_scale, faults.range_bias)
         lost = rng.random(len(cones)) < faults.colourless
         detections = replace(detections, labels=np.where(lost, UNKNOWN, detections.labels))
         kept = np.full(len(cones), not dropout <= t < dropout + faults.dropout)
@@ -188,11 +191,3 @@ def faulty(
         return detections.where(kept), cones[kept]
 
     return detect
-
-
-def mounted(pose: FloatArray, faults: SensorFaults) -> FloatArray:
-    """Return the pose (3,) of the sensor on a vehicle: `lateral` m to its left, and turned by `yaw`."""
-    x, y, theta = pose
-    return np.array(
-        [x - np.sin(theta) * faults.lateral, y + np.cos(theta) * faults.lateral, theta + faults.yaw]
-    )

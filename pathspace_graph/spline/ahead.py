@@ -107,10 +107,10 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
         least = distance / MOST_POINTS
         raise SettingsError(f"step: expected a number of at least {least:g} m, found {step:g}")
     samples = {label: _sampled(curve, distance) for label, curve in curves.items()}
-    sides = [
-        to_vehicle(samples[label].beside(distance), pose[None]) if label in samples else np.zeros((0, 2))
-        for label in BOUNDARIES
-    ]
+    sides = [np.zeros((0, 2)) for _ in BOUNDARIES]
+    for label, one in samples.items():
+        beside = (one.station >= -_SETTLED) & (one.station <= distance + _SETTLED)
+        sides[label] = to_vehicle(one.points[beside][::_ACROSS], pose[None])
     line = _first_line(samples[LEFT], samples[RIGHT]) if len(samples) == len(BOUNDARIES) else None
     if line is None or len(line) < 2:
         no, none = np.zeros(0), np.zeros((0, 2))
@@ -128,10 +128,6 @@ class _Samples:
     curvature: Array
     station: Array
     confirmed: BoolArray
-
-    def beside(self, distance: float) -> Array:
-        wanted = (self.station >= -_SETTLED) & (self.station <= distance + _SETTLED)
-        return self.points[wanted][::_ACROSS]
 
 
 def _sampled(curve: CurveAhead, distance: float) -> _Samples:

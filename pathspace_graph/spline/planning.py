@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from math import inf, sqrt
+from math import sqrt
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -71,7 +71,10 @@ def speed_profile(
         steps = np.append(steps, line.length - line.arc_length[-1])[around[:-1]]
         squares, bend = squares[around], bend[around]
     else:
-        squares[0], squares[-1] = min(squares[0], _square(begin)), min(squares[-1], _square(end))
+        for at, limit in ((0, begin), (-1, end)):
+            if limit is not None and not 0.0 <= limit < np.inf:
+                raise SettingsError(f"a speed profile: expected a speed (m/s) from 0 on, found {limit:g}")
+            squares[at] = squares[at] if limit is None else min(squares[at], limit**2)
     squares = _accelerated(squares, steps, bend, settings.forward)
     squares = _accelerated(squares[::-1], steps[::-1], bend[::-1], settings.braking)[::-1]
     acceleration, speed = 0.5 * np.diff(squares) / steps, np.sqrt(squares)
@@ -94,15 +97,6 @@ def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Arra
         share = sqrt(max(1.0 - (now * turn) ** 2, 0.0))
         now = reached[i] = min(reached[i], now + 2.0 * most * share * step)
     return np.array(reached)
-
-
-def _square(speed: float | None) -> float:
-    """Return the square of a speed (m/s), which is unbounded where none is given."""
-    if speed is None:
-        return inf
-    if not 0.0 <= speed < inf:
-        raise SettingsError(f"a speed profile: expected a speed (m/s) from 0 on, found {speed:g}")
-    return speed**2
 
 
 _FEWEST: Final = 4  # smallest number of points of a line
