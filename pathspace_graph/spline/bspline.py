@@ -168,9 +168,13 @@ class BSpline:
 
     def local_basis(self, u: Array, derivative: int = 0) -> tuple[Array, IntArray]:
         """Return the basis (k, p + 1) at u (k,) and the distinct control points (k, p + 1) it multiplies."""
-        values, span = self.tables.evaluate(u, derivative)
+        values, columns = self._local(u, derivative)
+        return values[derivative], columns
+
+    def _local(self, u: Array, derivatives: int) -> tuple[Array, IntArray]:
+        values, span = self.tables.evaluate(u, derivatives)
         columns = span[:, None] + np.arange(-self.degree, 1)
-        return values[derivative], columns % self.size if self.periodic else columns
+        return values, columns % self.size if self.periodic else columns
 
     def basis_matrix(self, u: Array, derivative: int = 0) -> Array:
         """Return B (k, m) for the distinct control points: S(u) = B c."""
@@ -182,6 +186,11 @@ class BSpline:
         values, columns = self.local_basis(u, derivative)
         position: Array = np.einsum("kj,kjd->kd", values, self.control_points[columns])
         return position
+
+    def derivatives(self, u: Array, most: int) -> Array:
+        """Return S and its derivatives up to an order, (most + 1, k, 2), at u (k,), as `evaluate` does."""
+        values, columns = self._local(u, most)
+        return np.asarray(np.einsum("rkj,kjd->rkd", values, self.control_points[columns]))
 
     def tangent_unit(self, u: Array) -> Array:
         """Return S' / |S'| (k, 2), which is zero where S' vanishes."""
@@ -195,7 +204,7 @@ class BSpline:
 
     def curvature(self, u: Array) -> Array:
         """Return (x' y'' - y' x'') / |S'|^3 (k,) in 1/m: positive in a left turn, zero where S' vanishes."""
-        first, second = self.evaluate(u, 1), self.evaluate(u, 2)
+        _, first, second = self.derivatives(u, 2)
         bent = cross(first, second)
         cube = np.linalg.norm(first, axis=1) ** 3
         return np.asarray(np.divide(bent, cube, out=np.zeros_like(bent), where=cube > 0.0))

@@ -137,7 +137,8 @@ class CentreCurve:
             begin = u = np.interp(at, *self.table(side).T[::-1])
             far = _FARTHEST * np.linalg.norm(spline.evaluate(u) - points, axis=1)
             for _ in range(_CROSSING_STEPS):
-                slope, ahead = dot(spline.evaluate(u, 1), tangent), dot(spline.evaluate(u) - points, tangent)
+                point, first = spline.derivatives(u, 1)
+                ahead, slope = dot(point - points, tangent), dot(first, tangent)
                 u = u - np.divide(ahead, slope, out=np.zeros_like(u), where=slope != 0.0)
                 u = u if spline.periodic else np.minimum(np.maximum(u, low), high)
             offset = spline.evaluate(u) - points

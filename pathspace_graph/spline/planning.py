@@ -232,7 +232,7 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
     moved = [(B @ by_control).reshape(len(u), RIBBON, -1)[:, :2] for B in basis]
     tangent = centre.tangent_unit(u)
     normal, curvature = left_of(tangent), centre.curvature(u)[:, None]
-    first, second, third = (centre.evaluate(u, order) for order in (1, 2, 3))
+    _, first, second, third = centre.derivatives(u, 3)
     speed = np.linalg.norm(first, axis=1)
     across, along = _along(normal, moved[0]), _along(tangent, moved[0])
     heading = _along(normal, moved[1]) / speed[:, None] - curvature * along
