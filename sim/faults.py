@@ -1,6 +1,5 @@
 """The faults of a real car that white noise does not have, off by default, and what they do to a drive."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,11 +8,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError, check_numbers
-from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
+from pathspace_graph.io.log import Odometry
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from .curves import FloatArray, IntArray, arc_lengths
-from .sensor import FALSE_POSITIVE, ConeSensor, OdometryNoise, measure_twists
+from .sensor import OdometryNoise, measure_twists
 from .track import Track
 from .vehicle import Drive
 
@@ -165,29 +164,3 @@ def colours(track: Track, wrong_way: bool) -> IntArray:
     labels = track.cone_labels
     changed = wrong_way & np.isin(labels, BOUNDARIES)
     return np.where(changed, LEFT + RIGHT - labels, labels)
-
-
-def faulty(
-    sensor: ConeSensor, sides: IntArray, driven: Drive, lap: float, faults: SensorFaults, rng: Generator
-) -> Callable[[float, FloatArray], tuple[Detections, IntArray]]:
-    """Return how a sensor detects that is mounted badly, and that fails at times.
-
-    It makes a cycle, and the true cone of each detection, of the stamp (s) and the pose then.
-    """
-    dropout, begin = time_at(driven, faults.dropout_at * lap), faults.blind_at * lap
-    blind = (time_at(driven, begin), time_at(driven, begin + faults.blind))
-    unseen = np.flatnonzero(sides == NAMES.index(faults.blind_side))
-
-    def detect(t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
-        x, y, theta = pose
-        left = faults.lateral
-        mounted = np.array([x - np.sin(theta) * left, y + np.cos(theta) * left, theta + faults.yaw])
-        detections, cones = sensor.detect(t, mounted, faults.range_scale, faults.range_bias)
-        lost = rng.random(len(cones)) < faults.colourless
-        detections = replace(detections, labels=np.where(lost, UNKNOWN, detections.labels))
-        kept = np.full(len(cones), not dropout <= t < dropout + faults.dropout)
-        if blind[0] <= t < blind[1]:
-            kept &= ~np.isin(cones, unseen) | (cones == FALSE_POSITIVE)
-        return detections.where(kept), cones[kept]
-
-    return detect
