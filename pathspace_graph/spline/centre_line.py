@@ -285,7 +285,7 @@ def _first_pair(
 ) -> tuple[int, int]:
     """Return the nearest pair of samples that face each other, the left one on the left."""
     some = np.unique(np.linspace(0, len(samples[0]) - 1, _STARTS).astype(int))
-    lengths = [spline.arc_length(u) for spline, u in zip(sides, samples, strict=True)]
+    lengths = [np.linspace(0.0, spline.length(), len(u)) for spline, u in zip(sides, samples, strict=True)]
     tangents = [spline.tangent_unit(u) for spline, u in zip(sides, samples, strict=True)]
     # an open map may overlap itself before its loop is closed
     apart = np.inf if closed else 0.5 * min(spline.length() for spline in sides)
