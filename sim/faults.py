@@ -1,6 +1,5 @@
 """The faults of a real car that white noise does not have, off by default, and what they do to a drive."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,11 +8,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError, check_numbers
-from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
+from pathspace_graph.io.log import Odometry
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from .curves import FloatArray, IntArray, arc_lengths
-from .sensor import FALSE_POSITIVE, ConeSensor, OdometryNoise, measure_twists
+from .sensor import OdometryNoise, measure_twists
 from .track import Track
 from .vehicle import Drive
 
@@ -112,8 +111,9 @@ def time_at(driven: Drive, distance: float) -> float:
     return float(driven.t[reached[0]]) if len(reached) else np.inf
 
 
-def _is_within(t: FloatArray, begin: float, time: float) -> NDArray[np.bool_]:
-    return np.asarray((t >= begin) & (t < begin + time))
+def _is_during(driven: Drive, distance: float, time: float) -> NDArray[np.bool_]:
+    begin = time_at(driven, distance)
+    return np.asarray((driven.t >= begin) & (driven.t < begin + time))
 
 
 def turned_round(track: Track) -> Track:
@@ -143,8 +143,8 @@ def measure_odometry(
     measured, calibration = measure_twists(_slipping(driven, faults), dt, noise, rng)
     bias = np.array([0.0, 0.0, faults.yaw_rate_bias])
     measured = measured + bias if faults.yaw_rate_bias else measured
-    measured[_is_within(driven.t, time_at(driven, faults.zero_at * lap), faults.zero)] = 0.0
-    kept = ~_is_within(driven.t, time_at(driven, faults.gap_at * lap), faults.gap)
+    measured[_is_during(driven, faults.zero_at * lap, faults.zero)] = 0.0
+    kept = ~_is_during(driven, faults.gap_at * lap, faults.gap)
     kept[0] = True  # the first stamp is the beginning of the log
     return Odometry(driven.t[kept], measured[kept]), calibration + bias[1:]
 
@@ -164,34 +164,3 @@ def colours(track: Track, wrong_way: bool) -> IntArray:
     labels = track.cone_labels
     changed = wrong_way & np.isin(labels, BOUNDARIES)
     return np.where(changed, LEFT + RIGHT - labels, labels)
-
-
-def faulty(
-    sensor: ConeSensor, sides: IntArray, driven: Drive, lap: float, faults: SensorFaults, rng: Generator
-) -> Callable[[float, FloatArray], tuple[Detections, IntArray]]:
-    """Return how a sensor detects that is mounted badly, and that fails at times.
-
-    It makes a cycle, and the true cone of each detection, of the stamp (s) and the pose then.
-    """
-    dropout, begin = time_at(driven, faults.dropout_at * lap), faults.blind_at * lap
-    blind = (time_at(driven, begin), time_at(driven, begin + faults.blind))
-    unseen = np.flatnonzero(sides == NAMES.index(faults.blind_side))
-
-    def detect(t: float, pose: FloatArray) -> tuple[Detections, IntArray]:
-        detections, cones = sensor.detect(t, mounted(pose, faults), faults.range_scale, faults.range_bias)
-        lost = rng.random(len(cones)) < faults.colourless
-        detections = replace(detections, labels=np.where(lost, UNKNOWN, detections.labels))
-        kept = np.full(len(cones), not dropout <= t < dropout + faults.dropout)
-        if blind[0] <= t < blind[1]:
-            kept &= ~np.isin(cones, unseen) | (cones == FALSE_POSITIVE)
-        return detections.where(kept), cones[kept]
-
-    return detect
-
-
-def mounted(pose: FloatArray, faults: SensorFaults) -> FloatArray:
-    """Return the pose (3,) of the sensor on a vehicle: `lateral` m to its left, and turned by `yaw`."""
-    x, y, theta = pose
-    return np.array(
-        [x - np.sin(theta) * faults.lateral, y + np.cos(theta) * faults.lateral, theta + faults.yaw]
-    )

@@ -159,15 +159,20 @@ class ConeSensor:
         """
         parts = zip(self._detect_cones(pose, scale, bias), self._false_positives(), strict=True)
         ranges, bearings, labels, cones = (np.concatenate(part) for part in parts)
-        points, covariances = _cartesian(ranges, bearings, self._settings)
-        kept = slice(0 if self._drop_rng.random() < self._settings.dropped_cycles else None)
+        points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+        settings = self._settings
+        along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
+        covariances = polar_covariances(bearings, along, across)
+        kept = slice(0 if self._drop_rng.random() < settings.dropped_cycles else None)
         return Detections(t, points[kept], covariances[kept], labels[kept]), cones[kept]
 
     def _detect_cones(
         self, pose: FloatArray, scale: float, bias: float
     ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
         settings, rng = self._settings, self._cone_rng
-        ranges, bearings = _polar(self._cones[self._seen], pose)
+        step = self._cones[self._seen] - pose[:2]
+        ranges = np.hypot(step[:, 0], step[:, 1])
+        bearings = (np.arctan2(step[:, 1], step[:, 0]) - pose[2] + np.pi) % (2 * np.pi) - np.pi
         inside = (ranges <= settings.range_max) & (ranges >= settings.range_min)
         inside &= np.abs(bearings) <= settings.fov / 2
         cones, ranges, bearings = self._seen[inside], ranges[inside], bearings[inside]
@@ -212,18 +217,3 @@ class ConeSensor:
         bearings = rng.uniform(-settings.fov / 2, settings.fov / 2, count)
         labels = rng.integers(LEFT, RIGHT, count, endpoint=True)
         return ranges, bearings, labels, np.full(count, FALSE_POSITIVE)
-
-
-def _polar(cones: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    step = cones - pose[:2]
-    bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
-    return np.hypot(step[:, 0], step[:, 1]), np.asarray((bearings + np.pi) % (2 * np.pi) - np.pi)
-
-
-def _cartesian(
-    ranges: FloatArray, bearings: FloatArray, settings: SensorSettings
-) -> tuple[FloatArray, FloatArray]:
-    """Return points (m, 2) and covariances `R(b) diag(s_r^2, (r s_b)^2) R(b)^T`, vehicle frame."""
-    points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
-    along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
-    return points, polar_covariances(bearings, along, across)

@@ -9,13 +9,14 @@ from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth
+from pathspace_graph.labels import NAMES, UNKNOWN
 from pathspace_graph.lengths import scaled
 
 from .curves import FloatArray, IntArray
-from .faults import Faults, SensorFaults, colours, faulty, measure_odometry, put_down, turned_round
-from .sensor import ConeSensor, OdometryNoise, SensorSettings
+from .faults import Faults, SensorFaults, colours, measure_odometry, put_down, time_at, turned_round
+from .sensor import FALSE_POSITIVE, ConeSensor, OdometryNoise, SensorSettings
 from .track import Track, to_map_frame
-from .vehicle import Drive, VehicleSettings, drive, integrate
+from .vehicle import Drive, VehicleSettings, displacements, drive
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,12 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     driven = put_down(drive(track, settings.laps, settings.vehicle, wander_rng), lap, faults.vehicle)
     odometry, calibration = measure_odometry(driven, lap, settings.odometry, faults.odometry, odometry_rng)
     cycles, associations = _perceive(track, driven, settings, *sensor_rngs)
+    stamps = np.union1d(driven.t, [cycle.t for cycle in cycles])
+    poses = _poses_at(driven, stamps)
+    poses[:, 2] = np.pi - (np.pi - poses[:, 2]) % (2 * np.pi)
     errors = np.array([getattr(faults.sensor, name) for name in SENSOR])
-    truth = replace(
-        _truth(track, driven, cycles, associations),
+    truth = Truth(
+        *(stamps, poses, track.cones, track.cone_labels, associations),
         calibration=calibration,
         sensor=errors if errors.any() else None,
         noise=_noise(settings),
@@ -94,35 +98,39 @@ def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, 
 def _perceive(
     track: Track, driven: Drive, settings: SimulationSettings, sensor_rng: Generator, colour_rng: Generator
 ) -> tuple[list[Detections], IntArray]:
-    faults, rate, lap = settings.faults, settings.sensor.rate, track.centre_line.length
-    cones = ConeSensor(track.cones, colours(track, faults.vehicle.wrong_way), settings.sensor, sensor_rng)
-    detect = faulty(cones, track.cone_labels, driven, lap, faults.sensor, colour_rng)
+    """Return the cycles of a sensor that is mounted badly and fails at times, and their associations."""
+    faults, rate, lap = settings.faults.sensor, settings.sensor.rate, track.centre_line.length
+    labels = colours(track, settings.faults.vehicle.wrong_way)
+    sensor = ConeSensor(track.cones, labels, settings.sensor, sensor_rng)
     stamps = np.arange(int(driven.t[-1] * rate) + 1) / rate
-    stamps = stamps[stamps - faults.sensor.latency <= driven.t[-1]]
-    poses = _poses_at(driven, np.maximum(stamps - faults.sensor.latency, 0.0))
-    seen = [detect(t, pose) for t, pose in zip(stamps.tolist(), poses, strict=True)]
-    seen = [cycle for cycle in seen if len(cycle[1])]
-    associations = np.concatenate([np.zeros(0, dtype=int), *(own for _, own in seen)])
-    return [detections for detections, _ in seen], associations
+    stamps = stamps[stamps - faults.latency <= driven.t[-1]]
+    poses = _poses_at(driven, np.maximum(stamps - faults.latency, 0.0))
+    sine, cosine = np.sin(poses[:, 2]), np.cos(poses[:, 2])
+    poses += np.column_stack(
+        [-sine * faults.lateral, cosine * faults.lateral, np.full(len(poses), faults.yaw)]
+    )
+    dropout, begin = time_at(driven, faults.dropout_at * lap), faults.blind_at * lap
+    blind = time_at(driven, begin), time_at(driven, begin + faults.blind)
+    unseen = np.flatnonzero(track.cone_labels == NAMES.index(faults.blind_side))
+    cycles, associations = [], [np.zeros(0, dtype=int)]
+    for t, pose in zip(stamps.tolist(), poses, strict=True):
+        detections, cones = sensor.detect(t, pose, faults.range_scale, faults.range_bias)
+        lost = colour_rng.random(len(cones)) < faults.colourless
+        detections = replace(detections, labels=np.where(lost, UNKNOWN, detections.labels))
+        kept = np.full(len(cones), not dropout <= t < dropout + faults.dropout)
+        if blind[0] <= t < blind[1]:
+            kept &= ~np.isin(cones, unseen) | (cones == FALSE_POSITIVE)
+        if kept.any():
+            cycles.append(detections.where(kept))
+            associations.append(cones[kept])
+    return cycles, np.concatenate(associations)
 
 
 def _poses_at(driven: Drive, stamps: FloatArray) -> FloatArray:
     """Return true poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
     index = np.searchsorted(driven.t, stamps, side="right") - 1
-    since = stamps - driven.t[index]
-    poses = driven.poses[index].copy()
-    for k in np.flatnonzero(since):
-        x, y, turn = integrate(driven.twists[index[k], None], float(since[k]))[1]
-        cos, sin = np.cos(poses[k, 2]), np.sin(poses[k, 2])
-        poses[k] += (cos * x - sin * y, sin * x + cos * y, turn)
-    return poses
-
-
-def _truth(track: Track, driven: Drive, cycles: list[Detections], associations: IntArray) -> Truth:
-    stamps = np.union1d(driven.t, [cycle.t for cycle in cycles])
-    poses = _poses_at(driven, stamps)
-    poses[:, 2] = np.pi - (np.pi - poses[:, 2]) % (2 * np.pi)
-    return Truth(stamps, poses, track.cones, track.cone_labels, associations)
+    poses = driven.poses[index]
+    return poses + displacements(poses[:, 2], driven.twists[index], stamps - driven.t[index])
 
 
 CAMERA: Final = SensorSettings(

@@ -158,7 +158,10 @@ def _curve(layout: _Layout, rng: Generator) -> FloatArray:
         end = corners[following] - direction * tangent[following]
         pieces.append(_straight(corners[k] + direction * tangent[k], end, rng))
         pieces.append(_arc(end, direction, radii[following], turns[following]))
-    curve = _evenly(np.vstack(pieces))
+    polyline = ring(np.vstack(pieces))
+    s = arc_lengths(polyline)
+    even = np.linspace(0.0, s[-1], int(s[-1] / curves.STEP), endpoint=False)
+    curve = curves.along_polyline(even, s, polyline)
     return np.asarray(gaussian_filter1d(curve, curves.SMOOTHING / curves.STEP, axis=0, mode="wrap"))
 
 
@@ -213,14 +216,6 @@ def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
     return np.asarray(rng.choice([-1.0, 1.0]) * depth * (1 - np.cos(np.pi * part)) / 2)
 
 
-def _evenly(points: FloatArray) -> FloatArray:
-    polyline = ring(points)
-    s = arc_lengths(polyline)
-    return curves.along_polyline(
-        np.linspace(0.0, s[-1], int(s[-1] / curves.STEP), endpoint=False), s, polyline
-    )
-
-
 def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettings) -> bool:
     bend = np.abs(_curvature(curve))
     return bool(
@@ -264,19 +259,14 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
     )
     rows = [curve + side * normals * width / 2 for side in (1.0, -1.0)]
     gap = _straight_gap(rows, crowding, settings)
-    left, right = (_place_cones(row, _density(gap, crowding), rng) for row in rows)
+    left, right = (_place_cones(row, _cumulative(row, gap, crowding), rng) for row in rows)
     start = np.append(curve[0], np.arctan2(along[0, 1], along[0, 0]))
     return Track(left, right, np.zeros((0, 2)), True, start, "generated")
 
 
-def _density(gap: float, crowding: FloatArray) -> FloatArray:
-    return 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, CONE_GAP_MAX)
-
-
 def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackGeneratorSettings) -> float:
     def excess(gap: float) -> float:
-        density = _density(gap, crowding)
-        return float(sum(_cumulative(row, density)[-1] for row in rows)) - settings.cones
+        return float(sum(_cumulative(row, gap, crowding)[-1] for row in rows)) - settings.cones
 
     widest = CONE_GAP_MAX * float(crowding.max())
     if excess(widest) >= 0:
@@ -286,15 +276,17 @@ def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackG
     return float(brentq(excess, MIN_CONE_GAP, widest))
 
 
-def _cumulative(row: FloatArray, density: FloatArray) -> FloatArray:
-    """Return the number of cones from the first sample to each, and round to the first again (n + 1,)."""
-    steps = np.diff(arc_lengths(ring(row)))
-    return np.concatenate([[0.0], np.cumsum(steps * density)])
+def _cumulative(row: FloatArray, gap: float, crowding: FloatArray) -> FloatArray:
+    """Return the number of cones from the first sample to each, and round to the first again (n + 1,).
+
+    They are `gap` (m) apart where nothing crowds them.
+    """
+    density = 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, CONE_GAP_MAX)
+    return np.concatenate([[0.0], np.cumsum(np.diff(arc_lengths(ring(row))) * density)])
 
 
-def _place_cones(row: FloatArray, density: FloatArray, rng: Generator) -> FloatArray:
-    """Place cones (k, 2) along a closed row at this density, with a random offset."""
-    total = _cumulative(row, density)
+def _place_cones(row: FloatArray, total: FloatArray, rng: Generator) -> FloatArray:
+    """Place cones (k, 2) along a closed row by their cumulative number, with a random offset."""
     count = int(np.ceil(total[-1]))
     at = (np.arange(count) + rng.random()) * total[-1] / count
     return curves.along_polyline(at, total, ring(row))

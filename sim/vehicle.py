@@ -81,12 +81,17 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
 def integrate(twists: FloatArray, dt: float | FloatArray) -> FloatArray:
     """Integrate body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from 0 by SE(2)'s exp."""
     theta = np.concatenate([[0.0], np.cumsum(twists[:, 2] * dt)])
+    steps = displacements(theta[:-1], twists, dt)[:, :2]
+    return np.column_stack([np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]), theta])
+
+
+def displacements(theta: FloatArray, twists: FloatArray, dt: float | FloatArray) -> FloatArray:
+    """Return what body twists (N, 3), each constant for `dt`, add to poses with headings theta (N,)."""
     a, b = _exponential(twists[:, 2] * dt)
     dx = (a * twists[:, 0] - b * twists[:, 1]) * dt
     dy = (b * twists[:, 0] + a * twists[:, 1]) * dt
-    cos, sin = np.cos(theta[:-1]), np.sin(theta[:-1])
-    steps = np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy])
-    return np.column_stack([np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]), theta])
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy, twists[:, 2] * dt])
 
 
 def _twists(poses: FloatArray, dt: float) -> FloatArray:

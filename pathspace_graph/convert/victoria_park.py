@@ -116,11 +116,9 @@ def _read(file: Path) -> Drive:
 
 def _reference(drive: Drive, t: Array) -> Truth:
     values = _optimum(drive)
-    poses = [values.atPose2(X(index)) for index in range(len(t))]
-    trees = np.array([values.atPoint2(L(index)) for index in range(int(drive.tree.max()) + 1)])
-    heading = np.unwrap([pose.theta() for pose in poses])
-    placed = np.column_stack([[pose.x() for pose in poses], [pose.y() for pose in poses], heading])
-    return Truth(t, placed - placed[0], trees, np.full(len(trees), LEFT), drive.tree)
+    poses, trees = gtsam.utilities.extractPose2(values), gtsam.utilities.extractPoint2(values)
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    return Truth(t, poses - poses[0], trees, np.full(len(trees), LEFT), drive.tree)
 
 
 def _optimum(drive: Drive) -> Any:

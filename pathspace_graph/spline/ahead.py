@@ -17,6 +17,7 @@ from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
+from .bspline import dot
 from .centre_line import points_across
 
 LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
@@ -106,10 +107,10 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
         least = distance / MOST_POINTS
         raise SettingsError(f"step: expected a number of at least {least:g} m, found {step:g}")
     samples = {label: _sampled(curve, distance) for label, curve in curves.items()}
-    sides = [
-        to_vehicle(samples[label].beside(distance), pose[None]) if label in samples else np.zeros((0, 2))
-        for label in BOUNDARIES
-    ]
+    sides = [np.zeros((0, 2)) for _ in BOUNDARIES]
+    for label, one in samples.items():
+        beside = (one.station >= -_SETTLED) & (one.station <= distance + _SETTLED)
+        sides[label] = to_vehicle(one.points[beside][::_ACROSS], pose[None])
     line = _first_line(samples[LEFT], samples[RIGHT]) if len(samples) == len(BOUNDARIES) else None
     if line is None or len(line) < 2:
         no, none = np.zeros(0), np.zeros((0, 2))
@@ -127,10 +128,6 @@ class _Samples:
     curvature: Array
     station: Array
     confirmed: BoolArray
-
-    def beside(self, distance: float) -> Array:
-        wanted = (self.station >= -_SETTLED) & (self.station <= distance + _SETTLED)
-        return self.points[wanted][::_ACROSS]
 
 
 def _sampled(curve: CurveAhead, distance: float) -> _Samples:
@@ -154,10 +151,10 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
         parts = [np.concatenate(pair) for pair in zip(parts, on, strict=True)]
         confirmed = np.append(confirmed, np.zeros(len(on[0]), bool))
     points, first_order, second = parts
-    square = _dot(first_order, first_order)
+    square = dot(first_order, first_order)
     speed = np.sqrt(square)
     station = float(u[0] - curve.beside) + np.cumsum(_distances(points))
-    curvature = _dot(left_of(first_order), second) / (square * speed)
+    curvature = dot(left_of(first_order), second) / (square * speed)
     return _Samples(points, first_order / speed[:, None], curvature, station, confirmed)
 
 
@@ -202,11 +199,11 @@ def _first_line(left: _Samples, right: _Samples) -> Array:
 def _from_beside(line: Array, position: Array, distance: float, step: float) -> Array:
     """Return the line (n, 4) at even steps, from the point beside a position (2,) on."""
     edges = np.diff(line[:, :2], axis=0)
-    squares = _dot(edges, edges)
+    squares = dot(edges, edges)
     offset = position - line[:-1, :2]
-    share = np.minimum(np.maximum(_dot(offset, edges) / squares, 0.0), 1.0)
+    share = np.minimum(np.maximum(dot(offset, edges) / squares, 0.0), 1.0)
     away = offset - share[:, None] * edges
-    nearest = int(_dot(away, away).argmin())
+    nearest = int(dot(away, away).argmin())
     lengths = np.append(0.0, np.cumsum(np.sqrt(squares)))
     begin = lengths[nearest] + share[nearest] * (lengths[nearest + 1] - lengths[nearest])
     count = int(min(distance, lengths[-1] - begin) / step + _SETTLED)
@@ -224,7 +221,7 @@ def _settled(
             foot.find(points)
         off = feet[0].distance + feet[1].distance
         both = feet[0].normal + feet[1].normal
-        square = np.maximum(_dot(both, both), np.finfo(float).tiny)[:, None]
+        square = np.maximum(dot(both, both), np.finfo(float).tiny)[:, None]
         inside = feet[0].inside & feet[1].inside
         if not (inside & ((np.abs(off) > _SETTLED) | feet[0].slid | feet[1].slid)).any():
             break
@@ -235,7 +232,7 @@ def _settled(
     normal = both / np.sqrt(square)
     heading = np.arctan2(-normal[:, 0], normal[:, 1]) - pose[2]
     half_turn = 0.5 * wrap_angle(np.diff(heading[:n], prepend=heading[:n][:1]))
-    bend = 0.5 * _dot(normal, feet[0].normal) * (feet[0].offset_curvature + feet[1].offset_curvature)
+    bend = 0.5 * dot(normal, feet[0].normal) * (feet[0].offset_curvature + feet[1].offset_curvature)
     return TrackAhead(
         points=to_vehicle(points[:n], pose[None]),
         heading=wrap_angle(heading[:n]),
@@ -287,7 +284,7 @@ class _Feet:
     def _frame(self, points: Array) -> None:
         samples, at = self._samples, self._at
         offset = points - samples.points[at]
-        self.a, self.b = _dot(offset, samples.tangents[at]), _dot(offset, self._normals[at])
+        self.a, self.b = dot(offset, samples.tangents[at]), dot(offset, self._normals[at])
         self.k = samples.curvature[at]
         self.spread = self._spread(self.b)
 
@@ -305,15 +302,11 @@ class _Feet:
 
         The distance w solves `k w^2 + 2 w (k (a s + b t) - t) + k (a^2 + b^2) - 2 b = 0` for the way (s, t).
         """
-        s, t = _dot(way, self._samples.tangents[self._at]), _dot(way, self._normals[self._at])
+        s, t = dot(way, self._samples.tangents[self._at]), dot(way, self._normals[self._at])
         half = self.k * (self.a * s + self.b * t) - t
         rest = self.k * (self.a**2 + self.b**2) - 2.0 * self.b
         root = np.sqrt(np.maximum(half**2 - self.k * rest, 0.0))
         return np.abs(rest / (half + np.where(half < 0.0, -root, root)))
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.einsum("kd,kd->k", a, b))
 
 
 def _distances(points: Array) -> Array:

@@ -128,9 +128,7 @@ class Boundary:
         return columns % self.size if self.periodic else columns
 
     def spline(self, control_points: Array) -> BSpline:
-        spline = BSpline(self.knots, self.extended(control_points), self.degree, self.periodic)
-        spline.__dict__["tables"] = self.tables
-        return spline
+        return BSpline.on(self.tables, self.extended(control_points))
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
         """Search the foot points of points (m, 2) in the stretches [low, high], each (m,)."""

@@ -1,6 +1,6 @@
 """Plane B-spline curves: evaluation, arc length, exact changes of the ends, and covariance."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Self
 
@@ -121,6 +121,13 @@ class BSpline:
         return cls(periodic_knots(breaks, degree), unwrapped, degree, periodic=True)
 
     @classmethod
+    def on(cls, tables: SpanPolynomials, control_points: Array) -> Self:
+        """Return a curve that shares a basis; its control points (n, 2) are unwrapped."""
+        spline = cls(tables.knots, control_points, tables.degree, tables.periodic)
+        spline.__dict__["tables"] = tables
+        return spline
+
+    @classmethod
     def even(cls, low: float, high: float, intervals: int, periodic: bool, degree: int = 3) -> Self:
         """Return a curve of zeros on equally spaced knots; the ends of an open one float."""
         if periodic:
@@ -157,15 +164,17 @@ class BSpline:
     def with_points(self, distinct: Array) -> Self:
         """Return the spline of the same basis with other distinct control points (m, 2)."""
         points = np.concatenate([distinct, distinct[: self.degree]]) if self.periodic else distinct
-        spline = replace(self, control_points=points)
-        spline.__dict__["tables"] = self.tables
-        return spline
+        return type(self).on(self.tables, points)
 
     def local_basis(self, u: Array, derivative: int = 0) -> tuple[Array, IntArray]:
         """Return the basis (k, p + 1) at u (k,) and the distinct control points (k, p + 1) it multiplies."""
-        values, span = self.tables.evaluate(u, derivative)
+        values, columns = self._local(u, derivative)
+        return values[derivative], columns
+
+    def _local(self, u: Array, derivatives: int) -> tuple[Array, IntArray]:
+        values, span = self.tables.evaluate(u, derivatives)
         columns = span[:, None] + np.arange(-self.degree, 1)
-        return values[derivative], columns % self.size if self.periodic else columns
+        return values, columns % self.size if self.periodic else columns
 
     def basis_matrix(self, u: Array, derivative: int = 0) -> Array:
         """Return B (k, m) for the distinct control points: S(u) = B c."""
@@ -177,6 +186,11 @@ class BSpline:
         values, columns = self.local_basis(u, derivative)
         position: Array = np.einsum("kj,kjd->kd", values, self.control_points[columns])
         return position
+
+    def derivatives(self, u: Array, most: int) -> Array:
+        """Return S and its derivatives up to an order, (most + 1, k, 2), at u (k,), as `evaluate` does."""
+        values, columns = self._local(u, most)
+        return np.asarray(np.einsum("rkj,kjd->rkd", values, self.control_points[columns]))
 
     def tangent_unit(self, u: Array) -> Array:
         """Return S' / |S'| (k, 2), which is zero where S' vanishes."""
@@ -190,7 +204,7 @@ class BSpline:
 
     def curvature(self, u: Array) -> Array:
         """Return (x' y'' - y' x'') / |S'|^3 (k,) in 1/m: positive in a left turn, zero where S' vanishes."""
-        first, second = self.evaluate(u, 1), self.evaluate(u, 2)
+        _, first, second = self.derivatives(u, 2)
         bent = cross(first, second)
         cube = np.linalg.norm(first, axis=1) ** 3
         return np.asarray(np.divide(bent, cube, out=np.zeros_like(bent), where=cube > 0.0))
@@ -333,6 +347,11 @@ def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
         share = ((x - lower) / (upper - lower))[:, None]
         weights = (1.0 - share) * weights[:-1] + share * weights[1:]
     return np.asarray(weights[0])
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Return the scalar products (k,) of plane vectors (k, 2)."""
+    return np.asarray(np.einsum("kd,kd->k", a, b))
 
 
 def cross(a: Array, b: Array) -> Array:

@@ -5,7 +5,7 @@ It is kept as a ribbon, one B-spline of the centre line and half the width.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
@@ -16,7 +16,8 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
 from pathspace_graph.factors.se2 import left_of, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.spline.bspline import BSpline, segments_cross
+
+from .bspline import BSpline, dot, segments_cross
 
 SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line on which the edge of each label is
 SAMPLE_STEP: Final = 0.5  # distance of the samples of boundaries, of lines, and of edges that are fitted (m)
@@ -34,9 +35,7 @@ class Ribbon(BSpline):
 
     @cached_property
     def centre(self) -> BSpline:
-        centre = BSpline(self.knots, self.control_points[:, :2], self.degree, self.periodic)
-        centre.__dict__["tables"] = self.tables
-        return centre
+        return BSpline.on(self.tables, self.control_points[:, :2])
 
     def half_width(self, u: Array) -> Array:
         """Return half the width (k,) of the track in m."""
@@ -128,9 +127,28 @@ class CentreCurve:
             u = table[0, 0] + np.mod(u - table[0, 0], high - low)
         return np.interp(u, table[:, 0], table[:, 1])
 
-    def crossings(self, u: Array) -> "list[Crossing]":
-        beside = [np.interp(u, *self.table(side).T[::-1]) for side in range(2)]
-        return [_crossing(self.ribbon, u, self.sides[s], beside[s], 1.0 - 2.0 * s) for s in range(2)]
+    def crossings(self, at: Array) -> "list[Crossing]":
+        """Return where the normals at parameters `at` (k,) of the ribbon cross each boundary."""
+        points, tangent = self.ribbon.centre.evaluate(at), self.ribbon.centre.tangent_unit(at)
+        normal, half = left_of(tangent), self.ribbon.half_width(at)
+        found = []
+        for side, spline in enumerate(self.sides):
+            outward, (low, high) = SIDE[side], spline.domain
+            begin = u = np.interp(at, *self.table(side).T[::-1])
+            far = _FARTHEST * np.linalg.norm(spline.evaluate(u) - points, axis=1)
+            for _ in range(_CROSSING_STEPS):
+                point, first = spline.derivatives(u, 1)
+                ahead, slope = dot(point - points, tangent), dot(first, tangent)
+                u = u - np.divide(ahead, slope, out=np.zeros_like(u), where=slope != 0.0)
+                u = u if spline.periodic else np.minimum(np.maximum(u, low), high)
+            offset = spline.evaluate(u) - points
+            across = dot(offset, normal)
+            good = np.abs(dot(offset, tangent)) <= _CROSSED
+            good &= (outward * across > 0.0) & (np.abs(across) <= far)
+            good &= dot(spline.tangent_unit(u), tangent) >= _LEAST_COSINE
+            u, across = np.where(good, u, begin), np.where(good, across, outward * half)
+            found.append(Crossing(spline, u, normal, across, good))
+        return found
 
     @cached_property
     def by_boundaries(self) -> Array:
@@ -163,16 +181,13 @@ class Crossing:
     def own_normal(self) -> Array:
         """Normals N (k, 2) of the boundary over N . n, the cosine of its angle to the line."""
         own = self.spline.normal_unit(self.u)
-        facing = np.einsum("kd,kd->k", own, self.normal)
-        return np.asarray(own / np.maximum(facing, _LEAST_COSINE)[:, None])
+        return np.asarray(own / np.maximum(dot(own, self.normal), _LEAST_COSINE)[:, None])
 
     def along_normal(self, first: int, size: int) -> csr_array:
         """Return the derivatives (k, 2s) of the offset by control points, its boundary's from `first` on."""
         values, columns = self.spline.local_basis(self.u)
-        entries = (values[:, :, None] * self.own_normal[:, None, :]).reshape(-1)
-        at = (2 * (columns + first)[:, :, None] + np.arange(2)).reshape(-1)
-        of = np.repeat(np.arange(len(self.u)), 2 * values.shape[1])
-        return csr_array((entries, (of, at)), shape=(len(self.u), 2 * size))
+        entries = values[:, :, None] * self.own_normal[:, None, :]
+        return sparse_rows(entries, 2 * (columns + first)[:, :, None] + np.arange(2), 2 * size)
 
 
 def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPACING) -> CentreCurve:
@@ -216,41 +231,23 @@ def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPAC
     return line
 
 
-def _crossing(ribbon: Ribbon, at: Array, spline: BSpline, u: Array, side: float) -> Crossing:
-    """Return the crossings with the normals at parameters `at` (k,), found from the parameters u (k,)."""
-    points, tangent = ribbon.centre.evaluate(at), ribbon.centre.tangent_unit(at)
-    normal, begin, (low, high) = left_of(tangent), u, spline.domain
-    far = _FARTHEST * np.linalg.norm(spline.evaluate(u) - points, axis=1)
-    for _ in range(_CROSSING_STEPS):
-        slope = np.einsum("kd,kd->k", spline.evaluate(u, 1), tangent)
-        ahead = np.einsum("kd,kd->k", spline.evaluate(u) - points, tangent)
-        u = u - np.divide(ahead, slope, out=np.zeros_like(u), where=slope != 0.0)
-        u = u if spline.periodic else np.minimum(np.maximum(u, low), high)
-    offset = spline.evaluate(u) - points
-    across = np.einsum("kd,kd->k", offset, normal)
-    good = np.abs(np.einsum("kd,kd->k", offset, tangent)) <= _CROSSED
-    good &= (side * across > 0.0) & (np.abs(across) <= far)
-    good &= np.einsum("kd,kd->k", spline.tangent_unit(u), tangent) >= _LEAST_COSINE
-    return Crossing(
-        spline, np.where(good, u, begin), normal, np.where(good, across, side * ribbon.half_width(at)), good
-    )
-
-
 class _Fit:
     """The least-squares fit of a ribbon's control points to values at parameters u (k,)."""
 
     def __init__(self, ribbon: Ribbon, u: Array) -> None:
-        values, columns = ribbon.local_basis(u)
-        rows = np.repeat(np.arange(len(u)), values.shape[1])
-        self._basis = csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(u), ribbon.size))
-        bending = ribbon.bending
-        rows = np.repeat(np.arange(len(bending)), bending.shape[1])
-        columns = (np.arange(len(bending))[:, None] + np.arange(bending.shape[1])) % ribbon.size
-        D = csr_array((bending.ravel(), (rows, columns.ravel())), shape=(len(bending), ribbon.size))
+        self._basis = sparse_rows(*ribbon.local_basis(u), ribbon.size)
+        triples = (np.arange(len(ribbon.bending))[:, None] + np.arange(RIBBON)) % ribbon.size
+        D = sparse_rows(ribbon.bending, triples, ribbon.size)
         self._factor: SuperLU = splu(csc_array(self._basis.T @ self._basis + _SMOOTHNESS**2 * (D.T @ D)))
 
     def solve(self, values: Array) -> Array:
         return np.asarray(self._factor.solve(np.asarray(self._basis.T @ values)))
+
+
+def sparse_rows(values: Array, columns: IntArray, size: int) -> csr_array:
+    """Return the matrix (k, size) of the values (k, ...) of each row in these columns."""
+    ends = np.arange(len(values) + 1) * (values.size // len(values))
+    return csr_array((values.ravel(), columns.ravel(), ends), shape=(len(values), size))
 
 
 # --- pairs along the strip -------------------------------------------------------------------------------
@@ -288,7 +285,7 @@ def _first_pair(
 ) -> tuple[int, int]:
     """Return the nearest pair of samples that face each other, the left one on the left."""
     some = np.unique(np.linspace(0, len(samples[0]) - 1, _STARTS).astype(int))
-    lengths = [spline.arc_length(u) for spline, u in zip(sides, samples, strict=True)]
+    lengths = [np.linspace(0.0, spline.length(), len(u)) for spline, u in zip(sides, samples, strict=True)]
     tangents = [spline.tangent_unit(u) for spline, u in zip(sides, samples, strict=True)]
     # an open map may overlap itself before its loop is closed
     apart = np.inf if closed else 0.5 * min(spline.length() for spline in sides)
@@ -310,8 +307,8 @@ def points_across(
     """
     normals = left_of(tangents[0]), left_of(tangents[1])
     square = ((points[0][:, None] - points[1]) ** 2).sum(axis=2)
-    good = normals[0] @ points[1].T < np.einsum("kd,kd->k", points[0], normals[0])[:, None]
-    good &= points[0] @ normals[1].T > np.einsum("kd,kd->k", points[1], normals[1])
+    good = normals[0] @ points[1].T < dot(points[0], normals[0])[:, None]
+    good &= points[0] @ normals[1].T > dot(points[1], normals[1])
     good &= tangents[0] @ tangents[1].T > 0.0
     good &= np.abs(lengths[0][:, None] - lengths[1]) <= apart
     found = np.flatnonzero(good.any(axis=1))
@@ -345,18 +342,13 @@ def _square(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 
 def _check_apart(lefts: Array, rights: Array, i: IntArray, j: IntArray, closed: bool) -> None:
     """Raise a SettingsError where the boundaries cross near a pair of samples that face each other."""
+    mode: Literal["wrap", "clip"] = "wrap" if closed else "clip"
     near = j[:, None] + np.arange(-_NEAR, _NEAR + 1)
-    p, q = _segments(lefts, i[:, None], closed)
-    crossed = segments_cross(p, q, *_segments(rights, near, closed)).any(axis=1)
+    p, q = (lefts.take(i[:, None] + k, axis=0, mode=mode) for k in range(2))
+    r, s = (rights.take(near + k, axis=0, mode=mode) for k in range(2))
+    crossed = segments_cross(p, q, r, s).any(axis=1)
     if crossed.any():
         x, y = p[crossed.argmax(), 0]
         raise SettingsError(
             f"expected boundaries that do not cross, found them crossing near x = {x:.1f} m, y = {y:.1f} m"
         )
-
-
-def _segments(points: Array, index: IntArray, closed: bool) -> tuple[Array, Array]:
-    if closed:
-        return points[index % len(points)], points[(index + 1) % len(points)]
-    last = len(points) - 1
-    return points[np.clip(index, 0, last)], points[np.clip(index + 1, 0, last)]

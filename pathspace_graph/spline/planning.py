@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
-from math import inf, sqrt
+from math import sqrt
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.settings.output import SpeedSettings
 
 from .ahead import MOST_POINTS, TrackAhead, check_length
-from .bspline import BSpline, cross
-from .centre_line import CentreCurve, Crossing, find_line
+from .bspline import BSpline, cross, dot
+from .centre_line import CentreCurve, Crossing, find_line, sparse_rows
 
 if TYPE_CHECKING:
     import pandas as pd  # imported when it is asked for: a planner has no use for it
@@ -70,7 +71,10 @@ def speed_profile(
         steps = np.append(steps, line.length - line.arc_length[-1])[around[:-1]]
         squares, bend = squares[around], bend[around]
     else:
-        squares[0], squares[-1] = min(squares[0], _square(begin)), min(squares[-1], _square(end))
+        for at, limit in ((0, begin), (-1, end)):
+            if limit is not None and not 0.0 <= limit < np.inf:
+                raise SettingsError(f"a speed profile: expected a speed (m/s) from 0 on, found {limit:g}")
+            squares[at] = squares[at] if limit is None else min(squares[at], limit**2)
     squares = _accelerated(squares, steps, bend, settings.forward)
     squares = _accelerated(squares[::-1], steps[::-1], bend[::-1], settings.braking)[::-1]
     acceleration, speed = 0.5 * np.diff(squares) / steps, np.sqrt(squares)
@@ -93,15 +97,6 @@ def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Arra
         share = sqrt(max(1.0 - (now * turn) ** 2, 0.0))
         now = reached[i] = min(reached[i], now + 2.0 * most * share * step)
     return np.array(reached)
-
-
-def _square(speed: float | None) -> float:
-    """Return the square of a speed (m/s), which is unbounded where none is given."""
-    if speed is None:
-        return inf
-    if not 0.0 <= speed < inf:
-        raise SettingsError(f"a speed profile: expected a speed (m/s) from 0 on, found {speed:g}")
-    return speed**2
 
 
 _FEWEST: Final = 4  # smallest number of points of a line
@@ -232,31 +227,31 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
     """
     if covariance is None:
         return [np.full(len(u), np.nan)] * 6
-    centre, by_control = line.ribbon.centre, line.by_boundaries.reshape(line.ribbon.size, 3, -1)
-    basis = [centre.basis_matrix(u, order) for order in range(3)]
-    moved = [np.einsum("kj,jdm->kdm", B, by_control[:, :2]) for B in basis]
+    centre, by_control = line.ribbon.centre, line.by_boundaries.reshape(line.ribbon.size, -1)
+    basis = [sparse_rows(*centre.local_basis(u, order), centre.size) for order in range(3)]
+    moved = [(B @ by_control).reshape(len(u), RIBBON, -1)[:, :2] for B in basis]
     tangent = centre.tangent_unit(u)
     normal, curvature = left_of(tangent), centre.curvature(u)[:, None]
-    first, second, third = (centre.evaluate(u, order) for order in (1, 2, 3))
+    _, first, second, third = centre.derivatives(u, 3)
     speed = np.linalg.norm(first, axis=1)
-    across, along = _dot(normal, moved[0]), _dot(tangent, moved[0])
-    heading = _dot(normal, moved[1]) / speed[:, None] - curvature * along
+    across, along = _along(normal, moved[0]), _along(tangent, moved[0])
+    heading = _along(normal, moved[1]) / speed[:, None] - curvature * along
     cube = (speed**3)[:, None]
-    bent = _dot(-left_of(second) / cube - 3.0 * curvature / speed[:, None] * tangent, moved[1])
-    bent = bent + _dot(left_of(first) / cube, moved[2])
+    bent = _along(-left_of(second) / cube - 3.0 * curvature / speed[:, None] * tangent, moved[1])
+    bent = bent + _along(left_of(first) / cube, moved[2])
     by_parameter = cross(first, third) / cube[:, 0]
-    by_parameter -= 3.0 * curvature[:, 0] * np.einsum("kd,kd->k", first, second) / speed**2
+    by_parameter -= 3.0 * curvature[:, 0] * dot(first, second) / speed**2
     bent = bent - (by_parameter / speed)[:, None] * along
     shorter = -curvature * across
     pieces = 0.5 * np.diff(centre.arc_length(u))[:, None] * (shorter[1:] + shorter[:-1])
     lengths = np.concatenate([np.zeros((1, pieces.shape[1])), np.cumsum(pieces, axis=0)])
     rows = [across, heading, bent, lengths]
     for one, begin in zip(crossings, (0, line.sides[0].size), strict=True):
-        turn = one.offset * np.einsum("kd,kd->k", one.own_normal, tangent)
+        turn = one.offset * dot(one.own_normal, tangent)
         rows.append(one.along_normal(begin, line.size) + turn[:, None] * heading - across)
     return [np.sqrt(np.maximum(np.einsum("km,km->k", row @ covariance, row), 0.0)) for row in rows]
 
 
-def _dot(a: Array, moved: Array) -> Array:
+def _along(a: Array, moved: Array) -> Array:
     """Return a . dC (n, M) of vectors a (n, 2) and derivatives (n, 2, M)."""
     return np.asarray(np.einsum("kd,kdm->km", a, moved))
