@@ -91,8 +91,8 @@ class Revisits:
         before = smoother.variables.poses[-1].copy()
         keyframes = smoother.revisit(revisit.factor(), smoother.map.settings.closing.iterations, SIGMA_STEP)
         after = smoother.variables.poses[-1].copy()
-        for follower in smoother.followers:
-            follower.move(compose(after, inverse(before)))
+        for one in smoother.attached:
+            one.move(compose(after, inverse(before)))
         record.bent(keyframes, smoother)
         return np.asarray(after - before)
 
@@ -191,7 +191,7 @@ def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
     settings, track = smoother.map.settings.closing, smoother.map
     if not may_tell_place(track.state, settings):
         return None
-    smoother.carry()
+    smoother.transform_to_origin()
     covariance = smoother.newest_covariance()
     return find_place(track, covariance, settings) if is_lost(covariance, settings) else None
 
