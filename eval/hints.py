@@ -1,4 +1,4 @@
-"""`python -m pathspace_graph.eval.hints` measures how many spoiled logs are told and good ones accused.
+"""`python -m pathspace_graph.eval.hints` measures of how many spoiled logs the cause is named, and how many good ones are accused.
 
 Good logs of all kinds are judged: what is unusual about them is no mistake, and none may be accused.
 """
@@ -178,7 +178,7 @@ GOOD: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class HintStudy:
-    """Spoil simulated logs by each mistake, and vary good ones; say how many are told and accused."""
+    """Spoil simulated logs by each mistake, and vary good ones; say how many are named and accused."""
 
     out: Path
     """Folder for the results; earlier ones there are kept as a numbered backup."""
@@ -255,9 +255,14 @@ def judged(log: Log, causes: Sequence[str] = ()) -> Row:
     begin = time.perf_counter()
     with threadpool_limits(limits=1):
         said = hints(log)
-    seconds, named = time.perf_counter() - begin, [hint.cause for hint in said]
-    told, text = any(cause in named for cause in causes), " | ".join(hint.line for hint in said)
-    return {"said": bool(said), "told": told, "causes": "; ".join(named), "seconds": seconds, "text": text}
+    seconds, found = time.perf_counter() - begin, [hint.cause for hint in said]
+    return {
+        "accused": bool(said),
+        "named": any(cause in found for cause in causes),
+        "causes": "; ".join(found),
+        "seconds": seconds,
+        "text": " | ".join(hint.line for hint in said),
+    }
 
 
 def mapped(log: Log) -> Row:
@@ -289,15 +294,15 @@ def outcome(found: Row, clean: Row) -> Row:
 
 
 def summary(rows: pd.DataFrame) -> TextTable:
-    """Return the table: for each kind of log how many were told or accused, with exact intervals."""
+    """Return the table: for each kind of log how many were named or accused, with exact intervals."""
     lines, groups = list[tuple[str, ...]](), list[int]()
-    for kind, verb, column in (("spoiled", "told", "told"), ("good", "accused", "said")):
+    for kind, column in (("spoiled", "named"), ("good", "accused")):
         of_kind = rows[rows["kind"] == kind]
         groups += [len(lines)] if len(of_kind) else []
         by_name = (*of_kind.groupby("name", sort=False), ("all", of_kind)) if len(of_kind) else ()
-        lines += [_line(f"{verb}: {name}", logs, column) for name, logs in by_name]
+        lines += [_line(f"{column}: {name}", logs, column) for name, logs in by_name]
     title = (
-        "Spoiled logs that are told by their cause, and good logs that are accused of anything, with the "
+        "Spoiled logs whose cause is named, and good logs that are accused of anything, with the "
         f"{100.0 * CONFIDENCE:.0f} % interval of Clopper and Pearson."
     )
     header = ("logs", "number", "of", "share [%]", "interval [%]", "maps", "seconds")
@@ -307,7 +312,7 @@ def summary(rows: pd.DataFrame) -> TextTable:
 def _line(name: str, logs: pd.DataFrame, column: str) -> tuple[str, ...]:
     count, total = int(logs[column].sum()), len(logs)
     interval = binomtest(count, total).proportion_ci(CONFIDENCE)
-    maps = logs["map"].value_counts().to_dict() if "map" in logs and column == "told" else {}
+    maps = logs["map"].value_counts().to_dict() if "map" in logs and column == "named" else {}
     return (
         name,
         str(count),

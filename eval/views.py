@@ -139,7 +139,7 @@ def camera_table(frame: pd.DataFrame) -> View:
     parts = {f"`{estimator}`, {stated.get(noise, noise)}": part for (estimator, noise), part in runs}
     oracle = (_figure("l", last.drop_duplicates([*RUN])), *[Figure(None)] * (len(keys) - 1))  # one a drive
     header, rows = _by_part("estimator, noise", parts, keys, TITLES_CAMERA)
-    return header, (*rows, ("landmarks, told all", oracle))
+    return header, (*rows, ("landmarks, given all", oracle))
 
 
 def study_table(study: Study, frame: pd.DataFrame) -> View:
@@ -170,12 +170,12 @@ def difference_table(study: Study, frame: pd.DataFrame, other: str, keys: Sequen
 
 
 def hints_table(rows: pd.DataFrame) -> View:
-    """Return the share of the logs that are told by their cause, for each mistake, or accused."""
+    """Return the share of the logs whose cause is named, for each mistake, or that are accused."""
     spoiled, good = rows[rows["kind"] == "spoiled"], rows[rows["kind"] == "good"]
-    groups = {str(name): of["reported"] for name, of in spoiled.groupby("name", sort=False)}
-    groups |= {"**all mistakes**": spoiled["reported"], "**good logs, accused of any**": good["notices"]}
-    rows = tuple((name, Figure.row((told.sum(), len(told)), 0)) for name, told in groups.items())
-    return ("mistake", "reported", "logs"), rows
+    groups = {str(name): of["named"] for name, of in spoiled.groupby("name", sort=False)}
+    groups |= {"**all mistakes**": spoiled["named"], "**good logs, accused of any**": good["accused"]}
+    rows = tuple((name, Figure.row((hits.sum(), len(hits)), 0)) for name, hits in groups.items())
+    return ("mistake", "named", "logs"), rows
 
 
 def faults_table(study: Study, frame: pd.DataFrame, columns: Mapping[str, tuple[str, int]] = FAULTS) -> View:

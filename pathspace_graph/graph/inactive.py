@@ -11,9 +11,9 @@ the next variables are deactivated, together with it.
 
 While the loop is open, only the drive itself ties the map to its beginning, and a bias of the yaw rate bends
 all of it: after a thousand metres, a thousandth of a radian per second is tens of metres. So the active part
-is held at an anchor near the vehicle, and the stretches behind are attached to it like a chain, each given by its
-conditional in the frame of its own anchor: however far the chain swings, it bends none of them. The oldest
-link holds the origin of the map frame. To bring it back to (0, 0, 0), the whole map is moved rigidly.
+is held at an anchor near the vehicle, and the stretches behind are attached to it like a chain, each given
+by its conditional in the frame of its own anchor: however far the chain swings, it bends none of them. The
+oldest link holds the origin of the map frame. To bring it back to (0, 0, 0), the whole map is moved rigidly.
 """
 
 from collections.abc import Iterator, Sequence

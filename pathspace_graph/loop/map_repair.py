@@ -1,4 +1,4 @@
-"""Map repair: the curves of a closed map are led through cones that contradict them, and the drive solved again.
+"""Map repair: the curves of a closed map are led through cones that contradict it, the drive is solved again.
 
 A contradiction is a cone that is seen again and again where the closed map has none of its colour. The poses
 are right, held by the other boundary and by the stretches before and after. So the batch of the whole drive

@@ -27,11 +27,11 @@ def test_every_good_log_has_known_settings() -> None:
         override(SimulationSettings(), good.overrides, name)
 
 
-def test_a_wrong_cause_does_not_count_as_told() -> None:
+def test_a_wrong_cause_does_not_count() -> None:
     log = MISTAKES["y to the right"](short_drive())
-    assert judged(log, ("y to the right",))["told"]
+    assert judged(log, ("y to the right",))["named"]
     wrong = judged(log, ("stamps",))
-    assert (wrong["said"], wrong["told"]) == (True, False)
+    assert (wrong["accused"], wrong["named"]) == (True, False)
 
 
 @pytest.mark.parametrize(
@@ -51,11 +51,11 @@ def test_a_map_is_held_against_that_of_the_good_log(found: dict[str, float], map
 
 def test_the_table_has_exact_intervals() -> None:
     rows = [
-        {"kind": kind, "name": "x", "told": told, "said": told, "seconds": 0.1}
-        for kind, told in (("spoiled", True), ("spoiled", True), ("good", False), ("good", False))
+        {"kind": kind, "name": "x", "named": found, "accused": found, "seconds": 0.1}
+        for kind, found in (("spoiled", True), ("spoiled", True), ("good", False), ("good", False))
     ]
     table = summary(pd.DataFrame(rows))
-    assert table.rows[0][:5] == ("told: x", "2", "2", "100.0", "15.8 to 100.0")  # 0.025^(1/2)
+    assert table.rows[0][:5] == ("named: x", "2", "2", "100.0", "15.8 to 100.0")  # 0.025^(1/2)
     assert table.rows[2][:5] == ("accused: x", "0", "2", "0.0", "0.0 to 84.2")
 
 
@@ -70,9 +70,9 @@ def test_the_script_leaves_rows_and_a_table(
     frame = pd.read_csv(out / "hints.csv")
     assert frame["kind"].tolist() == ["good", "spoiled"]
     assert frame["of"].tolist() == ["as simulated"] * 2
-    assert frame["told"].tolist() == [False, True]
-    assert "| told: y to the right" in (out / "hints.md").read_text()
-    assert "told: y to the right" in capsys.readouterr().out
+    assert frame["named"].tolist() == [False, True]
+    assert "| named: y to the right" in (out / "hints.md").read_text()
+    assert "named: y to the right" in capsys.readouterr().out
     monkeypatch.setattr(sys, "argv", [*arguments[:-1], "y to the left"])
     with pytest.raises(SystemExit):
         main()

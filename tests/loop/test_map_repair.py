@@ -12,7 +12,7 @@ from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop import mending
+from pathspace_graph.loop import map_repair
 from pathspace_graph.loop.map_repair import REPAIRED, Stretch, carried, led_through, newest_lap
 from pathspace_graph.loop.relocalization import KnownLoop
 from pathspace_graph.loop.track_loop import TrackLoop
@@ -39,7 +39,7 @@ def clean() -> Log:
 
 
 @cache
-def mended() -> tuple[FixedLagMapper, list[CycleResult]]:
+def repaired() -> tuple[FixedLagMapper, list[CycleResult]]:
     return map_log(unseen(clean(), [LEFT], *HOLE))
 
 
@@ -53,7 +53,7 @@ def rmse(mapper: FixedLagMapper) -> float:
 
 
 def test_a_hole_of_one_boundary_is_mended_once_the_vehicle_has_passed_it_again() -> None:
-    mapper, results = mended()
+    mapper, results = repaired()
     (notice,) = [result for result in results if result.notice]
     assert notice.notice == f"{REPAIRED}: 9 more cones on the left lie on it"
     assert notice.jump is not None and np.hypot(*notice.jump[:2]) < 0.3
@@ -63,15 +63,15 @@ def test_a_hole_of_one_boundary_is_mended_once_the_vehicle_has_passed_it_again()
 
 
 def test_the_vehicle_is_not_lost_beside_the_hole_and_it_is_said_which_boundary_is_not_mapped() -> None:
-    conditions = {result.health.condition for result in mended()[1]}
-    reasons = {result.health.reason for result in mended()[1]}
+    conditions = {result.health.condition for result in repaired()[1]}
+    reasons = {result.health.reason for result in repaired()[1]}
     assert conditions == {GOOD, DEGRADED}
     assert "the left boundary is not mapped here" in reasons
-    offset = np.array([r.pose[:2] for r in mended()[1]]) - true_poses(clean())[:, :2]
+    offset = np.array([r.pose[:2] for r in repaired()[1]]) - true_poses(clean())[:, :2]
     assert np.hypot(*offset.T).max() < 0.5
 
 
-def test_a_hole_of_both_boundaries_is_mended() -> None:
+def test_a_hole_of_both_boundaries_is_repaired() -> None:
     mapper, results = map_log(unseen(clean(), [LEFT, RIGHT], HOLE[0], HOLE[1] - 1.0))
     notices = [result.notice for result in results if result.notice]
     assert notices and all(notice.startswith(REPAIRED) for notice in notices)
@@ -98,7 +98,7 @@ def test_a_map_without_holes_is_never_solved_again(
 
 
 def test_the_record_has_the_pose_of_every_cycle_in_the_frame_of_the_mended_map() -> None:
-    mapper, results = mended()
+    mapper, results = repaired()
     poses = np.array(mapper.loop.record.poses)
     assert len(poses) == len(results)
     assert np.hypot(*(poses - true_poses(clean()))[:, :2].T).max() < 0.3
@@ -108,7 +108,7 @@ def test_a_map_that_does_not_explain_the_contradictions_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It is asked for more of them than there are."""
-    monkeypatch.setattr(mending, "EXPLAINED", 2.0)
+    monkeypatch.setattr(map_repair, "EXPLAINED", 2.0)
     mapper, results = map_log(unseen(clean(), [LEFT], *HOLE), FixedLagMapper())
     jumps = [result.t for result in results if result.jump is not None]
     assert len(jumps) == 1  # the swap of the open lap
@@ -136,7 +136,7 @@ def test_a_curve_is_led_through_new_cones_and_stays_elsewhere() -> None:
 
 
 def test_a_curve_without_contradictions_stays_to_the_bit() -> None:
-    track = mended()[0].smoother.map
+    track = repaired()[0].smoother.map
     same = led_through(track, RIGHT, [Stretch(LEFT, np.zeros((3, 2)))], np.zeros((2, 3)))
     assert (same.control_points == track.state.spline(RIGHT).control_points).all()
 
@@ -158,7 +158,7 @@ def test_cones_are_carried_by_the_pose_next_to_them() -> None:
 
 
 def test_known_gaps_are_gone_after_mending() -> None:
-    assert KnownLoop(mended()[0].smoother).with_gaps() == []
+    assert KnownLoop(repaired()[0].smoother).with_gaps() == []
 
 
 # --- a whole drive ---------------------------------------------------------------------------------------

@@ -87,12 +87,12 @@ def lost() -> Drive:
     )
 
 
-def mended() -> Drive:
+def repaired() -> Drive:
     return Drive(
         unseen(laps_log(pear_track()), [LEFT], 6.0, 11.0),
         {
             "contradicted": lambda mapper, _: mapper.loop.map_repair.is_tried(),
-            "mended": lambda mapper, result: result.notice.startswith(REPAIRED),
+            "repaired": lambda mapper, result: result.notice.startswith(REPAIRED),
         },
     )
 
@@ -194,7 +194,7 @@ def assert_same_map(track: Map, expected: Map) -> None:
         np.testing.assert_array_equal(boundary.covariance, known.covariance)
 
 
-@pytest.mark.parametrize("make", [laps, lost, mended, recurring, revisited, standing, colours, late])
+@pytest.mark.parametrize("make", [laps, lost, repaired, recurring, revisited, standing, colours, late])
 def test_a_restored_mapper_goes_on_to_the_same_result(
     make: Callable[[], Drive], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
