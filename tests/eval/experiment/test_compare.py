@@ -171,11 +171,14 @@ def test_without_truth_only_what_needs_none_is_told(folder: Path) -> None:
 # --- blind spot ------------------------------------------------------------------------------------------
 
 
-def test_the_blind_spot_is_where_most_cones_are_missed_on_end(folder: Path) -> None:
+def test_the_blind_spot_is_where_most_cones_are_missed_on_end(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pathspace_graph.eval.experiment.plots.HALF_SIZE", np.array([6.0, 5.0]))
     truth = read_log(folder / "a").truth
     assert truth is not None
     settings, log = MapperSettings(), read_log(folder / "a")
-    spot = find_blind_spot(truth, Rings(settings, log).map(), Gaps(settings, log).map(), (6.0, 5.0))
+    spot = find_blind_spot(truth, Rings(settings, log).map(), Gaps(settings, log).map())
     assert spot is not None
     angle = 2 * np.pi * np.array([3, 4, 5]) / 20
     expected = CENTRE + 12.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
