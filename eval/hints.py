@@ -1,4 +1,4 @@
-"""`python -m pathspace_graph.eval.hints` measures of how many spoiled logs the cause is named, and how many good ones are accused.
+"""`python -m pathspace_graph.eval.hints` measures of how many spoiled logs the cause is named.
 
 Good logs of all kinds are judged: what is unusual about them is no mistake, and none may be accused.
 """

@@ -88,8 +88,8 @@ def measure(
     ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and so one
     row, that of the last lap. `seconds` is the wall time of the whole run. `marginals` asks for the metrics
     of the paper's squared basis, `reference_limits` for `l`, `f` and `limit`, by a batch with oracle
-    association (ValueError without associations). Without `whole` the last row has the metrics that laps have only where
-    there is no lap.
+    association (ValueError without associations). Without `whole` the last row has the metrics that laps
+    have only where there is no lap.
     """
     run, log = run.at_scale_one(), scaled(log, 1.0 / run.scale)
     rows = []
