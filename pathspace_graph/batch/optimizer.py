@@ -4,13 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import gtsam
 import numpy as np
 
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.graph.elimination import Damping, Elimination
-from pathspace_graph.graph.gaussian import graph_of
+from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.state import State
@@ -174,10 +172,10 @@ class Optimizer:
     def _step(self, at: Evaluation) -> Evaluation:
         """Return the problem after the least damped step that makes the cost smaller, or the same one."""
         self._keep_foot_points(at)
-        graph = self.system.linear_graph(at)
+        rows = self.system.rows(at)
         while not self.damping.exhausted:
             self.steps += 1
-            trial = self._trial(at, graph)
+            trial = self._trial(at, rows)
             if trial is not None:
                 self.damping.lower()
                 self._keep_foot_points(trial)
@@ -186,12 +184,12 @@ class Optimizer:
         self.damping.reset()
         return at
 
-    def _trial(self, at: Evaluation, graph: gtsam.GaussianFactorGraph) -> Evaluation | None:
+    def _trial(self, at: Evaluation, rows: Sequence[Rows]) -> Evaluation | None:
         """Return the problem after a damped step, or None if the cost has grown."""
         state, system = at.state, self.system
-        damped = graph_of(graph, system.damping(state, self.damping.weight))
+        damped = [*rows, *system.damping(state, self.damping.weight)]
         try:
-            problem = Elimination(damped, state.variables.layout)
+            problem = Elimination(linear_graph(damped, state.variables), state.variables.layout)
             step = problem.step(np.zeros(problem.map.size))
         except SingularSystemError:
             return None
