@@ -555,23 +555,29 @@ py::tuple block_of(const Ints& keys, const Ints& widths, const py::list& groups)
   };
   for (const Rows& rows : all) {
     height += rows.size();
-    for (Index i = 0; i < rows.sought.size(); ++i) first[place_of(rows.sought.data()[i])] = 0;
+    const Index k = rows.sought.shape(1);
+    const Index* own = rows.sought.data();
+    for (Index i = 0; i < rows.sought.size(); ++i)
+      if (i < k || own[i] != own[i - k]) first[place_of(own[i])] = 0;
   }
   for (Index k = 0; k < keys.shape(0); ++k)
     if (first[k] == 0) held.push_back(k), first[k] = width, width += widths.data()[k];
   Columns block(Shape{height, width + 1});
   double* at = block.mutable_data();
   std::fill_n(at, height * (width + 1), 0.0);
-  for (const Rows& rows : all)
+  for (const Rows& rows : all) {
+    const Index k = rows.sought.shape(1);
+    std::vector<Index> begin(k);
     for (Index i = 0; i < rows.size(); ++i, ++at) {
-      const Index* own = rows.sought.data() + i * rows.sought.shape(1);
-      Index key = -1, begin = 0;
-      for (Index j = 0; j < rows.width(); ++j) {
-        if (rows.key.data()[j] != key) key = rows.key.data()[j], begin = first[place_of(own[key])];
-        at[(begin + rows.entry.data()[j]) * height] = rows.jacobian.data()[i * rows.width() + j];
-      }
+      const Index* own = rows.sought.data() + i * k;
+      for (Index c = 0; c < k; ++c)  // neighbouring rows mostly hold the same variables
+        if (i == 0 || own[c] != own[c - k]) begin[c] = first[place_of(own[c])];
+      for (Index j = 0; j < rows.width(); ++j)
+        at[(begin[rows.key.data()[j]] + rows.entry.data()[j]) * height] =
+            rows.jacobian.data()[i * rows.width() + j];
       at[width * height] = -rows.residual.data()[i];
     }
+  }
   return py::make_tuple(Ints(Shape{static_cast<Index>(held.size())}, held.data()), block);
 }
 

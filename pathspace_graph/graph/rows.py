@@ -140,22 +140,26 @@ def _moved_residual(
 
 def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.GaussianConditional]:
     """Return a factor `1/2 |J d + r|^2` by owner, from rows whose unknowns are d, on the keys of its rows."""
-    parts: dict[int, list[Rows]] = {}
+    parts: dict[int, list[Placed]] = {}
     for unordered in groups:
-        rows = unordered.where(unordered.owner.argsort(kind="stable"))
-        owners, first = np.unique(rows.owner, return_index=True)
-        for owner, begin, end in zip(owners.tolist(), first, np.append(first, len(rows))[1:], strict=True):
-            parts.setdefault(owner, []).append(rows.where(slice(begin, end)))
+        if len(unordered):
+            rows = unordered.where(unordered.owner.argsort(kind="stable"))
+            (keys, key, entry, jacobian, residual), begin = rows.placed, 0
+            owners, counts = np.unique(rows.owner, return_counts=True)
+            for owner, end in zip(owners.tolist(), counts.cumsum().tolist(), strict=True):
+                part = keys[begin:end], key, entry, jacobian[begin:end], residual[begin:end]
+                parts.setdefault(owner, []).append(part)
+                begin = end
     return {owner: _factor(parts[owner], layout) for owner in sorted(parts)}
 
 
-def _factor(parts: Sequence[Rows], layout: Layout) -> gtsam.GaussianConditional:
+def _factor(parts: list[Placed], layout: Layout) -> gtsam.GaussianConditional:
     """Return the factor of rows on the variables of a layout."""
     try:
-        held, block = _block_of(layout.keys, layout.widths, [rows.placed for rows in parts])
+        held, block = _block_of(layout.keys, layout.widths, parts)
     except ValueError:
-        for rows in parts:
-            layout.places(rows.keys)  # it says which variable is not known
+        for keys, *_ in parts:
+            layout.places(keys)  # it says which variable is not known
         raise
     matrix = gtsam.VerticalBlockMatrix([*layout.widths[held].tolist(), 1], block, False)
     return gtsam.GaussianConditional(layout.keys[held].tolist(), 1, matrix)
@@ -230,7 +234,7 @@ class KeptRows:
 
     def pop(self, owner: int, layout: Layout) -> gtsam.GaussianConditional:
         """Remove the rows of an owner and return them as a factor."""
-        return _factor(self.drop(np.array([owner])), layout)
+        return _factor([rows.placed for rows in self.drop(np.array([owner]))], layout)
 
 
 def among(keys: IntArray, ascending: IntArray) -> BoolArray:
