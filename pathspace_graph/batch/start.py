@@ -97,10 +97,6 @@ class Recurrence:
     def recurs(self) -> bool:
         return bool(np.isfinite(self.lap))
 
-    def denied(self) -> "Recurrence":
-        """Return the same path without a lap."""
-        return Recurrence(self.driven)
-
     @property
     def whole_turn(self) -> float:
         """Return the whole turns nearest to the change of the heading in a lap (rad)."""

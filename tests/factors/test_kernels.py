@@ -17,6 +17,7 @@ from pathspace_graph.factors.kernels import _KERNELS, COMPILED, IN_NUMPY, NUMPY_
 
 for _module in (
     "front_end.gate",
+    "front_end.measurement",
     "front_end.scan_matching",
     "front_end.sightings",
     "graph.relative",
@@ -239,6 +240,12 @@ CASES: dict[str, Arguments] = {
         information(rng, 3),
         rng.normal(size=(3, 2)),
         0.3,
+    ),
+    "centred": lambda rng: (
+        np.arange(0, COUNT, 5),
+        covariances(rng),
+        rng.normal(size=(COUNT, 2, 6)),
+        rng.normal(size=(COUNT, 2)),
     ),
     "usable": lambda rng: (
         rng.normal(size=(COUNT, 2)),
