@@ -1,1 +1,1 @@
-"""Evaluation: metrics, yardsticks, tables and figures."""
+"""Evaluation: metrics, reference limits, tables and figures."""

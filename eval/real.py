@@ -14,7 +14,7 @@ from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import compose, move_points, to_map, to_vehicle, wrap_angle
 from pathspace_graph.factors.sensor import SENSOR, by_sensor
 from pathspace_graph.front_end.front_end import seen_cycles
-from pathspace_graph.front_end.sightings import Follower, SeenCycle
+from pathspace_graph.front_end.sightings import ConeTracker, SeenCycle
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.labels import BOUNDARIES
@@ -103,7 +103,7 @@ def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise, frame:
         seen = cycle.detections
         chosen = (seen.labels == label) & (np.hypot(*seen.points_vehicle.T) < 15.0)
         own.append(replace(cycle, detections=seen.where(chosen)))
-    table = Follower(noise).follow(own)
+    table = ConeTracker(noise).follow(own)
     corrected = table.point + by_sensor(table.point, table.twist) @ noise.sensor
     points = to_vehicle(to_map(corrected, table.pose), np.tile(frame, (len(table.t), 1)))
     weights = 1.0 / np.maximum(np.hypot(*table.point.T), 1.0) ** 2

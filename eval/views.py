@@ -17,7 +17,7 @@ from .metrics.metric import METRICS
 ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
 ONLINE, BATCH, LANDMARKS = ESTIMATORS[:3]
 TITLES: Final = {"ate": "trajectory error [m]", "nees": "NEES of the map"}
-TITLES_CAMERA: Final = TITLES | {"turn_nees": "NEES of the turn", "told_degraded": "degraded [%]"}
+TITLES_CAMERA: Final = TITLES | {"turn_nees": "NEES of the turn", "reported_degraded": "degraded [%]"}
 """Headings in tables that are short of room."""
 FAULTS: Final = {  # columns of the table of faults: value and digits
     "rmse by clean": ("ratio_mean", 2),
@@ -27,12 +27,12 @@ FAULTS: Final = {  # columns of the table of faults: value and digits
     "closed [%]": ("closed", 0),
     "lost at the end [%]": ("lost", 0),
     "largest error [m]": ("error_max", 1),
-    "called degraded [%]": ("told_degraded", 1),
-    "said so [%]": ("told", 0),
+    "called degraded [%]": ("reported_degraded", 1),
+    "reported [%]": ("reported", 0),
 }
 RECOVERY: Final = {  # how long a vehicle is over a metre off after closing: value and digits
-    "longest time [s]": ("astray_time", 1),
-    "longest way [m]": ("astray_way", 0),
+    "longest time [s]": ("divergence_time", 1),
+    "longest way [m]": ("divergence_distance", 0),
 }
 
 
@@ -130,7 +130,7 @@ def skidpad_table(frame: pd.DataFrame) -> View:
 
 def camera_table(frame: pd.DataFrame) -> View:
     """Return the map of each estimator at stated and at measured noise, and the limit of its landmarks."""
-    keys, last = ("rmse", "missed", "nees", "turn_nees", "told_degraded"), last_laps(frame)
+    keys, last = ("rmse", "missed", "nees", "turn_nees", "reported_degraded"), last_laps(frame)
     runs = last.groupby(["estimator", "variant"], sort=False)
     stated = {DEFAULT: "stated"}  # since a simulated log states its own noise
     parts = {f"`{estimator}`, {stated.get(noise, noise)}": part for (estimator, noise), part in runs}
@@ -169,10 +169,10 @@ def difference_table(study: Study, frame: pd.DataFrame, other: str, keys: Sequen
 def hints_table(rows: pd.DataFrame) -> View:
     """Return the share of the logs that are told by their cause, for each mistake, or accused."""
     spoiled, good = rows[rows["kind"] == "spoiled"], rows[rows["kind"] == "good"]
-    groups = {str(name): of["told"] for name, of in spoiled.groupby("name", sort=False)}
-    groups |= {"**all mistakes**": spoiled["told"], "**good logs, accused of any**": good["said"]}
+    groups = {str(name): of["reported"] for name, of in spoiled.groupby("name", sort=False)}
+    groups |= {"**all mistakes**": spoiled["reported"], "**good logs, accused of any**": good["notices"]}
     shares = {name: (float(np.sum(told)), float(len(told))) for name, told in groups.items()}
-    return ("mistake", "told", "logs"), tuple(
+    return ("mistake", "reported", "logs"), tuple(
         (name, tuple(Figure.known(count, 0) for count in counts)) for name, counts in shares.items()
     )
 
@@ -181,7 +181,7 @@ def faults_table(study: Study, frame: pd.DataFrame, columns: Mapping[str, tuple[
     """Return what each fault costs by the clean run on the same track, and whether anything was said."""
     rows = []
     for noise, values in zip(study.noise, outcomes(study, frame), strict=True):
-        values |= {name: values[name] / max(values["runs"], 1) for name in ("closed", "lost", "told")}
+        values |= {name: values[name] / max(values["runs"], 1) for name in ("closed", "lost", "reported")}
         figures = tuple(
             Figure.of([values[key]], digits, 100.0 if "%" in title else 1.0)
             for title, (key, digits) in columns.items()

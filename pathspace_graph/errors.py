@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 
 
 class PathspaceError(Exception):
-    """Base of all errors that a user can mend: one line of what was expected and what was found."""
+    """Base of all errors that a user can fix: one line of what was expected and what was found."""
 
 
 class InputError(PathspaceError):

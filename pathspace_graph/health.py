@@ -133,7 +133,7 @@ class HealthMonitor:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class HealthStretch:
     """A run of cycles of one condition that is not good."""
 
     health: str
@@ -142,12 +142,12 @@ class Stretch:
     reason: str  # of its first cycle
 
 
-def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[Stretch]:
+def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[HealthStretch]:
     found = []
     for condition, group in groupby(zip(t, healths, strict=True), key=lambda cycle: cycle[1].condition):
         cycles = list(group)
         if condition in (DEGRADED, LOST):
-            found.append(Stretch(condition, cycles[0][0], cycles[-1][0], cycles[0][1].reason))
+            found.append(HealthStretch(condition, cycles[0][0], cycles[-1][0], cycles[0][1].reason))
     return found
 
 

@@ -179,9 +179,9 @@ class Cell(Generic[D]):
     @cached_property
     def id(self) -> str:
         """Identity of everything that the result depends on, also the code."""
-        yardsticks, code = self.measured.get("yardsticks", False), code_digest(MEASURED)
+        reference_limits, code = self.measured.get("reference_limits", False), code_digest(MEASURED)
         parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": asdict(self.settings)}
-        return identity(**parts, yardsticks=yardsticks, code=code)
+        return identity(**parts, reference_limits=reference_limits, code=code)
 
     @property
     def names(self) -> dict[str, Any]:
@@ -242,7 +242,7 @@ def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
         said += [] if run.vehicle is None else diagnose(run.vehicle, run.settings)
     record: Record = {"format": FORMAT, "id": cell.id, "cell": cell.names, "versions": versions()}
     record |= {"failure": outcome.failure, "traceback": outcome.trace}
-    record |= {"said": "; ".join(dict.fromkeys(said)), "laps": lap_rows(outcome.rows)}
+    record |= {"notices": "; ".join(dict.fromkeys(said)), "laps": lap_rows(outcome.rows)}
     return dict(to_plain(record))
 
 

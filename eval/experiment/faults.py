@@ -28,9 +28,18 @@ from .tables import TextTable, group_starts
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
 FAULT_COLUMNS: Final = 4  # panels side by side in the figure of faults
 Values = Mapping[str, Any]  # values of an outcome by name
-_WORST: Final = ("error_max", "error_end", "astray_time", "astray_way")
+_WORST: Final = ("error_max", "error_end", "divergence_time", "divergence_distance")
 _MEASURED: Final = (
-    *("rmse", "size", "missed", "closed_at_end", "lost_at_end", "told_degraded", "told_lost", *_WORST),
+    *(
+        "rmse",
+        "size",
+        "missed",
+        "closed_at_end",
+        "lost_at_end",
+        "reported_degraded",
+        "reported_lost",
+        *_WORST,
+    ),
 )
 _NAME: Final = re.compile(r"(?P<kind>.+): (?P<strength>(?P<value>[-+.\d]+)(?: (?P<unit>\S+))?)")
 
@@ -116,11 +125,11 @@ def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
         "closed": int((runs["closed_at_end"] == 1.0).sum()),
         "lost": int((runs["lost_at_end"] == 1.0).sum()),
         **{name: float(runs[name].max()) for name in _WORST},
-        "told": int(runs["told"].sum()),
-        "told_degraded": float(runs["told_degraded"].mean()),
-        "told_lost": float(runs["told_lost"].mean()),
+        "reported": int(runs["reported"].sum()),
+        "reported_degraded": float(runs["reported_degraded"].mean()),
+        "reported_lost": float(runs["reported_lost"].mean()),
         "calibration": {titles[key]: value for key, value in sigmas.items() if abs(value) > LIMIT},
-        "said": dict(Counter(text for text in runs["said"] if text).most_common()),
+        "notices": dict(Counter(text for text in runs["notices"] if text).most_common()),
     }
 
 
@@ -135,7 +144,7 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     own = pd.MultiIndex.from_frame(last[[*RUN]])
     for name, ratio in (("rmse", "ratio"), ("size", "size_ratio")):
         last[ratio] = last[name] / clean[name].where(clean[name] > 0.0).reindex(own).to_numpy()
-    return last.assign(told=(last["said"] != "") | (last["told_lost"] > 0.0))
+    return last.assign(reported=(last["notices"] != "") | (last["reported_lost"] > 0.0))
 
 
 def fault_table(study: Study, found: Sequence[Values]) -> TextTable:
@@ -166,8 +175,8 @@ def _closed(values: Values) -> str:
 
 def _said(values: Values) -> str:
     """Return how many runs said what, shortened to 60 characters; the JSON file has all of it."""
-    short = {text: text if len(text) <= 60 else f"{text[:60].rstrip()} …" for text in values["said"]}
-    said = (f"{number} of {values['runs']}: {short[text]}" for text, number in values["said"].items())
+    short = {text: text if len(text) <= 60 else f"{text[:60].rstrip()} …" for text in values["notices"]}
+    said = (f"{number} of {values['runs']}: {short[text]}" for text, number in values["notices"].items())
     return "; ".join(said) or "nothing"
 
 
@@ -186,14 +195,14 @@ COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {  # columns after fault
     "closed": _closed,
     "lost at the end": lambda values: f"{values['lost']} of {values['runs']}",
     "largest error [m]": _form("{:.1f}", "error_max"),
-    "over 1 m off after closing [s, m]": _form("{:.1f}, {:.1f}", "astray_time", "astray_way"),
+    "over 1 m off after closing [s, m]": _form("{:.1f}, {:.1f}", "divergence_time", "divergence_distance"),
     "calibration by its prior's sigma": lambda values: ", ".join(
         f"{name} {value:+.1f}" for name, value in values["calibration"].items()
     ),
     "called degraded, lost [% of cycles]": _form(
-        "{:.1f}, {:.1f}", "told_degraded", "told_lost", factor=100.0
+        "{:.1f}, {:.1f}", "reported_degraded", "reported_lost", factor=100.0
     ),
-    "said": _said,
+    "notices": _said,
 }
 
 
@@ -228,7 +237,7 @@ def _draw_fault(axes: Axes, noises: Sequence[str], runs: pd.DataFrame) -> None:
         means.append(own["ratio"].mean())
         spread = 0.15 if len(own) > 1 else 0.0
         places = at + np.linspace(-spread, spread, len(own))
-        for place, *run in zip(places, own["ratio"], own["lost_at_end"] == 1.0, own["told"], strict=True):
+        for place, *run in zip(places, own["ratio"], own["lost_at_end"] == 1.0, own["reported"], strict=True):
             _draw_faulty_run(axes, float(place), *run)
     known = np.flatnonzero(~np.isnan(means))
     if len(known):
@@ -249,7 +258,7 @@ def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool
         axes.plot(at, 0.95, "x", color=ORANGE, markersize=4.0, transform=edge, label="no map")
         return
     color = ORANGE if lost else GREEN
-    label = f"{'lost at the end' if lost else 'not lost'}{', said so' if told else ''}"
+    label = f"{'lost at the end' if lost else 'not lost'}{', reported' if told else ''}"
     look: dict[str, Any] = {"markerfacecolor": color if told else "none", "markersize": 4.0}
     axes.plot(at, ratio, "^" if lost else "o", color=color, markeredgewidth=0.8, label=label, **look)
 
@@ -265,7 +274,7 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
     about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
     write_json(out / "faults.json", {"format": "pathspace-faults/1", **about, "faults": faults}, indent=1)
     flat = pd.DataFrame(faults)
-    for key in ("calibration", "said"):  # as JSON texts
+    for key in ("calibration", "notices"):  # as JSON texts
         flat[key] = [json.dumps(value, ensure_ascii=False) for value in flat[key]]
     write_csv(out / "faults.csv", flat)
     style.save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})

@@ -35,11 +35,11 @@ def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -
     for cell, record in cells:
         assert record is not None, "every cell has been run by now"
         shared = {"study": study.name} | cell.names | _settings_row(study, cell)
-        about = {"failure": record["failure"], "said": record["said"], **record["versions"]}
+        about = {"failure": record["failure"], "notices": record["notices"], **record["versions"]}
         rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
     add_batch(rows, (*RUN, "noise", "variant"))
     settings = _settings_row(study, cells[0][0])
-    order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "said", *versions()]
+    order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions()]
     known = dict.fromkeys([*order, *(name for row in rows for name in row)])
     frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
     return frame.astype({"lap": "Int64"})

@@ -96,7 +96,7 @@ class Plan:
             "noise": {name: asdict(study.simulation(name)) for name in study.noise},
             "variants": {name: asdict(settings) for name, settings in study.points.items()},
             "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
-            "yardsticks": study.yardsticks,
+            "reference_limits": study.reference_limits,
         }
 
     def stale(self, out: Path) -> int:
@@ -108,7 +108,7 @@ class Plan:
 def make_plan(study: Study) -> Plan:
     """Read and generate the tracks, and return the cells, grouped by the log that they share."""
     tracks, points = tuple(load_tracks(study.tracks)), study.points
-    measured = {"marginals": True, "yardsticks": study.yardsticks}
+    measured = {"marginals": True, "reference_limits": study.reference_limits}
     drives = product(study.noise, tracks, study.seeds)
     cells = tuple(
         Cell(drive, estimator, settings, variant, measured)

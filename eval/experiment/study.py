@@ -62,7 +62,7 @@ class Study:
     columns: tuple[str, ...] = ()
     """Columns of the table by track: `rmse` is the last lap's, `rmse@1` that of lap 1, and
     `slope(bias, bias_true)` says how much of the truth an estimate has found."""
-    yardsticks: bool = False
+    reference_limits: bool = False
     """Whether to compute the limit of every run, which takes a landmark batch with oracle associations."""
 
     def __post_init__(self) -> None:
@@ -75,8 +75,10 @@ class Study:
         if self.estimators == (ALL,):
             object.__setattr__(self, "estimators", tuple(known_estimators()))
         self._check_lists()
-        if not isinstance(self.yardsticks, bool):
-            raise SettingsError(f"yardsticks: expected true or false, found {shown(self.yardsticks)}")
+        if not isinstance(self.reference_limits, bool):
+            raise SettingsError(
+                f"reference_limits: expected true or false, found {shown(self.reference_limits)}"
+            )
         if type(self.laps) is not int:
             raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
         if DEFAULT in self.variants:

@@ -33,7 +33,7 @@ _DIAMOND: Final = 0.8 * MARKER_SIZE
 
 
 @dataclass(frozen=True, eq=False)
-class Expansion:
+class ExpansionFigure:
     """The three steps, on a curve with the joint covariance of its control points."""
 
     detections: Array  # (m, 2) positions (m)
@@ -44,7 +44,7 @@ class Expansion:
     updated: SplineBoundary
 
 
-def expansion() -> Expansion:
+def expansion() -> ExpansionFigure:
     """Classify the detections, extend the curve to the last of their chain, update it with the others."""
     # a curve along the bend that drifts to its outside and ends beside the origin
     along, settings = np.linspace(-18.0, 0.0, 13), CkfSettings(threshold=2.0, separation=2.0)
@@ -60,7 +60,7 @@ def expansion() -> Expansion:
     extended = extend(before, detections[order[-1]], covariances[order[-1]])
     others = np.arange(len(detections)) != order[-1]
     updated = update(extended, detections[others], covariances[others])
-    return Expansion(detections, expands, order, before, extended, updated)
+    return ExpansionFigure(detections, expands, order, before, extended, updated)
 
 
 def extend(boundary: SplineBoundary, detection: Array, covariance: Array) -> SplineBoundary:
@@ -127,7 +127,7 @@ def plot_expansion() -> tuple[Figure, str]:
     )
 
 
-def _draw_step(axes: Axes, data: Expansion, boundary: SplineBoundary, expands: BoolArray) -> None:
+def _draw_step(axes: Axes, data: ExpansionFigure, boundary: SplineBoundary, expands: BoolArray) -> None:
     color, name = (PURPLE, "updated spline") if boundary is data.updated else (BLUE, "spline")
     style.draw_band(axes, boundary, color, f"{name}, 2σ", zorder=1)
     style.draw_curve(axes, boundary.spline, color, name)

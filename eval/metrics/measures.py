@@ -74,14 +74,14 @@ def measure(
     ghost_settings: GhostSettings | None = None,
     *,
     marginals: bool = False,
-    yardsticks: bool = False,
+    reference_limits: bool = False,
 ) -> list[Row]:
     """Return a row for each complete lap, and one for the whole run as the last; lengths are over the scale.
 
     A lap's row has the map as it stood at its end, and the poses and updates of its cycles. Laps are the true
     ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and so one
     row, that of the last lap. `seconds` is the wall time of the whole run. `marginals` asks for the metrics
-    of the paper's squared basis, `yardsticks` for `l`, `f` and `limit`, by a batch with oracle association
+    of the paper's squared basis, `reference_limits` for `l`, `f` and `limit`, by a batch with oracle association
     (ValueError without associations).
     """
     run, log = run.at_scale_one(), scaled(log, 1.0 / run.scale)
@@ -94,7 +94,7 @@ def measure(
     values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
     health = [record.health for record in run.cycles]
     if any(health):
-        values |= {f"told_{level}": health.count(level) / len(health) for level in (DEGRADED, LOST)}
+        values |= {f"reported_{level}": health.count(level) / len(health) for level in (DEGRADED, LOST)}
     if run.vehicle is not None:
         values |= {f"{name}_by_prior": value for name, value in by_prior(run.vehicle, run.settings).items()}
     if isinstance(run, BatchRun):
@@ -102,7 +102,7 @@ def measure(
     if isinstance(run, BatchResult) and log.truth is not None and has_cones(log.truth):
         joint = joint_cone_error(run, log.truth)
         values |= {"normalized_error_joint": joint.ratio, "normalized_error_joint_inside": joint.honest}
-    if yardsticks:
+    if reference_limits:
         values |= limit(log, run.map)
     if seconds is not None:
         values["seconds"] = seconds
@@ -186,7 +186,7 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
     if len(truth.poses):
         values["false_closing"] = closes_falsely(run, truth)
         values |= trajectory.end_of_trajectory(run.trajectory_t, run.trajectory, truth)
-        values |= trajectory.longest_astray(run.trajectory_t, run.trajectory, truth, closing_stamp(run))
+        values |= trajectory.longest_divergence(run.trajectory_t, run.trajectory, truth, closing_stamp(run))
     jumps = [np.hypot(*record.jump[:2]) for record in run.cycles if record.jump is not None]
     return values | ({"jump": float(max(jumps))} if jumps else {})
 

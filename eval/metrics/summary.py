@@ -12,7 +12,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.kernels import KERNELS
 from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
-from pathspace_graph.health import Health, Stretch, counts, stretches
+from pathspace_graph.health import Health, HealthStretch, counts, stretches
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult
@@ -104,7 +104,7 @@ def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
     return sources | {"measured": values}
 
 
-def stretches_of(result: RunResult) -> list[Stretch]:
+def stretches_of(result: RunResult) -> list[HealthStretch]:
     return stretches([r.t for r in result.cycles], [health_of(r) for r in result.cycles])
 
 

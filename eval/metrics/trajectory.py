@@ -19,7 +19,7 @@ from pathspace_graph.sim.curves import arc_lengths
 
 from .accuracy import boundary_distances, root_mean_square
 
-LOST, ASTRAY = 5.0, 1.0  # position errors beyond which a vehicle is lost, or astray (m)
+LOST, DIVERGED = 5.0, 1.0  # position errors beyond which a vehicle is lost, or its estimate has diverged (m)
 MOST: Final = 35.0  # greatest length of a reach (m)
 ON_CURVE: Final = 0.5  # distance of a true cone from the mapped boundary at which the reach ends (m)
 SHORT: Final = 4.0  # reach below which no planner can work (m)
@@ -61,7 +61,7 @@ def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
     return {"error_max": largest, "error_end": end, "lost_at_end": end > LOST}
 
 
-def longest_astray(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:
+def longest_divergence(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:
     """Return the longest time (s) and way (m) for which a vehicle was astray, from a stamp (s) on.
 
     Counted from the first cycle that is wrong by more than a metre to the next one that is right, or the end.
@@ -71,11 +71,11 @@ def longest_astray(t: Array, poses: Array, truth: Truth, since: float) -> dict[s
         return {}
     stamps, errors = t[after], np.linalg.norm(trajectory_errors(t[after], poses[after], truth)[:, :2], axis=1)
     driven = np.interp(stamps, truth.pose_t, path_lengths(truth.poses))
-    astray = np.append(errors > ASTRAY, False).astype(int)
+    astray = np.append(errors > DIVERGED, False).astype(int)
     begins = np.flatnonzero(np.diff(astray, prepend=0) == 1)
     ends = np.minimum(np.flatnonzero(np.diff(astray, prepend=0) == -1), len(stamps) - 1)
     time, way = (float((of[ends] - of[begins]).max(initial=0.0)) for of in (stamps, driven))
-    return {"astray_time": time, "astray_way": way}
+    return {"divergence_time": time, "divergence_distance": way}
 
 
 def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, float]:

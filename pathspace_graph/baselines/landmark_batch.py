@@ -161,9 +161,9 @@ def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[L
     state.add(track.state.landmarks, track.state.labels, track.state.numbers)
     state.votes, state.next_number = track.state.votes, track.state.next_number
     insert_drive(state.variables, smoother.variables.calibrations, poses)
-    sigma = np.array(online.believed.odometry.sigmas_calibration)
+    sigma = np.array(online.inflated.odometry.sigmas_calibration)
     chain = replace(system.chain, calibration_sigma=sigma)  # as the online run believed in the end
-    return replace(system, settings=online.believed, chain=chain), state
+    return replace(system, settings=online.inflated, chain=chain), state
 
 
 class Reassociation:

@@ -54,7 +54,7 @@ class LandmarkFixedLag:
         self.smoother.window.exact = True
         self.path = DrivenPath()
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
-        self.believed = self.settings  # settings with the priors of the calibrations as they are now
+        self.inflated = self.settings  # settings with the priors of the calibrations as they are now
         self.closed = False
         self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
         self._last_check = 0.0
@@ -71,8 +71,8 @@ class LandmarkFixedLag:
         new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
         self._use(new, detections.t, watch)
         if not self.closed:
-            self.believed = motions.doubt_calibrations(
-                self.smoother, self.believed, reading.sensor_doubted, reading.measured
+            self.inflated = motions.inflate_priors(
+                self.smoother, self.inflated, reading.sensor_doubted, reading.measured
             )
         watch.lap("update")
         self._close()

@@ -182,7 +182,7 @@ def is_worth_trying(recurrence: Recurrence, settings: MapperSettings) -> bool:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ClosureEvidence:
     """What speaks for or against a closed result."""
 
     closed: bool  # whether both boundaries are closed
@@ -196,7 +196,7 @@ class Evidence:
     in place, beside the curves (m). It is infinite on a straight, whose stretches all agree."""
 
 
-def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSettings) -> Evidence:
+def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSettings) -> ClosureEvidence:
     """Return the evidence for or against an optimum whose curves are closed."""
     state, boundaries = at.state, at.state.boundaries
     coloured = np.isin(detections.label, list(boundaries))
@@ -210,7 +210,7 @@ def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSetting
     again = second[detections.cycle] & coloured
     parts = [(p, again[p.rows]) for p in at.projected.values()]
     whitened = np.concatenate([np.zeros(0), *(p.whitened[chosen] for p, chosen in parts)])
-    return Evidence(
+    return ClosureEvidence(
         closed=set(boundaries) == set(BOUNDARIES) and all(b.periodic for b in boundaries.values()),
         used=_share(detections.used, coloured & ~again),
         used_again=_share(detections.used, again),
@@ -221,7 +221,7 @@ def evidence(at: Evaluation, detections: DetectionTable, settings: MapperSetting
     )
 
 
-def is_true_closure(found: Evidence, settings: MapperSettings) -> bool:
+def is_true_closure(found: ClosureEvidence, settings: MapperSettings) -> bool:
     """Return whether the evidence is for a closed result, in every respect."""
     return (
         found.closed
@@ -234,7 +234,9 @@ def is_true_closure(found: Evidence, settings: MapperSettings) -> bool:
     )
 
 
-def objection(found: Evidence, splines: Mapping[int, BSpline], poses: Array, settings: MapperSettings) -> str:
+def objection(
+    found: ClosureEvidence, splines: Mapping[int, BSpline], poses: Array, settings: MapperSettings
+) -> str:
     """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
 
     Boundaries don't cross but at level crossings, the vehicle crosses neither and has driven beside all of

@@ -37,7 +37,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE as POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.motion import doubted, known_noise
+from pathspace_graph.mapping.motion import known_noise, with_inflated_priors
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict
@@ -375,7 +375,7 @@ def _with_doubt(
     system, variables = optimizer.system, at.state.variables
     known = _known(system, at)
     variance = np.diag(known.covariance(variables.calibration_keys))
-    believed = doubted(variables.calibrations, variance, system.settings)
+    believed = with_inflated_priors(variables.calibrations, variance, system.settings)
     if believed == system.settings:
         return at, convergence, known
     system.settings = believed

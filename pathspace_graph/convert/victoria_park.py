@@ -33,7 +33,7 @@ POSES_A_STEP: Final = 10  # of the reference, which no batch finds after the dri
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class VictoriaDrive:
     """Rows of the file, with poses numbered from 0 in order."""
 
     moves: Array  # (n, 3) moves from each pose to the next one, in m, m and rad
@@ -75,7 +75,7 @@ def example_file() -> Path:
     return Path(find(EXAMPLE))
 
 
-def _read(file: Path) -> Drive:
+def _read(file: Path) -> VictoriaDrive:
     rows: dict[str, list[list[float]]] = {kind: [] for kind in FIELDS}
     for number, line in enumerate(read_text(file).splitlines(), start=1):
         kind, *words = line.split() or [""]
@@ -104,7 +104,7 @@ def _read(file: Path) -> Drive:
         raise InputError(file, "expected each row LANDMARK to begin with a pose of the rows ODOMETRY")
     by_pose = np.argsort(place, kind="stable")
     seen, (xx, xy, yy) = seen[by_pose], seen[by_pose, 4:].T
-    return Drive(
+    return VictoriaDrive(
         moves=moves[:, 2:5],
         sigmas=np.sqrt(moves[0, [5, 8, 10]]),
         pose=place[by_pose],
@@ -114,7 +114,7 @@ def _read(file: Path) -> Drive:
     )
 
 
-def _reference(drive: Drive, t: Array) -> Truth:
+def _reference(drive: VictoriaDrive, t: Array) -> Truth:
     values = _optimum(drive)
     poses = [values.atPose2(X(index)) for index in range(len(t))]
     trees = np.array([values.atPoint2(L(index)) for index in range(int(drive.tree.max()) + 1)])
@@ -123,7 +123,7 @@ def _reference(drive: Drive, t: Array) -> Truth:
     return Truth(t, placed - placed[0], trees, np.full(len(trees), LEFT), drive.tree)
 
 
-def _optimum(drive: Drive) -> Any:
+def _optimum(drive: VictoriaDrive) -> Any:
     graph, values, whole = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.NonlinearFactorGraph()
     smoother, seen, pose = gtsam.ISAM2(), set[int](), gtsam.Pose2()
     noise = gtsam.noiseModel.Diagonal.Sigmas(drive.sigmas)
@@ -149,7 +149,7 @@ def _optimum(drive: Drive) -> Any:
     return gtsam.LevenbergMarquardtOptimizer(whole, smoother.calculateEstimate()).optimize()
 
 
-def _sighting(drive: Drive, row: int) -> Any:
+def _sighting(drive: VictoriaDrive, row: int) -> Any:
     """Return the factor of a detection: its covariance is turned to the bearing and the range."""
     point, distance = drive.points[row], float(np.hypot(*drive.points[row]))
     along = point / distance

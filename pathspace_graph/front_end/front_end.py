@@ -95,7 +95,7 @@ class FrontEnd:
             self._sensor_doubted = check.errors.contradict(self._settings.calibration)
         fresh, settings = noise.observe(odometry, cones, motion, check.pose), self._settings
         if fresh:
-            check.believe(noise.twist_sigma)
+            check.set_noise(noise.twist_sigma)
         if fresh or not self._begun:
             settings, self._begun = noise.calibrated(settings), True
         measured = None if settings is self._settings else settings

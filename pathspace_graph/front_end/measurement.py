@@ -17,7 +17,7 @@ from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights
 from pathspace_graph.factors.se2 import in_vehicle, left_of, rotations, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
 
-from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, Follower, SeenCycle, Sightings, TwistRecord
+from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, ConeTracker, SeenCycle, Sightings, TwistRecord
 
 DRIFT: Final = np.array([0.05, 0.05, 0.0017])
 """Assumed drift of any odometry (m, m, rad per root of s): 0.5 m and 0.9 degrees after 90 s.
@@ -298,7 +298,7 @@ class Measurement:
         return cls(cycles, replace(found, odometry=sigma, interval=interval))
 
     def _begin(self, found: MeasuredNoise) -> None:
-        self._found, self._follower, self._followed = found, Follower(found), 0
+        self._found, self._tracker, self._followed = found, ConeTracker(found), 0
         self._sightings: list[Sightings] = []
         self._cones: _Cones | None = None
 
@@ -307,7 +307,7 @@ class Measurement:
         if self._cones is not None:
             return self._round(self._cones)
         cycles = self._cycles[self._followed : self._followed + FOLLOWED]
-        self._sightings.append(self._follower.follow(cycles))
+        self._sightings.append(self._tracker.follow(cycles))
         self._followed += FOLLOWED
         if self._followed < len(self._cycles):
             return None

@@ -64,7 +64,7 @@ class MotionCheck:
         self._rest = Rest(sigma)
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
-    def believe(self, sigma: Array) -> None:
+    def set_noise(self, sigma: Array) -> None:
         """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten."""
         self.sigma = self._rest.sigma = sigma
         self._recent, self.errors = RecentDetections(), SensorErrors(self.settings)

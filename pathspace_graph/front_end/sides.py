@@ -128,7 +128,7 @@ class SideJudge:
 
     def _beginning(
         self, label: int, pose: Array, path: PathAhead, seen: IntArray, stations: Array, lateral: Array
-    ) -> "Row":
+    ) -> "ConeRow":
         side = SIDES[label] * lateral
         beside = (side > MIN_LATERAL) & (side < MAX_LATERAL)
         beside &= (stations > path.driven - BEHIND) & (stations < path.driven + SURE)
@@ -136,7 +136,7 @@ class SideJudge:
         cones = seen[order[in_front_row(stations[order], side[order], BESIDE, LATERAL_GAP)]].tolist()
         left = np.array([-np.sin(pose[2]), np.cos(pose[2])])
         points = self._cones.points[cones[-2:]]
-        row = Row(cones, pose[:2] + SIDES[label] * HALF_WIDTH * left, float(pose[2]))
+        row = ConeRow(cones, pose[:2] + SIDES[label] * HALF_WIDTH * left, float(pose[2]))
         if cones:
             row.end = points[-1]
         if len(cones) > 1:
@@ -145,7 +145,7 @@ class SideJudge:
 
 
 @dataclass
-class Row:
+class ConeRow:
     """A row of cones, the nearest first."""
 
     cones: list[int]
@@ -158,7 +158,7 @@ class Row:
         self.end, self.heading = point, float(np.arctan2(dy, dx))
 
 
-def follow_rows(rows: Mapping[int, Row], points: Array, votes: IntArray, free: IntArray) -> None:
+def follow_rows(rows: Mapping[int, ConeRow], points: Array, votes: IntArray, free: IntArray) -> None:
     """Lead both rows on through free cones (k,), as long as it is clear which cone comes next.
 
     All cones have points (n, 2) in m, and votes (n, 2) for left and right. The next one has the least
@@ -178,7 +178,7 @@ def follow_rows(rows: Mapping[int, Row], points: Array, votes: IntArray, free: I
 
 
 def _costs(
-    rows: Mapping[int, Row], label: int, points: Array, votes: IntArray, cones: IntArray
+    rows: Mapping[int, ConeRow], label: int, points: Array, votes: IntArray, cones: IntArray
 ) -> tuple[Array, Array]:
     """Return what it costs a row to lead on to cones (k,), and how far they are from its end (m)."""
     row, other = rows[label], rows[LEFT + RIGHT - label]

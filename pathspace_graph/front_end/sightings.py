@@ -62,7 +62,7 @@ class SeenCycle:
     twist: Array  # (3,) twist of the vehicle: m/s, m/s, rad/s
 
 
-class Follower:
+class ConeTracker:
     """Cones that were seen in the last seconds, by dead reckoning."""
 
     def __init__(self, known: MeasuredNoise) -> None:

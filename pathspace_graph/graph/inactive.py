@@ -11,7 +11,7 @@ the next variables are deactivated, together with it.
 
 While the loop is open, only the drive itself ties the map to its beginning, and a bias of the yaw rate bends
 all of it: after a thousand metres, a thousandth of a radian per second is tens of metres. So the active part
-is held at an anchor near the vehicle, and the stretches behind hang on it like a chain, each given by its
+is held at an anchor near the vehicle, and the stretches behind are attached to it like a chain, each given by its
 conditional in the frame of its own anchor: however far the chain swings, it bends none of them. The oldest
 link holds the origin of the map frame. To bring it back to (0, 0, 0), the whole map is moved rigidly.
 """
@@ -121,7 +121,7 @@ class InactiveMap:
 SIGMA_ANCHOR: Final = 1e-3  # of the pose that holds an open map (m, rad); any value gives the same step
 
 
-class Follower(Protocol):
+class Attached(Protocol):
     """What else is in the map frame, and moves with the open map."""
 
     def move(self, motion: Array) -> None:
@@ -236,8 +236,8 @@ class InactiveChain(InactiveMap):
         now = variables.change(variables.layout.entries(self.anchors))
         return [jacobian_factor(self.anchors, np.eye(POSE) / SIGMA_ANCHOR, now / SIGMA_ANCHOR)]
 
-    def carry(
-        self, prior: gtsam.GaussianFactorGraph, variables: Variables, followers: Sequence[Follower]
+    def transform_to_origin(
+        self, prior: gtsam.GaussianFactorGraph, variables: Variables, attached: Sequence[Attached]
     ) -> gtsam.GaussianFactorGraph:
         """Update the inactive variables, and move everything so that the origin is at (0, 0, 0) again.
 
@@ -249,8 +249,8 @@ class InactiveChain(InactiveMap):
         motion = inverse(self.origin)
         self.poses = {key: compose(motion, pose) for key, pose in self.poses.items()}
         variables.values = from_frame(variables.values, motion, variables.layout)
-        for follower in followers:
-            follower.move(motion)
+        for one in attached:
+            one.move(motion)
         return graph_of(near.factor(variables))
 
     # --- as one Gaussian ---------------------------------------------------------------------------------

@@ -171,7 +171,7 @@ class Submaps:
         self.finished: list[RelativeFactor] = []  # submaps, in the order of the drive
         self.keyframes: dict[int, tuple[Array, Array]] = {}
         """Pose (3,), when it was marginalized, and reference (3,) of each keyframe by key."""
-        self._hung: dict[int, tuple[int, Array]] = {}  # a keyframe's anchor, and its pose in that frame
+        self._attached: dict[int, tuple[int, Array]] = {}  # a keyframe's anchor, and its pose in that frame
         self._graph: gtsam.GaussianFactorGraph | None = None
         self._keyframe = 0
         self._driven = 0.0
@@ -199,17 +199,17 @@ class Submaps:
             self.finished.append(relative_factor(self._graph, self._keyframe, pose, reference, variables))
             self._graph = None
 
-    def hang(self, anchor: int, pose: Array) -> None:
-        """Hang all new keyframes on an anchor, by its key, which is at a pose (3,); they move with it."""
+    def attach(self, anchor: int, pose: Array) -> None:
+        """Attach all new keyframes to an anchor, by its key, which is at a pose (3,); they move with it."""
         for key, (keyframe, _) in self.keyframes.items():
-            if key not in self._hung:
-                self._hung[key] = anchor, relative(pose, keyframe)
+            if key not in self._attached:
+                self._attached[key] = anchor, relative(pose, keyframe)
 
-    def carry(self, anchors: Mapping[int, Array]) -> None:
-        """Place all hung keyframes anew, given the poses (3,) of their anchors."""
-        for key, (anchor, local) in self._hung.items():
+    def place_attached(self, anchors: Mapping[int, Array]) -> None:
+        """Place all attached keyframes anew, given the poses (3,) of their anchors."""
+        for key, (anchor, local) in self._attached.items():
             self.keyframes[key] = compose(anchors[anchor], local), self.keyframes[key][1]
-        self._hung = {}
+        self._attached = {}
 
     def remove_information(self, keys: IntArray, variables: Variables) -> None:
         self.finish(variables)

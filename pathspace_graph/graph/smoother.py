@@ -32,7 +32,7 @@ from .gaussian import (
     sparse_marginal,
     substitute_points,
 )
-from .inactive import Follower, InactiveChain, InactiveMap
+from .inactive import Attached, InactiveChain, InactiveMap
 from .relative import RelativeFactor, Submaps
 from .rows import Rows, calibrated_delta, newton_system, predicted_covariance
 from .variables import CALIBRATION_KEY, POINT, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys
@@ -51,7 +51,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.window = WindowFactors(map_rows, settings.tolerances)
         self.user_factors = UserFactors()
         self.inactive: InactiveMap = InactiveChain()  # variables that a cycle does not solve for
-        self.followers: list[Follower] = []  # what moves with the open map
+        self.attached: list[Attached] = []  # what moves with the open map
         self.submaps: Submaps | None = None
         """The prior in submaps, while the loop is open and the user gave no factors on poses."""
         self.last_step: FactoredSystem | None = None  # damped system of the last Gauss-Newton step
@@ -117,7 +117,7 @@ class FixedLagSmoother(Generic[M_co]):
 
     def add_pose(self, t: float, pose: Array, odometry: IntegratedOdometry) -> None:
         """Add the next pose (3,) at t (s), and the odometry that leads to it."""
-        self.window.lead_on(self.next_cycle - 1, odometry)
+        self.window.extend(self.next_cycle - 1, odometry)
         self.variables.insert(pose_keys(np.array([self.next_cycle])), pose)
         self.times.append(t)
 
@@ -142,7 +142,7 @@ class FixedLagSmoother(Generic[M_co]):
         if self.chain is not None or np.isin(self.user_factors.keys, self.inactive.keys).any():
             self.reactivate()
 
-    def believe_calibrations(self, mean: Array, sigma: Array) -> None:
+    def set_calibration_priors(self, mean: Array, sigma: Array) -> None:
         """Give the priors of the calibrations other means and standard deviations, (2,) or (7,).
 
         Calibrations are never eliminated, so their priors can be exchanged exactly.
@@ -300,15 +300,15 @@ class FixedLagSmoother(Generic[M_co]):
             self.submaps.finish(self.variables)
             if self.chain is not None and len(self.chain):
                 anchor = int(self.chain.anchors[0])
-                self.submaps.hang(anchor, self.variables.of(self.chain.anchors))
+                self.submaps.attach(anchor, self.variables.of(self.chain.anchors))
 
-    def carry(self) -> None:
+    def transform_to_origin(self) -> None:
         """Update the inactive variables, and move an open map so that the drive began at the origin."""
         if self.chain is None or len(self.chain) == 0:
             self.refresh()
             return
         self._finish_submap()
-        self.prior = self.chain.carry(self.prior, self.variables, self.followers)
+        self.prior = self.chain.transform_to_origin(self.prior, self.variables, self.attached)
         self.window.relinearize(self._cycles, self.inactive.keys)
 
     def refresh(self) -> None:
@@ -334,7 +334,7 @@ class FixedLagSmoother(Generic[M_co]):
         chain = self.chain
         if chain is None and len(self.inactive) == 0:
             return
-        self.carry()
+        self.transform_to_origin()
         self._finish_submap()
         if chain is not None:
             self._place_keyframes(chain)
@@ -355,7 +355,7 @@ class FixedLagSmoother(Generic[M_co]):
         if self.submaps is not None:
             anchors = np.union1d(chain.anchors, self.variables.keyframes)
             active = {int(key): self.variables.of(np.array([key])) for key in anchors}
-            self.submaps.carry(chain.poses | active)
+            self.submaps.place_attached(chain.poses | active)
 
     def _marginalize_keyframes(self) -> None:
         keyframes = self.variables.keyframes

@@ -146,7 +146,7 @@ class WindowFactors(Generic[M_co]):
         self.variables.linearized[entries] = self.variables.values[entries]
         return True
 
-    def lead_on(self, cycle: int, odometry: IntegratedOdometry) -> None:
+    def extend(self, cycle: int, odometry: IntegratedOdometry) -> None:
         """Add the odometry that leads from the newest pose, that of a cycle, to the next one."""
         self.odometry.append(odometry)
         self._lengthened = cycle

@@ -37,7 +37,7 @@ def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
     settings, track = smoother.map.settings.closing, smoother.map
     if not may_tell_place(track.state, settings):
         return None
-    smoother.carry()
+    smoother.transform_to_origin()
     smoother.refresh()
     covariance = smoother.newest_covariance()
     return find_place(track, covariance, settings) if is_lost(covariance, settings) else None

@@ -61,8 +61,8 @@ class Revisits:
         before = smoother.variables.poses[-1].copy()
         keyframes = smoother.revisit(revisit.factor(), smoother.map.settings.closing.iterations, SIGMA_STEP)
         after = smoother.variables.poses[-1].copy()
-        for follower in smoother.followers:
-            follower.move(compose(after, inverse(before)))
+        for one in smoother.attached:
+            one.move(compose(after, inverse(before)))
         record.bent(keyframes, smoother)
         return np.asarray(after - before)
 

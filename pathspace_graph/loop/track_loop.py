@@ -14,7 +14,7 @@ from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.motion import doubt_calibrations
+from pathspace_graph.mapping.motion import inflate_priors
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
@@ -24,9 +24,9 @@ from pathspace_graph.spline.bspline import BSpline
 
 from .closing import go_on_from, hold_gauge
 from .drive_record import LATE, DriveRecord, LapBatch
-from .finding import FOUND, KnownLoop, Search, evidence_of, start_anew
-from .mending import Mending
+from .map_repair import MapRepair
 from .recognition import recognize
+from .relocalization import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .revisit import Revisits
 
 OWN_PRIOR: Final = "the map goes on from the window's own prior"  # begins the notice where no batch came
@@ -58,7 +58,7 @@ class TrackLoop:
         self.late_cycles = 0  # cycles by which the slowest batch is late in a vehicle, by its wall time
         self.record = DriveRecord(self.settings, noise)
         self.revisits = Revisits(smoother, path, self.record)
-        self.mending = Mending(smoother)
+        self.map_repair = MapRepair(smoother)
         self._smoother = smoother
         self._path = path
         self._monitor = HealthMonitor(self.settings.health)
@@ -68,7 +68,7 @@ class TrackLoop:
         self._lap_batch: LapBatch | None = None
         self._batch_ends: list[int] = []
         self._boundaries_cross = False
-        self._believed = self.settings  # with the priors of the calibrations as they are now
+        self._inflated = self.settings  # with the priors of the calibrations as they are now
         self._settled: float | None = None  # path driven (m) when the closed map was last replaced
         self._closing_tried = 0.0
         self._loop_tried, self._recognition_tried = 0.0, 0.0
@@ -125,20 +125,20 @@ class TrackLoop:
         if self.health.condition == GOOD and self._boundaries_cross:
             self.health = Health(DEGRADED, "the two boundaries of the map cross")
         if self._known_loop.is_whole and self.record.unsolvable is None:
-            self.mending.contradictions.observe(smoother.map, self._known_loop, new, detections.t)
+            self.map_repair.contradictions.observe(smoother.map, self._known_loop, new, detections.t)
         if self.health.condition == LOST and self._known_loop.is_whole and self._lap_batch is None:
             smoother.map.detections.release_all()  # the map stays as it was before
             self._search, self._lost = Search(smoother), self.health
-            self.mending.contradictions.clear()
+            self.map_repair.contradictions.clear()
             self.record.give_up("the vehicle was lost")
 
-    def doubt_calibrations(self, reading: Reading) -> str:
+    def inflate_priors(self, reading: Reading) -> str:
         """Widen the priors of calibrations that the drive contradicts while the loop is open; say so once."""
         if self.closed:
             return ""
-        before = self._believed
-        self._believed = doubt_calibrations(self._smoother, before, reading.sensor_doubted, reading.measured)
-        doubted = before == self.settings != self._believed and reading.measured is None
+        before = self._inflated
+        self._inflated = inflate_priors(self._smoother, before, reading.sensor_doubted, reading.measured)
+        doubted = before == self.settings != self._inflated and reading.measured is None
         return LEARNED if doubted else ""
 
     # --- the batch of the open lap -----------------------------------------------------------------------
@@ -180,9 +180,9 @@ class TrackLoop:
                 return jump, REVISITED if len(self.revisits.found) == 1 else ""
         if batch is None:
             self._hold_gauge()
-            may_mend = self._known_loop.is_whole and self._search is None and self.record.unsolvable is None
-            if may_mend and self.mending.is_due(self._known_loop, self._path.length):
-                self._begin_batch(self.mending.begin(np.array(self.record.poses)))
+            may_repair = self._known_loop.is_whole and self._search is None and self.record.unsolvable is None
+            if may_repair and self.map_repair.is_due(self._known_loop, self._path.length):
+                self._begin_batch(self.map_repair.begin(np.array(self.record.poses)))
         elif self._smoother.next_cycle - 1 >= batch.due:
             return self._end(batch, spent)
         return None, ""
@@ -222,13 +222,13 @@ class TrackLoop:
         return self._take(outcome)
 
     def _take(self, marginal: LapMarginal | str) -> tuple[Array | None, str]:
-        mends, smoother = self.mending.is_tried(), self._smoother
-        notice = self.mending.end(marginal) if mends else ""
+        repairs, smoother = self.map_repair.is_tried(), self._smoother
+        notice = self.map_repair.end(marginal) if repairs else ""
         if isinstance(marginal, str):
-            return None, f"{OWN_PRIOR}: {marginal}" if self.closed and not mends else ""
-        if mends and (not notice or self._crosses(marginal.splines) > self._boundaries_cross):
+            return None, f"{OWN_PRIOR}: {marginal}" if self.closed and not repairs else ""
+        if repairs and (not notice or self._crosses(marginal.splines) > self._boundaries_cross):
             return None, ""
-        if marginal.objection and not mends:
+        if marginal.objection and not repairs:
             if self.closed:
                 raise LoopRefusedError(marginal.objection)
             return None, f"the loop stays open: {marginal.objection}"
@@ -289,7 +289,7 @@ class TrackLoop:
         first_kept, due = min(first + wait, cycle), cycle + wait
         last = max(due, min(due + open_lap.late, first_kept + self.settings.max_poses - 1))
         recorded = open_lap.ends[len(self._batch_ends) :][:1]
-        lap = self.record.lap(first_kept, start, self._believed)
+        lap = self.record.lap(first_kept, start, self._inflated)
         due = min(max([due, *recorded]), last + 1)
         self._lap_batch = LapBatch(lap, smoother.times[-1], due, last)
 
@@ -312,7 +312,7 @@ class TrackLoop:
 
     # --- a vehicle that is lost --------------------------------------------------------------------------
 
-    def find_back(self, *, sees_road: bool) -> tuple[Array | None, str]:
+    def relocalize(self, *, sees_road: bool) -> tuple[Array | None, str]:
         """Start the window anew where a lost vehicle is found; return its jump (3,) and a notice.
 
         Where no place of the map agrees, but it `sees_road`, it has left the map.

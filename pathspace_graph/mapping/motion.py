@@ -102,7 +102,7 @@ def predict(
         smoother.measure_bias(motion.bias.value, motion.bias.sigma)
 
 
-def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSettings:
+def with_inflated_priors(mean: Array, variance: Array, settings: MapperSettings) -> MapperSettings:
     """Return the settings, with wide priors of the calibrations if the drive contradicts one of them.
 
     mean m and variance v, (2,) or (7,), are those of the calibrations. If a prior with mean p and standard
@@ -126,7 +126,7 @@ def doubted(mean: Array, variance: Array, settings: MapperSettings) -> MapperSet
     return replace(settings, calibration=settings.calibration.widened())
 
 
-def doubt_calibrations(
+def inflate_priors(
     smoother: FixedLagSmoother[MapRows],
     settings: MapperSettings,
     sensor_doubted: bool,
@@ -146,8 +146,8 @@ def doubt_calibrations(
     if smoother.last_step is not None and smoother.next_cycle % DOUBT_CYCLES == 0:
         variables = smoother.variables
         variance = np.diag(smoother.last_covariance(variables.calibration_keys))
-        settings = doubted(variables.calibrations, variance, settings)
-    smoother.believe_calibrations(np.array(settings.calibrations), np.array(settings.sigmas_calibrations))
+        settings = with_inflated_priors(variables.calibrations, variance, settings)
+    smoother.set_calibration_priors(np.array(settings.calibrations), np.array(settings.sigmas_calibrations))
     return settings
 
 

@@ -11,7 +11,7 @@ from pathspace_graph.factors.footpoint import TOLERANCES, FootPoints, joint_foot
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.residuals import project, sigma_across
 from pathspace_graph.factors.sensor import sensor_rows
-from pathspace_graph.graph.inactive import Follower
+from pathspace_graph.graph.inactive import Attached
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import SENSOR_KEY, pose_keys
@@ -38,11 +38,11 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
     def __init__(self, settings: MapperSettings) -> None:
         super().__init__(smoother_settings(settings), CurveMap(settings))
         self.window.exact = True
-        self.add_followers(self.map)
+        self.attach(self.map)
 
-    def add_followers(self, *followers: Follower) -> None:
+    def attach(self, *attached: Attached) -> None:
         """Move these together with the open map."""
-        self.followers += followers
+        self.attached += attached
 
     def settle(self) -> None:
         """Relinearize only what moves from now on: once the loop has closed, hardly anything does."""
@@ -204,7 +204,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         keys = [state.keys(label)[indices] for label, indices in zip(active, leaving, strict=True)]
         self.deactivate(np.concatenate(keys))
         state.activate_only(active)
-        self.carry()
+        self.transform_to_origin()
 
     def _is_worthwhile(self, needed: dict[int, IntArray]) -> bool:
         """Whether a closed curve is active all around, or an open one has enough behind the vehicle."""

@@ -297,7 +297,7 @@ def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gt
         points_vehicle=detections.measured[rows],
         covariances=detections.covariance[rows],
         low=u - before,
-        high=boundary.believed(u + past),
+        high=boundary.within_trusted(u + past),
         sigma_model=settings.spline.sigma_model,
         huber=settings.gate.huber,
         sensor_key=track.variables.sensor_key,

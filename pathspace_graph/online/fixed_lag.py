@@ -67,7 +67,7 @@ class FixedLagMapper(MapperEstimate):
         """Tentative tracks, through which the open curves grow."""
         self.orange = OrangeCones(self.settings.growth, self.settings.spline.sigma_shape)
         """Orange cones, which are points of the map."""
-        self.smoother.add_followers(self.path, self.growth, self.orange)
+        self.smoother.attach(self.path, self.growth, self.orange)
         self.loop = TrackLoop(self.smoother, self.path, self.front_end.noise)
         if self.settings.open_lap.prior == "window":
             self.loop.record.give_up("no batch of the lap was asked for")
@@ -149,7 +149,7 @@ class FixedLagMapper(MapperEstimate):
         watch.lap("expand")
         self._update()
         watch.lap("update")
-        learned = self.loop.doubt_calibrations(reading)
+        learned = self.loop.inflate_priors(reading)
         closes = self._close()
         watch.lap("close")
         if closes:
@@ -267,7 +267,7 @@ class FixedLagMapper(MapperEstimate):
         if not self.boundaries or not self.loop.may_close():
             return False
         smoother, settings = self.smoother, self.settings.closing
-        smoother.carry()
+        smoother.transform_to_origin()
         track, times = smoother.map, smoother.times
         if self.path.length < self._placed_until and not is_within_reach(track, times, settings):
             return False  # the covariance would be costly
@@ -300,7 +300,7 @@ class FixedLagMapper(MapperEstimate):
         road.smoother.marginalize()
         ends = [boundary.confirmed_end for boundary in road.boundaries.values()]
         sees_road = len(ends) == len(BOUNDARIES) and min(ends) > ROAD and road.loop.health.condition == GOOD
-        jump, notice = self.loop.find_back(sees_road=sees_road)
+        jump, notice = self.loop.relocalize(sees_road=sees_road)
         if jump is not None:
             self.new_road = None
         return jump, notice

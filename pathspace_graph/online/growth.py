@@ -140,7 +140,7 @@ class Growth:
         _, near = nearest_within(points, found.points, radius)
         rows, points = rows[near], points[near]
         low = np.full(len(rows), u[0] - radius)
-        high = boundary.believed(np.full(len(rows), np.inf))
+        high = boundary.within_trusted(np.full(len(rows), np.inf))
         detections.take(rows, label, boundary.find(self._state.control_points(label), points, low, high).u)
 
     def _relocate_poses(self, label: int, from_u: float) -> None:

@@ -44,7 +44,7 @@ MIN_TRACKS: Final = 2  # least number of tracks for a tentative curve of a bound
 
 
 @dataclass(eq=False)
-class Row:
+class TentativeRow:
     """One boundary as far as it is known, and the tracks that may continue it."""
 
     side: float  # sign of the signed distance from the other row (left positive)
@@ -77,7 +77,7 @@ class Row:
         self.chosen.append(index)
 
 
-def extend_rows(left: Row, right: Row, driven: Array, threshold: float) -> None:
+def extend_rows(left: TentativeRow, right: TentativeRow, driven: Array, threshold: float) -> None:
     """Continue both rows through their candidates, each time the one that lags behind.
 
     A row stays on its side of the other, at about the width of the track, and does not cross the driven path
@@ -95,7 +95,7 @@ def extend_rows(left: Row, right: Row, driven: Array, threshold: float) -> None:
             waiting = [other for other in (left, right) if not other.ended]
 
 
-def _next(row: Row, other: Row, driven: Array, threshold: float) -> int | None:
+def _next(row: TentativeRow, other: TentativeRow, driven: Array, threshold: float) -> int | None:
     """Return the index of the candidate that continues a row, or None."""
     step = row.candidates - row.end
     distance = np.hypot(step[:, 0], step[:, 1])
@@ -116,7 +116,7 @@ def _next(row: Row, other: Row, driven: Array, threshold: float) -> int | None:
     return int(indices[possible.argmax()]) if possible.any() else None
 
 
-def _has_width(row: Row, other: Row, points: Array) -> BoolArray:
+def _has_width(row: TentativeRow, other: TentativeRow, points: Array) -> BoolArray:
     """Return whether points (k, 2) are about as far from the other row as the end of their own row."""
     stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(other.line, axis=0).T)))
     station, width = along_and_across(np.concatenate([row.end[None], points]), other.line, stations)
@@ -236,7 +236,7 @@ def confirmed(track: CurveMap) -> dict[int, Outlook]:
 
 def extended_rows(
     track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
-) -> dict[int, tuple[Row, IntArray]]:
+) -> dict[int, tuple[TentativeRow, IntArray]]:
     """Return the row of each boundary, extended through its tentative tracks, and the indices of these."""
     tracks = {label: _tracks(track, label, tentative[label], t) for label in BOUNDARIES}
     rows = {label: _row(track, label, tentative[label].points[tracks[label]]) for label in BOUNDARIES}
@@ -261,23 +261,23 @@ def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> I
     return indices[undisputed(track, label, tracks.points[indices], settings.merge_radius)]
 
 
-def _row(track: CurveMap, label: int, candidates: Array) -> Row:
+def _row(track: CurveMap, label: int, candidates: Array) -> TentativeRow:
     """Return a boundary's row with its candidates; it begins beside the vehicle if there is no curve yet."""
     state, side = track.state, SIDES[label]
     if label not in state.boundaries:
         x, y, theta = state.poses[-1]
         ahead = np.array([np.cos(theta), np.sin(theta)])
         beside = np.array([x, y]) + side * BEGIN_LATERAL * np.array([-ahead[1], ahead[0]])
-        return Row(side, np.array([beside - TAIL * ahead, beside]), ahead, candidates)
+        return TentativeRow(side, np.array([beside - TAIL * ahead, beside]), ahead, candidates)
     boundary, known = state.boundaries[label], state.control_points(label)
     end = boundary.confirmed_end
     steps = int(np.ceil(min(TAIL, end) / TAIL_STEP)) + 1
     u = np.linspace(max(end - TAIL, 0.0), end, max(steps, 2))
     direction = boundary.evaluate(known, u[-1:], 1)[0]
-    return Row(side, boundary.evaluate(known, u), direction / np.hypot(*direction), candidates)
+    return TentativeRow(side, boundary.evaluate(known, u), direction / np.hypot(*direction), candidates)
 
 
-def _begun(settings: MapperSettings, row: Row, variances: Array) -> Outlook:
+def _begun(settings: MapperSettings, row: TentativeRow, variances: Array) -> Outlook:
     """Return a curve through the tracks of a row; none of it is confirmed."""
     boundary, u = open_boundary(settings.spline, settings.gauge), row.lengths
     placement = boundary.extend(0, u - u[0])

@@ -220,10 +220,10 @@ def _of_frame(best: Trial, trials: Trials, figures: dict[str, float]) -> list[Hi
         mistake = "frame"
     side = "with y to the right, and " if frame.mirrored else ""
     what = FRAMES.get(frame.stands, f"the sensor's frame is {side}turned by {_angle(frame.turn)}")
-    return [told(mistake, what=what, how=_mended(frame), **figures)]
+    return [told(mistake, what=what, how=_remedy(frame), **figures)]
 
 
-def _mended(frame: Hypothesis) -> str:
+def _remedy(frame: Hypothesis) -> str:
     rows = np.round(frame.frame)
     if np.allclose(frame.frame, rows, atol=1e-9):
         x, y = (f"{'-' if row.sum() < 0.0 else ''}{'xy'[np.abs(row).argmax()]}" for row in rows)

@@ -148,7 +148,7 @@ class Boundary:
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
         """Refine the foot points of points (m, 2), starting at the parameters u (m,)."""
         s, alone = self.settings, np.zeros(len(points), np.intp)
-        search = u, u - s.refine_room, self.believed(u + s.refine_room), s.refine_iterations
+        search = u, u - s.refine_room, self.within_trusted(u + s.refine_room), s.refine_iterations
         unwrapped = self.extended(control_points)
         return refine_joint_foot_points(self.tables.alone, unwrapped, points, alone, *search)
 
@@ -162,7 +162,7 @@ class Boundary:
         """Return the length (m) of the curve's end, up to where it is confirmed, without any cone."""
         return self.confirmed_end - float(self.cone_parameters[-1:].sum())
 
-    def believed(self, high: Array) -> Array:
+    def within_trusted(self, high: Array) -> Array:
         """Return upper limits (m,) of stretches, clipped so that they exclude the extrapolated end."""
         return np.minimum(high, self.trusted)
 
@@ -253,7 +253,7 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
     """
     low, high = boundary.tables.low, boundary.tables.high
     if not boundary.periodic:
-        low, high = max(low, boundary.confirmed_end - room), float(boundary.believed(np.array(high)))
+        low, high = max(low, boundary.confirmed_end - room), float(boundary.within_trusted(np.array(high)))
     u = np.append(np.arange(low, high, boundary.settings.search_step), high)
     offset = boundary.evaluate(control_points, u) - pose[:2]
     tangent = boundary.evaluate(control_points, u, 1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import Evidence, evidence, is_true_closure, is_worth_trying, objection
+from pathspace_graph.batch.lap import ClosureEvidence, evidence, is_true_closure, is_worth_trying, objection
 from pathspace_graph.batch.mapper import BatchMapper, find_closed_optimum
 from pathspace_graph.batch.optimizer import LOOSE_GATE, Optimizer
 from pathspace_graph.batch.simplification import own_settings
@@ -29,7 +29,9 @@ Array = NDArray[np.float64]
 
 SETTINGS = own_settings(MapperSettings())
 
-BELIEVED = Evidence(closed=True, used=0.95, used_again=0.95, misfit=1.0, gap=6.0, overlap=40.0, sigma=0.05)
+BELIEVED = ClosureEvidence(
+    closed=True, used=0.95, used_again=0.95, misfit=1.0, gap=6.0, overlap=40.0, sigma=0.05
+)
 
 
 def path_of(laps: float) -> Recurrence:

@@ -128,7 +128,7 @@ def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
 
 def test_the_table_of_the_camera_has_each_noise_and_the_landmarks_that_are_told_all() -> None:
     parts = [
-        frame(estimator, 2, rmse).assign(variant=variant, nees=1.5, l=0.2, told_degraded=0.25)
+        frame(estimator, 2, rmse).assign(variant=variant, nees=1.5, l=0.2, reported_degraded=0.25)
         for estimator, variant, rmse in (("fixed-lag", "default", 0.6), ("spline", "measured", 0.4))
     ]
     header, rows = camera_table(pd.concat(parts, ignore_index=True))
@@ -149,7 +149,7 @@ def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength
     late = list(study.noise)[1]
     runs = [
         frame("fixed-lag", 2, rmse).assign(
-            noise=noise, size=50.0, closed_at_end=True, lost_at_end=False, said=said
+            noise=noise, size=50.0, closed_at_end=True, lost_at_end=False, notices=said
         )
         for noise, rmse, said in (("clean", 0.2, ""), (late, 0.3, "late"))
     ]
@@ -157,7 +157,7 @@ def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength
     header, rows = faults_table(pair, pd.concat(runs, ignore_index=True).assign(error_max=2.0))
     assert [label for label, _ in rows] == ["clean", late]
     assert [figures[0].text for _, figures in rows] == ["1.00", "1.50"]
-    assert rows[1][1][header.index("said so [%]") - 1].text == "100"
+    assert rows[1][1][header.index("reported [%]") - 1].text == "100"
     assert all(len(figures) == len(header) - 1 for _, figures in rows)
 
 

@@ -14,7 +14,7 @@ from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.sightings import (
     MAX_RANGE,
     MIN_TWISTS,
-    Follower,
+    ConeTracker,
     SeenCycle,
     Sightings,
     TwistRecord,
@@ -100,7 +100,7 @@ def test_few_twists_say_nothing() -> None:
 
 
 def follow(cycles: list[SeenCycle], known: MeasuredNoise) -> Sightings:
-    return Follower(known).follow(cycles)
+    return ConeTracker(known).follow(cycles)
 
 
 def drive(
@@ -226,4 +226,4 @@ def test_tables_of_sightings_are_cut_and_put_together() -> None:
     again = Sightings.stacked(parts)
     np.testing.assert_array_equal(again.cone, found.cone)
     np.testing.assert_array_equal(again.by_bias, found.by_bias)
-    assert len(Follower(NO_ERRORS).follow([]).t) == 0
+    assert len(ConeTracker(NO_ERRORS).follow([]).t) == 0

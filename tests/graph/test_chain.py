@@ -185,14 +185,14 @@ def test_a_swing_bends_nothing_and_is_undone(motion: Array) -> None:
     drive = Drive(0)
     variables, chain = drive.variables, drive.chain
     chain.refresh(variables)
-    drive.prior = chain.carry(drive.prior, variables, [])
+    drive.prior = chain.transform_to_origin(drive.prior, variables, [])
     before, system = variables.copy(), normal_equations(drive.prior, Layout(keys_of(drive.prior)))
     anchor = int(chain.anchors[0])
     near = relative_factor(drive.prior, anchor, *pose_and_reference(anchor, variables), variables)
     variables.values = from_frame(variables.values, motion, variables.layout)
     variables.values[variables.layout.entries(chain.keys)] = np.nan
     flag = Flag(variables.of(POINTS[-1:]))
-    prior = chain.carry(graph_of(near.factor(variables)), variables, [flag])
+    prior = chain.transform_to_origin(graph_of(near.factor(variables)), variables, [flag])
     np.testing.assert_allclose(variables.values, before.values, atol=1e-8)
     np.testing.assert_allclose(flag.points[0], before.of(POINTS[-1:]), atol=1e-8)
     found = normal_equations(prior, Layout(keys_of(prior)))

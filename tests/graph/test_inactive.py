@@ -225,7 +225,7 @@ def test_steps_of_the_active_variables_are_steps_of_the_whole_system() -> None:
     mapper = FixedLagMapper(EAGER, log.odometry_sigma)
     mapper.smoother = smoother = Checked(EAGER)
     mapper.growth = Growth(smoother)
-    smoother.add_followers(mapper.path, mapper.growth)
+    smoother.attach(mapper.path, mapper.growth)
     mapper.loop = TrackLoop(smoother, mapper.path, mapper.front_end.noise)
     map_log(log, mapper)
     assert mapper.closed
@@ -246,7 +246,7 @@ def test_reactivation_does_not_change_the_map(cycles: int) -> None:
         mapper.update(odometry, cycle)
     assert mapper.closed == (cycles == 240)
     smoother = mapper.smoother
-    smoother.carry()
+    smoother.transform_to_origin()
     assert len(smoother.inactive) >= (1 if mapper.closed else 3)
     size, before, calibration = smoother.layout.size, mapper.map(), mapper.calibration.copy()
     keys = np.append(smoother.map.state.map_keys, pose_keys(np.array([smoother.next_cycle - 1])))

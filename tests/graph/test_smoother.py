@@ -139,7 +139,7 @@ def test_another_prior_of_the_calibration_is_one_that_was_known_from_the_start(
     for drive in (changed, other):
         drive.drive(9)
     before = changed.smoother.variables.calibration.copy()
-    changed.smoother.believe_calibrations(np.array(means), np.array(sigmas))
+    changed.smoother.set_calibration_priors(np.array(means), np.array(sigmas))
     for drive in (changed, other):
         drive.drive(3)
     ours, theirs = changed.smoother, other.smoother
@@ -158,9 +158,9 @@ def test_the_prior_of_a_calibration_can_be_changed_several_times_and_back() -> N
     for drive in (changed, other):
         drive.drive(5)
     for means, sigmas in (((0.4, -0.9), (0.7, 3.0)), ((0.1, 0.2), (2.0, 0.2)), ((0.0, 0.0), (0.3, 0.5))):
-        changed.smoother.believe_calibrations(np.array(means), np.array(sigmas))
+        changed.smoother.set_calibration_priors(np.array(means), np.array(sigmas))
         prior = changed.smoother.prior
-        changed.smoother.believe_calibrations(np.array(means), np.array(sigmas))
+        changed.smoother.set_calibration_priors(np.array(means), np.array(sigmas))
         assert changed.smoother.prior is prior
     for drive in (changed, other):
         drive.drive(3)
@@ -174,7 +174,7 @@ def test_the_submaps_of_an_open_loop_have_the_other_prior_of_the_calibration() -
     changed, other = LinearDrive(2), LinearDrive(2, means=means, sigmas=sigmas)
     for drive in (changed, other):
         drive.drive(6)
-    changed.smoother.believe_calibrations(np.array(means), np.array(sigmas))
+    changed.smoother.set_calibration_priors(np.array(means), np.array(sigmas))
     for drive in (changed, other):
         drive.drive(3)
     found = []

@@ -26,7 +26,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import drive_record
-from pathspace_graph.loop.mending import MENDED
+from pathspace_graph.loop.map_repair import REPAIRED
 from pathspace_graph.loop.track_loop import LONGEST_WAIT, OWN_PRIOR
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
@@ -167,7 +167,7 @@ def test_a_map_is_mended_by_a_late_batch_and_replayed_to_the_bit(
 ) -> None:
     drive = unseen(laps_log(pear_track()), [LEFT], 6.0, 11.0)
     results = assert_replayed(drive, 9, 2, sent, monkeypatch)
-    assert [result.notice.startswith(MENDED) for result in results if result.notice] == [True]
+    assert [result.notice.startswith(REPAIRED) for result in results if result.notice] == [True]
 
 
 def assert_replayed(

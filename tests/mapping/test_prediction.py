@@ -15,10 +15,10 @@ from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.motion import (
     MeasuredMotion,
-    doubted,
     integrate_odometry,
     predict,
     smoother_settings,
+    with_inflated_priors,
 )
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.run import split_odometry
@@ -111,7 +111,7 @@ def shown(entry: int, value: float, sigma: float) -> MapperSettings:
     prior = np.array(SETTINGS.sigmas_calibrations)
     values, sigmas = np.zeros(7), 1e3 * prior
     values[entry], sigmas[entry] = value, sigma
-    return doubted(*posterior(values, sigmas, prior), SETTINGS)
+    return with_inflated_priors(*posterior(values, sigmas, prior), SETTINGS)
 
 
 @pytest.mark.parametrize(("value", "wide"), [(0.0189, False), (0.0191, True), (-0.0191, True), (0.0, False)])
@@ -137,12 +137,12 @@ def test_an_error_of_the_sensor_widens_its_priors_but_keeps_the_scale_of_the_wor
 def test_a_prior_is_widened_once() -> None:
     wide = shown(1, 1.0, 1e-4)
     mean, variance = posterior(np.ones(7), np.full(7, 1e-6), np.array(wide.sigmas_calibrations))
-    again = doubted(mean, variance, wide)
+    again = with_inflated_priors(mean, variance, wide)
     assert again.odometry == wide.odometry
     assert again.calibration == wide.calibration.widened()
-    assert doubted(mean, variance, again) == again
+    assert with_inflated_priors(mean, variance, again) == again
 
 
 def test_what_a_drive_does_not_show_is_not_doubted() -> None:
     sigma = np.array(SETTINGS.sigmas_calibrations)
-    assert doubted(np.zeros(7), sigma**2, SETTINGS) == SETTINGS
+    assert with_inflated_priors(np.zeros(7), sigma**2, SETTINGS) == SETTINGS

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from pathspace_graph.mapping.path import crosses
-from pathspace_graph.online.outlook import Row, extend_rows
+from pathspace_graph.online.outlook import TentativeRow, extend_rows
 
 THRESHOLD = 0.7
 PATH = np.array([[-10.0, 0.0], [0.0, 0.0]])
 
 
-def row(side: float, *candidates: tuple[float, float], end: float = 0.0) -> Row:
+def row(side: float, *candidates: tuple[float, float], end: float = 0.0) -> TentativeRow:
     """Returns a row along x that ends 2 m to the left or to the right of (end, 0)."""
     line = np.array([[-10.0, 2.0 * side], [end, 2.0 * side]])
-    return Row(side, line, np.array([1.0, 0.0]), np.array(candidates).reshape(-1, 2))
+    return TentativeRow(side, line, np.array([1.0, 0.0]), np.array(candidates).reshape(-1, 2))
 
 
-def chosen(left: Row, right: Row, driven: np.ndarray = PATH) -> tuple[list[int], list[int]]:
+def chosen(left: TentativeRow, right: TentativeRow, driven: np.ndarray = PATH) -> tuple[list[int], list[int]]:
     extend_rows(left, right, driven, THRESHOLD)
     return left.chosen, right.chosen
 

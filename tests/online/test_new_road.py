@@ -7,7 +7,7 @@ import pytest
 
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import DEGRADED, LOST
-from pathspace_graph.loop.finding import FOUND
+from pathspace_graph.loop.relocalization import FOUND
 from pathspace_graph.loop.track_loop import NEW_ROAD
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry

@@ -18,8 +18,8 @@ from pathspace_graph.health import LOST
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, UNKNOWN
-from pathspace_graph.loop.finding import FOUND
-from pathspace_graph.loop.mending import MENDED
+from pathspace_graph.loop.map_repair import REPAIRED
+from pathspace_graph.loop.relocalization import FOUND
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -91,8 +91,8 @@ def mended() -> Drive:
     return Drive(
         unseen(laps_log(pear_track()), [LEFT], 6.0, 11.0),
         {
-            "contradicted": lambda mapper, _: mapper.loop.mending.is_tried(),
-            "mended": lambda mapper, result: result.notice.startswith(MENDED),
+            "contradicted": lambda mapper, _: mapper.loop.map_repair.is_tried(),
+            "mended": lambda mapper, result: result.notice.startswith(REPAIRED),
         },
     )
 

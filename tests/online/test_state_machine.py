@@ -54,7 +54,7 @@ STRANGE = st.sampled_from([np.nan, np.inf, -np.inf, 1e308, -1e308, 1e18, 1e5, -1
 
 STAGES = [
     *((FixedLagMapper, name) for name in ("_predict", "_classify", "_expand", "_update", "_result")),
-    *((TrackLoop, name) for name in ("judge", "doubt_calibrations", "go_on")),
+    *((TrackLoop, name) for name in ("judge", "inflate_priors", "go_on")),
     (FixedLagSmoother, "marginalize"),
 ]
 """Methods that every cycle calls."""

@@ -138,7 +138,7 @@ def test_settled_control_points_alone_hold_the_curve_before_the_confirmed_end(co
 def test_the_extrapolated_end_is_not_believed() -> None:
     boundary, points = line(16.0)
     assert (boundary.trusted, boundary.tables.high) == (16.5, 18.0)
-    np.testing.assert_array_equal(boundary.believed(np.array([3.0, 16.4, 99.0])), [3.0, 16.4, 16.5])
+    np.testing.assert_array_equal(boundary.within_trusted(np.array([3.0, 16.4, 99.0])), [3.0, 16.4, 16.5])
     foot = boundary.refine(points, np.array([[16.4, 1.0], [17.5, 1.0]]), np.array([16.0, 16.0]))
     assert foot.interior.tolist() == [True, False]
 

@@ -41,7 +41,7 @@ def row(noise: str, seed: int, lap: int, **values: Any) -> dict[str, Any]:
         "error_max": 0.5,
         "scale_by_prior": 0.1,
         "failure": "",
-        "said": "",
+        "notices": "",
     }
     return {"study": "faults", "noise": noise, "seed": seed, "lap": lap} | usual | values
 
@@ -54,7 +54,7 @@ def frame() -> pd.DataFrame:
             row("clean", 0, 1, rmse=9.0),
             row("clean", 0, 2, rmse=0.2),
             row("clean", 1, 2, rmse=0.1),
-            row("latency: 20 ms", 0, 2, rmse=0.3, size=60, scale_by_prior=-5.0, said="a notice"),
+            row("latency: 20 ms", 0, 2, rmse=0.3, size=60, scale_by_prior=-5.0, notices="a notice"),
             row("latency: 20 ms", 1, 2, rmse=0.35, missed=0.1, lost_at_end=True, scale_by_prior=-3.0),
             row("latency: 50 ms", 0, 2, rmse=np.nan, missed=1.0, closed_at_end=False, error_max=80.0),
             row("latency: 50 ms", 1, 2, failure="ValueError: lost", rmse=np.nan),
@@ -71,9 +71,9 @@ def test_a_run_is_compared_with_the_clean_one_of_its_track_and_seed(frame: pd.Da
     assert (values["ratio_min"], values["ratio_max"]) == pytest.approx((1.5, 3.5))
     assert values["size_ratio"] == pytest.approx(1.25)
     assert (values["missed"], values["closed"], values["lost"]) == (pytest.approx(0.05), 2, 1)
-    assert (values["said"], values["told"]) == ({"a notice": 1}, 1)
+    assert (values["notices"], values["reported"]) == ({"a notice": 1}, 1)
     assert values["calibration"] == {"scale error of the speeds": pytest.approx(-4.0)}
-    assert np.isnan(values["told_lost"])
+    assert np.isnan(values["reported_lost"])
     values = strong
     assert (values["runs"], values["failed"], values["with_map"]) == (1, 1, 0)
     assert np.isnan(values["ratio_mean"])
@@ -81,16 +81,16 @@ def test_a_run_is_compared_with_the_clean_one_of_its_track_and_seed(frame: pd.Da
 
 
 def test_what_a_run_calls_itself_is_told_where_it_judges_its_health(frame: pd.DataFrame) -> None:
-    frame["told_degraded"], frame["told_lost"] = 0.1, np.where(frame["noise"] == "clean", 0.0, 0.2)
+    frame["reported_degraded"], frame["reported_lost"] = 0.1, np.where(frame["noise"] == "clean", 0.0, 0.2)
     clean, mild, _ = outcomes(STUDY, frame)
-    assert mild["told_lost"] == pytest.approx(0.2)
-    assert (clean["told"], mild["told"]) == (0, 2)
+    assert mild["reported_lost"] == pytest.approx(0.2)
+    assert (clean["reported"], mild["reported"]) == (0, 2)
     table = fault_table(STUDY, [clean, mild])
     assert table.rows[1][table.header.index("called degraded, lost [% of cycles]")] == "10.0, 20.0"
 
 
 def test_the_longest_way_astray_is_that_of_the_worst_run(frame: pd.DataFrame) -> None:
-    frame["astray_time"], frame["astray_way"] = np.arange(7.0), 10.0 * np.arange(7.0)
+    frame["divergence_time"], frame["divergence_distance"] = np.arange(7.0), 10.0 * np.arange(7.0)
     clean, mild, _ = outcomes(STUDY, frame)
     table = fault_table(STUDY, [clean, mild])
     column = table.header.index("over 1 m off after closing [s, m]")
@@ -115,7 +115,7 @@ def test_the_figure_has_a_panel_for_each_fault_and_a_look_for_each_fate(frame: p
     visible = [axes for axes in figure.axes if axes.get_visible()]
     assert [axes.get_title(loc="left") for axes in visible] == ["latency [ms]"]
     labels = {str(line.get_label()) for line in visible[0].lines}
-    assert {"no map", "lost at the end", "not lost, said so", "mean"} <= labels
+    assert {"no map", "lost at the end", "not lost, reported", "mean"} <= labels
     assert [text.get_text() for text in visible[0].get_xticklabels()] == ["20", "50"]
 
 
@@ -147,7 +147,7 @@ def test_the_files_hold_every_value(frame: pd.DataFrame, tmp_path: Path) -> None
         assert entry == dict.fromkeys(row) | known
     for name in flat.select_dtypes("number"):
         np.testing.assert_allclose(flat[name], [row[name] for row in expected], err_msg=name)
-    assert json.loads(flat["said"][1]) == {"a notice": 1}
+    assert json.loads(flat["notices"][1]) == {"a notice": 1}
     written = {file.name for file in tmp_path.iterdir()}
     forms = {f"faults.{suffix}" for suffix in ("txt", "md", "tex", "csv", "json", "png", "pdf")}
     assert written == forms | {"results.csv", "times.csv"}

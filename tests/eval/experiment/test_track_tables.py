@@ -118,5 +118,5 @@ def test_an_unknown_column_is_refused(column: str) -> None:
 
 
 def test_yardsticks_are_true_or_false() -> None:
-    with pytest.raises(SettingsError, match="yardsticks: expected true or false, found 1"):
-        Study(tracks=(0,), yardsticks=1)  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match="reference_limits: expected true or false, found 1"):
+        Study(tracks=(0,), reference_limits=1)  # type: ignore[arg-type]

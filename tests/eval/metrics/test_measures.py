@@ -107,7 +107,7 @@ def test_marginals_and_yardsticks_are_measured_where_they_are_asked_for() -> Non
     assert whole.values["normalized_error"] == pytest.approx((9.0 + 9.0 + 28.8) / 3)
     assert whole.values["nees_inside"] is False
     with pytest.raises(ValueError, match="associations"):
-        measure(run(true), log(true), yardsticks=True)
+        measure(run(true), log(true), reference_limits=True)
 
 
 def test_landmarks_have_no_band() -> None:
@@ -184,11 +184,11 @@ class Judged(CycleRecord):
 def test_the_health_of_the_cycles_is_counted_where_it_is_told() -> None:
     true = circle_truth()
     made = run(true)
-    assert not any(name.startswith("told") for name in measure(made, log(true))[-1].values)
+    assert not any(name.startswith("reported") for name in measure(made, log(true))[-1].values)
     told = ["good"] * 20 + ["degraded"] * 12 + ["lost"] * 8
     cycles = tuple(Judged(k, t, 0.001, 4, 0, 0, 1, health=told[k]) for k, t in enumerate(STAMPS))
     whole = measure(replace(made, cycles=cycles), log(true))[-1].values
-    assert (whole["told_degraded"], whole["told_lost"]) == (0.3, 0.2)
+    assert (whole["reported_degraded"], whole["reported_lost"]) == (0.3, 0.2)
 
 
 def test_the_calibration_is_told_in_sigmas_of_its_prior() -> None:

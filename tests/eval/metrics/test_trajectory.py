@@ -8,7 +8,7 @@ import pytest
 from pathspace_graph.eval.metrics.trajectory import (
     end_of_trajectory,
     interpolate_poses,
-    longest_astray,
+    longest_divergence,
     position_rms,
     trajectory_errors,
     vehicle_errors,
@@ -59,10 +59,14 @@ def test_a_vehicle_is_astray_until_it_is_within_a_metre_again() -> None:
     for begin, end in ((10, 20), (50, 55), (100, 120), (198, 201)):
         poses[begin:end, 1] = 1.1
     poses[70:90, 1] = 0.9
-    assert longest_astray(t, poses, true, 3.0) == pytest.approx({"astray_time": 2.0, "astray_way": 4.0})
-    assert longest_astray(t, poses, true, 12.0) == pytest.approx({"astray_time": 0.2, "astray_way": 0.4})
-    assert longest_astray(t, path, true, 0.0) == {"astray_time": 0.0, "astray_way": 0.0}
-    assert longest_astray(t, poses, true, np.inf) == {}
+    assert longest_divergence(t, poses, true, 3.0) == pytest.approx(
+        {"divergence_time": 2.0, "divergence_distance": 4.0}
+    )
+    assert longest_divergence(t, poses, true, 12.0) == pytest.approx(
+        {"divergence_time": 0.2, "divergence_distance": 0.4}
+    )
+    assert longest_divergence(t, path, true, 0.0) == {"divergence_time": 0.0, "divergence_distance": 0.0}
+    assert longest_divergence(t, poses, true, np.inf) == {}
 
 
 def test_the_vehicle_at_the_end_is_compared_with_the_truth() -> None:

@@ -1,4 +1,4 @@
-"""Mending: holes of the first lap are led through in the second one, and nothing else is touched."""
+"""MapRepair: holes of the first lap are led through in the second one, and nothing else is touched."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop import mending
-from pathspace_graph.loop.finding import KnownLoop
-from pathspace_graph.loop.mending import MENDED, Stretch, carried, led_through, newest_lap
+from pathspace_graph.loop.map_repair import REPAIRED, Stretch, carried, led_through, newest_lap
+from pathspace_graph.loop.relocalization import KnownLoop
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online
@@ -55,7 +55,7 @@ def rmse(mapper: FixedLagMapper) -> float:
 def test_a_hole_of_one_boundary_is_mended_once_the_vehicle_has_passed_it_again() -> None:
     mapper, results = mended()
     (notice,) = [result for result in results if result.notice]
-    assert notice.notice == f"{MENDED}: 9 more cones on the left lie on it"
+    assert notice.notice == f"{REPAIRED}: 9 more cones on the left lie on it"
     assert notice.jump is not None and np.hypot(*notice.jump[:2]) < 0.3
     lap = 15.0  # seconds, about
     assert HOLE[1] + lap < notice.t < HOLE[1] + 1.5 * lap
@@ -74,7 +74,7 @@ def test_the_vehicle_is_not_lost_beside_the_hole_and_it_is_said_which_boundary_i
 def test_a_hole_of_both_boundaries_is_mended() -> None:
     mapper, results = map_log(unseen(clean(), [LEFT, RIGHT], HOLE[0], HOLE[1] - 1.0))
     notices = [result.notice for result in results if result.notice]
-    assert notices and all(notice.startswith(MENDED) for notice in notices)
+    assert notices and all(notice.startswith(REPAIRED) for notice in notices)
     assert LOST not in {result.health.condition for result in results}
     assert rmse(mapper) < 0.05
 
@@ -176,5 +176,5 @@ def test_one_side_unseen_for_50_m_is_mended_in_the_second_lap() -> None:
     assert metrics[1].missed > 0.05
     assert metrics[2].missed <= 0.02 and metrics[3].missed <= 0.02
     assert metrics[3].rmse < 0.3
-    assert any(record.notice.startswith(MENDED) for record in result.cycles)
+    assert any(record.notice.startswith(REPAIRED) for record in result.cycles)
     assert LOST not in {record.health for record in result.cycles}

@@ -1,4 +1,4 @@
-"""Mending: the curves of a closed map are led through cones that contradict them, and the drive solved again.
+"""Map repair: the curves of a closed map are led through cones that contradict them, and the drive solved again.
 
 A contradiction is a cone that is seen again and again where the closed map has none of its colour. The poses
 are right, held by the other boundary and by the stretches before and after. So the batch of the whole drive
@@ -28,24 +28,24 @@ from pathspace_graph.settings.online import GrowthSettings
 from pathspace_graph.spline.boundary import sampled
 from pathspace_graph.spline.bspline import BSpline
 
-from .finding import KnownLoop, Loop
+from .relocalization import KnownLoop, Loop
 
-MENDED: Final = "the map was mended"  # beginning of the notice of the cycle in which it was
+REPAIRED: Final = "the map was repaired"  # beginning of the notice of the cycle in which it was
 SIGHTINGS: Final = 6  # detections of a cone that contradicts the map; clutter has one, a cone passed twenty
 MEMORY: Final = 30.0  # time after its last detection at which a contradiction is forgotten (s)
-CONES: Final = 3  # least number of contradictions in a row that is mended
+CONES: Final = 3  # least number of contradictions in a row that is repaired
 BESIDE: Final = 0.5  # distance from a curve within which a cone does not contradict it (m)
 CERTAIN: Final = 1.0  # most sigma of a detection that may contradict the map (m): far cones are smeared
 ROW: Final = 11.0  # most distance of neighbours in a row (m): two regular gaps, since one cone may be missed
 SETTLE: Final = 1.5  # time without detections of its cones after which the vehicle has passed a stretch (s)
 MOST: Final = 20  # number of contradictions passed after which enough of a stretch is seen, whatever the time
 INTERVAL: Final = 1.0  # time after which contradictions are looked for again (s)
-ATTEMPTS: Final = 8  # largest number of attempts to mend a map
-EXPLAINED: Final = 0.5  # least share of the contradictions that a mended map explains, or the old one stays
+ATTEMPTS: Final = 8  # largest number of attempts to repair a map
+EXPLAINED: Final = 0.5  # least share of the contradictions that a repaired map explains, or the old one stays
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class ContradictedStretch:
     """Cones of a boundary's colour that stand in a row beside its curve."""
 
     label: int
@@ -80,12 +80,12 @@ class Contradictions:
         for tracks in self._tracks.values():
             tracks.clear()
 
-    def stretches(self, loop: Loop, t: float) -> list[Stretch]:
+    def stretches(self, loop: Loop, t: float) -> list[ContradictedStretch]:
         """Return the stretches whose cones contradict the loop or stand in a gap, once all are passed.
 
         Of a very long one, `MOST` cones passed are enough.
         """
-        found = list[Stretch]()
+        found = list[ContradictedStretch]()
         for label, tracks in self._tracks.items():
             chosen = tracks.confirmed()
             if len(chosen) < CONES:
@@ -100,7 +100,7 @@ class Contradictions:
             for row in (row for row in in_rows(points, ROW) if len(row) >= CONES):
                 if not passed[row].all() and passed[row].sum() < MOST:
                     return []
-                found.append(Stretch(label, points[row[passed[row]]]))
+                found.append(ContradictedStretch(label, points[row[passed[row]]]))
         return found
 
     def _undisputed(self, label: int, chosen: IntArray) -> BoolArray:
@@ -118,13 +118,13 @@ def in_rows(points: Array, apart: float) -> list[IntArray]:
     return [np.flatnonzero(group == number) for number in range(count)]
 
 
-class Mending:
-    """Whether a closed map is contradicted, and the batch that mends it."""
+class MapRepair:
+    """Whether a closed map is contradicted, and the batch that repairs it."""
 
     def __init__(self, smoother: CurveSmoother) -> None:
         self.contradictions = Contradictions(smoother.map.settings.growth)
         self._smoother = smoother
-        self._stretches: list[Stretch] = []
+        self._stretches: list[ContradictedStretch] = []
         self._lap: Array = np.zeros((0, 3))  # the poses of the newest lap as the attempt began
         self._asked = -np.inf
         self._wait_until = 0.0
@@ -151,7 +151,7 @@ class Mending:
         return ClosedMap(splines, poses, state.variables.calibrations.copy())
 
     def is_tried(self) -> bool:
-        """Return whether the batch that is under way mends a map, rather than closing it."""
+        """Return whether the batch that is under way repairs a map, rather than closing it."""
         return bool(self._stretches)
 
     def end(self, marginal: LapMarginal | str) -> str:
@@ -169,7 +169,7 @@ class Mending:
         self._wait_until = 0.0
         self.contradictions.clear()
         names = [NAMES[label] for label in BOUNDARIES if explained[label]]
-        return f"{MENDED}: {sum(explained)} more cones on the {' and on the '.join(names)} lie on it"
+        return f"{REPAIRED}: {sum(explained)} more cones on the {' and on the '.join(names)} lie on it"
 
 
 def carried(points: Array, before: Array, after: Array) -> Array:
@@ -178,7 +178,7 @@ def carried(points: Array, before: Array, after: Array) -> Array:
     return to_map(to_vehicle(points, before[nearest]), after[nearest])
 
 
-def led_through(track: CurveMap, label: int, stretches: list[Stretch], poses: Array) -> BSpline:
+def led_through(track: CurveMap, label: int, stretches: list[ContradictedStretch], poses: Array) -> BSpline:
     """Return the closed curve of a boundary, led through the cones of its stretches, none beside them.
 
     The cones are in the order in which the newest lap of the poses (P, 3) passes them.

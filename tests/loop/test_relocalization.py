@@ -16,7 +16,7 @@ from pathspace_graph.graph.variables import Layout, pose_keys
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.finding import FOUND, MEMORY, KnownLoop, Search, evidence_of, lay_out_loop
+from pathspace_graph.loop.relocalization import FOUND, MEMORY, KnownLoop, Search, evidence_of, lay_out_loop
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
