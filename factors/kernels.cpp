@@ -594,12 +594,16 @@ py::tuple block_of(const py::handle& own_layout, const py::sequence& groups) {
   for (const py::handle& rows : groups) {
     all.emplace_back(rows);
     patterns.push_back(all.back().size() ? Pattern(rows) : Pattern());
+    expect(all.back().size() == 0 || Index(patterns.back().key.size()) == all.back().width());
   }
   Index height = 0, width = 0;
   std::vector<Index> first(layout.size(), -1), held;
   for (const Rows& rows : all) {
     height += rows.size();
-    for (Index i = 0; i < rows.keys.size(); ++i) first[layout.place(rows.keys.data()[i])] = 0;
+    const Index k = rows.keys.shape(1);
+    const Index* own = rows.keys.data();
+    for (Index i = 0; i < rows.keys.size(); ++i)  // neighbouring rows mostly hold the same variables
+      if (i < k || own[i] != own[i - k]) first[layout.place(own[i])] = 0;
   }
   for (Index k = 0; k < layout.size(); ++k)
     if (first[k] == 0) held.push_back(k), first[k] = width, width += layout.widths.data()[k];
@@ -608,13 +612,15 @@ py::tuple block_of(const py::handle& own_layout, const py::sequence& groups) {
   std::fill_n(at, height * (width + 1), 0.0);
   for (std::size_t g = 0; g < all.size(); ++g) {
     const Rows& rows = all[g];
+    const Pattern& pattern = patterns[g];
+    const Index k = rows.keys.shape(1);
+    std::vector<Index> begin(k);
     for (Index i = 0; i < rows.size(); ++i, ++at) {
-      const Index* own = rows.keys.data() + i * rows.keys.shape(1);
-      Index key = -1, begin = 0;
-      for (Index j = 0; j < rows.width(); ++j) {
-        if (patterns[g].key[j] != key) key = patterns[g].key[j], begin = first[layout.place(own[key])];
-        at[(begin + patterns[g].entry[j]) * height] = rows.jacobian.data()[i * rows.width() + j];
-      }
+      const Index* own = rows.keys.data() + i * k;
+      for (Index c = 0; c < k; ++c)
+        if (i == 0 || own[c] != own[c - k]) begin[c] = first[layout.place(own[c])];
+      for (Index j = 0; j < rows.width(); ++j)
+        at[(begin[pattern.key[j]] + pattern.entry[j]) * height] = rows.jacobian.data()[i * rows.width() + j];
       at[width * height] = -rows.residual.data()[i];
     }
   }
@@ -1706,6 +1712,56 @@ py::tuple followed(const Ints& begins, const Array& stamps, const Array& places,
   return py::make_tuple(numbers, cones.columns(), count);
 }
 
+// --- measured noise ---------------------------------------------------------------------------------------
+
+py::tuple centred(const Ints& begins, const Array& information, const Array& columns, const Array& points) {
+  constexpr Index kErrors = 6, kBoth = kErrors + 1;
+  const Index cones = begins.size(), n = points.shape(0);
+  expect(information.size() == 4 * n && columns.size() == 2 * kErrors * n && points.size() == 2 * n);
+  Array moved(Shape{n, 2, kErrors}), off(Shape{n, 2}), own(Shape{cones, kErrors, kErrors});
+  Array vectors(Shape{cones, kErrors});
+  const double* W = information.data();
+  for (Index c = 0; c < cones; ++c) {
+    const Index begin = begins.data()[c], end = c + 1 < cones ? begins.data()[c + 1] : n;
+    expect(0 <= begin && begin <= end && end <= n);
+    double total[4] = {}, inverse[4], sums[2][kBoth] = {}, mean[2][kBoth], products[kErrors][kBoth] = {};
+    for (Index i = begin; i < end; ++i) {
+      const double *w = W + 4 * i, *A = columns.data() + 2 * kErrors * i, *p = points.data() + 2 * i;
+      for (int k = 0; k < 4; ++k) total[k] += w[k];
+      for (Index j = 0; j < kBoth; ++j) {
+        const double x = j < kErrors ? A[j] : p[0], y = j < kErrors ? A[kErrors + j] : p[1];
+        sums[0][j] += w[0] * x + w[1] * y;
+        sums[1][j] += w[2] * x + w[3] * y;
+      }
+    }
+    inverse2(total, inverse);
+    for (int a = 0; a < 2; ++a)
+      for (Index j = 0; j < kBoth; ++j)
+        mean[a][j] = inverse[2 * a] * sums[0][j] + inverse[2 * a + 1] * sums[1][j];
+    for (Index i = begin; i < end; ++i) {
+      const double* w = W + 4 * i;
+      double both[2][kBoth], weighted[2][kBoth];
+      for (int a = 0; a < 2; ++a) {
+        const Index row = 2 * i + a;
+        for (Index j = 0; j < kErrors; ++j)
+          both[a][j] = moved.mutable_data()[kErrors * row + j] = columns.data()[kErrors * row + j] - mean[a][j];
+        both[a][kErrors] = off.mutable_data()[row] = points.data()[row] - mean[a][kErrors];
+      }
+      for (int a = 0; a < 2; ++a)
+        for (Index j = 0; j < kBoth; ++j)
+          weighted[a][j] = w[2 * a] * both[0][j] + w[2 * a + 1] * both[1][j];
+      for (Index j = 0; j < kErrors; ++j)
+        for (Index k = 0; k < kBoth; ++k)
+          products[j][k] += both[0][j] * weighted[0][k] + both[1][j] * weighted[1][k];
+    }
+    for (Index j = 0; j < kErrors; ++j) {
+      std::copy_n(products[j], kErrors, own.mutable_data() + kErrors * (kErrors * c + j));
+      vectors.mutable_data()[kErrors * c + j] = products[j][kErrors];
+    }
+  }
+  return py::make_tuple(moved, off, own, vectors);
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_kernels, module) {
@@ -1740,6 +1796,7 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("weighted_means", &weighted_means);
   module.def("matched", &matched);
   module.def("followed", &followed);
+  module.def("centred", &centred);
   module.def("off_prediction", &off_prediction);
   module.def("squared", &squared);
   module.def("learned", &learned);

@@ -29,7 +29,11 @@ def integrate_poses(durations: Array, twists: Array) -> Array:
 
     durations (k,) are in s, twists (k, 3) in m/s, m/s and rad/s.
     """
-    steps = se2_exp(twists * durations[:, None])
+    return accumulated(se2_exp(twists * durations[:, None]))
+
+
+def accumulated(steps: Array) -> Array:
+    """Return the poses (k, 3), in the frame of the start, after each of k steps (k, 3) on SE(2)."""
     heading = np.cumsum(steps[:, 2])
     before = heading - steps[:, 2]
     c, s = np.cos(before), np.sin(before)

@@ -137,28 +137,19 @@ def _misfit(
     if whole:
         foot = boundary.find_anywhere(control_points, points)
     else:
-        begin = _nearest_in_view(state, detections.cycle[rows], points, label, settings)
-        foot = boundary.refine(control_points, points, begin)
+        in_view = _in_view(state, detections.cycle[rows], label, settings)
+        begin = boundary.find(control_points, points, *in_view).u
+        foot = boundary.refine(control_points, points, begin)  # it may lie somewhat beyond
     projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
 
 
-def _nearest_in_view(
-    state: State, cycles: IntArray, points: Array, label: int, settings: MapperSettings
-) -> Array:
-    """Return the parameter (m,) nearest to each point (m, 2) on the stretch that its cycle's pose sees."""
-    boundary, gate, step = state.boundaries[label], settings.gate, settings.batch.association.step
-    ahead = np.arange(-gate.view_behind, gate.view_ahead + step, step)
-    u = state.pose_u[label][:, None] + ahead
-    x, y = boundary.evaluate(state.control_points(label), u.ravel()).T.reshape(2, *u.shape)
-    dx, dy = x[cycles], y[cycles]
-    dx -= points[:, :1]
-    dy -= points[:, 1:]
-    dx *= dx
-    dy *= dy
-    dx += dy
-    return np.asarray(u[cycles, dx.argmin(axis=1)])
+def _in_view(state: State, cycles: IntArray, label: int, settings: MapperSettings) -> tuple[Array, Array]:
+    """Return where on a curve begin and end the stretches (m,) that the poses of cycles (m,) see."""
+    boundary, u = state.boundaries[label], state.pose_u[label][cycles]
+    ends = (-np.inf, np.inf) if boundary.periodic else (boundary.tables.low, boundary.tables.high)
+    return np.clip(u - settings.gate.view_behind, *ends), np.clip(u + settings.gate.view_ahead, *ends)
 
 
 # --- cones of a curve ------------------------------------------------------------------------------------
@@ -250,10 +241,7 @@ def _beside(
     if boundary.periodic:
         foot = boundary.find_anywhere(control_points, points)
     else:
-        u = state.pose_u[label][cycles]
-        low, high = u - settings.gate.view_behind, u + settings.gate.view_ahead
-        ends = boundary.tables.low, boundary.tables.high
-        foot = boundary.find(control_points, points, np.clip(low, *ends), np.clip(high, *ends))
+        foot = boundary.find(control_points, points, *_in_view(state, cycles, label, settings))
     distance = np.hypot(*(points - foot.position).T)
     beside = foot.interior & (distance < settings.gate.rough)
     return beside, ~foot.interior & (distance < settings.growth.merge_radius), foot.u

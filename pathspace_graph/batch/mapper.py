@@ -48,7 +48,7 @@ from pathspace_graph.spline.boundary import Boundary
 from .lap import evidence, is_true_closure
 from .optimizer import LOOSE_GATE, Convergence, Optimizer
 from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplified
-from .start import CurveMapper, find_recurrence, start_odometry, start_online
+from .start import CurveMapper, Recurrence, find_recurrence, start_odometry, start_online
 from .system import BatchSystem, Biweight, CurveGauge, Evaluation
 
 ROOM: Final = 4.0  # distance from its foot points in which a factor searches them (m along the curve)
@@ -347,11 +347,8 @@ def find_closed_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence] 
 
     None where no lap recurs in it, the search fails, or the detections are against the loop.
     """
-    chain, detections, settings = (
-        optimizer.system.chain,
-        optimizer.system.detections,
-        optimizer.system.settings,
-    )
+    system = optimizer.system
+    chain, detections, settings = system.chain, system.detections, system.settings
     recurrence = find_recurrence(chain.dead_reckoned(np.zeros(CALIBRATION_SIZE)), settings)
     if not recurrence.recurs:
         return None
@@ -364,13 +361,9 @@ def find_closed_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence] 
 
 def find_open_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:
     """Return the optimum whose search begins with an open map along the odometry."""
-    chain, detections, settings = (
-        optimizer.system.chain,
-        optimizer.system.detections,
-        optimizer.system.settings,
-    )
-    recurrence = find_recurrence(chain.dead_reckoned(np.zeros(CALIBRATION_SIZE)), settings)
-    return optimizer.find(start_odometry(chain, detections, settings, recurrence.denied()))
+    system = optimizer.system
+    path = Recurrence(path_lengths(system.chain.dead_reckoned(np.zeros(CALIBRATION_SIZE))))
+    return optimizer.find(start_odometry(system.chain, system.detections, system.settings, path))
 
 
 def _with_doubt(

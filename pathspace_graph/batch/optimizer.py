@@ -4,13 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import gtsam
 import numpy as np
 
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.graph.elimination import Damping, Elimination
-from pathspace_graph.graph.gaussian import graph_of
+from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.mapping.state import State
@@ -23,8 +21,8 @@ LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 SEARCH: Final = 20  # rounds in which associations are found anew
 SETTLE: Final = 8  # most refinements of the foot points before a step
-POSE_STEPS: Final = 3  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
-ROUGH_TOLERANCE: Final = 8.0  # factor of the tolerances in the first optimization
+POSE_STEPS: Final = 2  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
+ROUGH_TOLERANCE: Final = 40.0  # factor of the tolerances in the first optimization
 TOLERANCE_COST: Final = 1e-5  # most |cost_before - cost_after| over a round at convergence, over the cost
 TOLERANCE_CURVE: Final = 2e-3  # largest move of a curve across itself in a round then, as seen from poses (m)
 TOLERANCE_DECREASE: Final = 5e-3  # most decrease of the cost by an undamped step then; one sigma has 1/2
@@ -73,7 +71,7 @@ class Optimizer:
         detections, settings, effort = self.system.detections, self.system.settings, self.effort
         state = self.align_poses(state, POSE_STEPS, LOOSE_GATE)
         state = reknot(state, detections, settings, dense=True)
-        at, _ = self.run(state, LOOSE_GATE, effort.rough_rounds, ROUGH_TOLERANCE)
+        at, _ = self.run(state, LOOSE_GATE, effort.rough_rounds, rough=True)
         for _ in range(effort.knot_passes):
             cones = cone_counts(at.state, detections, settings)
             state = reknot(at.state, detections, settings, dense=True)
@@ -90,18 +88,18 @@ class Optimizer:
         return state
 
     def run(
-        self, state: State, gate: float, rounds: int, tolerance: float = 1.0
+        self, state: State, gate: float, rounds: int, rough: bool = False
     ) -> tuple[Evaluation, Convergence]:
         """Optimize in rounds until nothing changes, and return the problem there.
 
         Each round takes one step. The gate (sigmas) shrinks to that of the settings (graduated robust
         weights), and only then may it end. After `SEARCH` rounds, or half of them, associations and sigmas
-        stay: where two rows are near, some would change for ever.
+        stay: where two rows are near, some would change for ever. The end of a `rough` one isn't measured.
         """
         system = self.system
         locate_poses(state, self.settings.association)
         system.begin(state)
-        self._last_step, tolerance = None, tolerance * self.effort.tolerance
+        self._last_step, tolerance = None, (ROUGH_TOLERANCE if rough else 1.0) * self.effort.tolerance
         cost, done, searched, search = np.inf, 0, 0, max(min(SEARCH, rounds // 2), 1)
         while done < rounds:
             done, gate = done + 1, max(gate, self.settings.gate)
@@ -116,13 +114,14 @@ class Optimizer:
             still = strict and gain <= tolerance * TOLERANCE_COST * cost
             if still and self._movement(before.state, state) <= tolerance * TOLERANCE_CURVE:
                 at = self._refreshed(state, gate, strict, held)
-                decrease = self.predicted_decrease(at)
+                decrease = 0.0 if rough else self.predicted_decrease(at)
                 if decrease <= tolerance * TOLERANCE_DECREASE:
                     converged, reason = True, "nothing changes any more"
                     break
             gate *= GATE_FACTOR
         else:
-            converged, reason, decrease = False, "no round left", self.predicted_decrease(at)
+            converged, reason = False, "no round left"
+            decrease = 0.0 if rough else self.predicted_decrease(at)
         norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
         return at, Convergence(converged, reason, done, self.steps, at.cost, norm)
 
@@ -174,10 +173,10 @@ class Optimizer:
     def _step(self, at: Evaluation) -> Evaluation:
         """Return the problem after the least damped step that makes the cost smaller, or the same one."""
         self._keep_foot_points(at)
-        graph = self.system.linear_graph(at)
+        rows = self.system.rows(at)
         while not self.damping.exhausted:
             self.steps += 1
-            trial = self._trial(at, graph)
+            trial = self._trial(at, rows)
             if trial is not None:
                 self.damping.lower()
                 self._keep_foot_points(trial)
@@ -186,12 +185,12 @@ class Optimizer:
         self.damping.reset()
         return at
 
-    def _trial(self, at: Evaluation, graph: gtsam.GaussianFactorGraph) -> Evaluation | None:
+    def _trial(self, at: Evaluation, rows: Sequence[Rows]) -> Evaluation | None:
         """Return the problem after a damped step, or None if the cost has grown."""
         state, system = at.state, self.system
-        damped = graph_of(graph, system.damping(state, self.damping.weight))
+        damped = [*rows, *system.damping(state, self.damping.weight)]
         try:
-            problem = Elimination(damped, state.variables.layout)
+            problem = Elimination(linear_graph(damped, state.variables), state.variables.layout)
             step = problem.step(np.zeros(problem.map.size))
         except SingularSystemError:
             return None

@@ -44,7 +44,7 @@ MIN_OVERLAP: Final = 20.0  # least length of the path after a lap (m): over less
 REFERENCE_STEP: Final = 8.0  # distance of the reference poses that every lap passes (m)
 LAP_SIGMAS: Final = np.array([1.5, 1.5, 0.15])  # of a lap's pose about a reference pose (m, m, rad)
 ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the laps together
-ALIGN_TOLERANCE: Final = 1e-6  # largest move of a step at which they are together (m, rad)
+ALIGN_TOLERANCE: Final = 1e-2  # largest move of a step at which they are together (m, rad)
 MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
 
 
@@ -96,10 +96,6 @@ class Recurrence:
     @property
     def recurs(self) -> bool:
         return bool(np.isfinite(self.lap))
-
-    def denied(self) -> "Recurrence":
-        """Return the same path without a lap."""
-        return Recurrence(self.driven)
 
     @property
     def whole_turn(self) -> float:

@@ -311,11 +311,10 @@ class BatchSystem:
         """Return the linear problem with its poses eliminated."""
         return Elimination(self.linear_graph(at), at.state.variables.layout)
 
-    def damping(self, state: State, weight: float) -> gtsam.GaussianFactorGraph:
-        """Return factors that damp how control points move as seen from the poses beside them (1/m^2)."""
+    def damping(self, state: State, weight: float) -> list[Rows]:
+        """Return rows that damp how control points move as seen from the poses beside them (1/m^2)."""
         points, poses = state.control_points, state.poses
-        rows = [gauge.damping(points(label), poses, weight) for label, gauge in self.gauges.items()]
-        return linear_graph(rows, state.variables)
+        return [gauge.damping(points(label), poses, weight) for label, gauge in self.gauges.items()]
 
     def retract(self, state: State, step: Array) -> State:
         """Return the state after a step (n,), taken in relative coordinates.

@@ -160,12 +160,15 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
     readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
     for odometry, _ in readings:
         twists.add(odometry)
-    unknown = KnownNoise(log.odometry_sigma, False, False, measure([], twists, None))
-    front_end = FrontEnd(MapperSettings(), unknown)
+    white, settings = measure([], twists, None), MapperSettings()
+    sigma = log.odometry_sigma if white is None else white.twist_sigma
+    check, sides = MotionCheck(sigma, settings.motion), SideJudge(settings.sides)
     for odometry, detections in readings:
-        reading = front_end.update(odometry, detections)
-        labelled = replace(detections.where(~is_orange(detections)), labels=reading.detections.labels)
-        cycles.append(SeenCycle(labelled, front_end.pose, reading.motion.odometry.twist))
+        of_orange = is_orange(detections)
+        cones, in_lane = detections.where(~of_orange), is_in_orange_lane(detections, of_orange)
+        motion = check.update(odometry, cones, may_doubt=None)
+        labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
+        cycles.append(SeenCycle(labelled, check.pose, motion.odometry.twist))
     return cycles, twists
 
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.odometry import accumulated
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.elimination import owners
-from pathspace_graph.graph.rows import OdometryChain, Rows, calibrated_delta, odometry_rows
+from pathspace_graph.graph.rows import OdometryChain, Rows, odometry_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, pose_key
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
 from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
@@ -32,10 +33,8 @@ class LogOdometry:
 
     def dead_reckoned(self, calibration: Array) -> Array:
         """Return poses (P, 3) by odometry alone, corrected by a calibration (2,); theta is not wrapped."""
-        poses = [self.first]
-        for interval in self.odometry.intervals:
-            poses.append(compose(poses[-1], calibrated_delta(interval, calibration)))
-        return np.array(poses)
+        deltas = compose(self.odometry.deltas, -self.odometry.by_calibration @ calibration)
+        return accumulated(np.concatenate([self.first[None], deltas]))
 
     def rows(self, poses: Array, calibration: Array) -> list[Rows]:
         """Return the rows of `odometry` and `priors` at poses (P, 3) and a calibration (2,)."""

@@ -12,6 +12,7 @@ from typing import Final, Self
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights
 from pathspace_graph.factors.se2 import in_vehicle, left_of, rotations, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
@@ -30,7 +31,7 @@ FIRST_ACROSS: Final = (0.05, 0.016)  # noise that the iteration begins with: m a
 PASSES: Final = 4  # times that cones are followed
 FOLLOWED: Final = 40  # cycles in which cones are followed in a step
 ROUNDS: Final = 5  # times that errors, noise and weights are found in turn
-ROUNDS_AGAIN: Final = 3  # the same from noise that was found before, which is as close to convergence
+ROUNDS_AGAIN: Final = 3  # rounds of a pass that starts from measured noise, which is nearly converged
 STRETCH: Final = 3.0  # time (s) over which errors of the odometry are alike
 COUNTED: Final = 0.8  # share of `MAX_RANGE` beyond which cones are followed only where they seem nearer
 HARDLY: Final = 1e-6  # weight of sightings beyond: a cone seen only there still has a place
@@ -132,19 +133,29 @@ def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Arra
 
     The cones' places, weighted means of `p + A b`, are eliminated. One covariance is `_clustered`.
     """
-    total = np.linalg.inv(cones.sums(information))
-    mean_columns = total @ cones.sums(information @ cones.columns)
-    mean_points = (total @ cones.sums(information @ cones.points[:, :, None]))[:, :, 0]
-    columns = cones.columns - cones.spread(mean_columns)
-    points = cones.points - cones.spread(mean_points)
-    weighted = information[:, :, :1] * columns[:, :1] + information[:, :, 1:] * columns[:, 1:]
-    stacked = weighted.reshape(-1, len(PRIOR)).T
-    own = stacked @ columns.reshape(-1, len(PRIOR))
-    covariance = np.asarray(np.linalg.inv(own + np.diag(PRIOR**-2)), np.float64)
-    errors = -covariance @ (stacked @ points.ravel())
-    left = points + columns @ errors
-    scores = cones.sums(weighted[:, 0] * left[:, :1] + weighted[:, 1] * left[:, 1:])
-    return errors, covariance, _clustered(cones, scores, covariance), left
+    columns, points, own, vectors = _centred(cones.begins, information, cones.columns, cones.points)
+    covariance = np.asarray(np.linalg.inv(own.sum(axis=0) + np.diag(PRIOR**-2)), np.float64)
+    errors = -covariance @ vectors.sum(axis=0)
+    scores = vectors + own @ errors
+    return errors, covariance, _clustered(cones, scores, covariance), points + columns @ errors
+
+
+@compiled
+def _centred(
+    begins: IntArray, information: Array, columns: Array, points: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return columns A (n, 2, 6) and points p (n, 2) less each cone's weighted mean, and its sums.
+
+    Those are `A' W A` (c, 6, 6) and `A' W p` (c, 6), with information W (n, 2, 2) of the sightings of cones
+    that begin at rows (c,).
+    """
+    counts = np.diff(np.append(begins, len(points)))
+    both = np.concatenate([columns, points[:, :, None]], axis=2)
+    total = np.linalg.inv(np.add.reduceat(information, begins))
+    both -= np.repeat(total @ np.add.reduceat(information @ both, begins), counts, axis=0)
+    columns, points = both[:, :, :-1], both[:, :, -1]
+    sums = np.add.reduceat(columns.transpose(0, 2, 1) @ information @ both, begins)
+    return columns, points, sums[:, :, :-1], sums[:, :, -1]
 
 
 def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:

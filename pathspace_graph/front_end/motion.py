@@ -69,8 +69,13 @@ class MotionCheck:
         self.sigma = self._rest.sigma = sigma
         self._recent, self.errors = RecentDetections(), SensorErrors(self.settings)
 
-    def update(self, odometry: Odometry, detections: Detections, may_doubt: bool = True) -> MeasuredMotion:
-        """Return the motion since the last cycle, whose odometry may be doubted if the noise is known."""
+    def update(
+        self, odometry: Odometry, detections: Detections, may_doubt: bool | None = True
+    ) -> MeasuredMotion:
+        """Return the motion since the last cycle, whose odometry may be doubted if the noise is known.
+
+        If `may_doubt` is None, the detections are only asked where the odometry is missing or stuck.
+        """
         t, measured = detections.t, detections.points_vehicle
         motion = self._integrate(odometry, t)
         columns = by_errors(measured, motion.odometry.twist)
@@ -86,8 +91,10 @@ class MotionCheck:
         if not motion.fault and self._rest.update(odometry, t):
             motion = self._at_rest(motion, t, seen)
         self.pose = compose(self.pose, motion.odometry.delta)
-        placed = to_map(points, self.pose[None])
-        self.seen_again = self._recent.has(placed) if self._matched is None else self._matched
+        if self._matched is not None:
+            self.seen_again = self._matched
+        elif may_doubt is not None:
+            self.seen_again = self._recent.has(to_map(points, self.pose[None]))
         if motion.fault:
             columns = by_errors(measured, motion.odometry.twist)  # by the twist that is believed
         self._recent.add(t, measured, columns, self.pose)
@@ -131,9 +138,12 @@ class MotionCheck:
             return motion
         return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(t))
 
-    def _checked(self, motion: MeasuredMotion, t: float, seen: Seen, may_doubt: bool) -> MeasuredMotion:
+    def _checked(
+        self, motion: MeasuredMotion, t: float, seen: Seen, may_doubt: bool | None
+    ) -> MeasuredMotion:
         """Return the motion, or that of the detections where they contradict it, or where it is missing."""
-        if self._t is None or t <= self._t:
+        unasked = may_doubt is None and not (motion.missing or motion.stuck)
+        if self._t is None or t <= self._t or unasked:
             return motion
         odometry, dt = motion.odometry, t - self._t
         going_on = dt * (odometry.twist if self._velocity is None else self._velocity)

@@ -122,10 +122,12 @@ def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.
     """Return a factor `1/2 |J d + r|^2` by owner, from rows whose unknowns are d, on the keys of its rows."""
     parts: dict[int, list[Rows]] = {}
     for unordered in groups:
-        rows = unordered.where(unordered.owner.argsort(kind="stable"))
-        owners, first = np.unique(rows.owner, return_index=True)
-        for owner, begin, end in zip(owners.tolist(), first, np.append(first, len(rows))[1:], strict=True):
-            parts.setdefault(owner, []).append(rows.where(slice(begin, end)))
+        if len(unordered):
+            rows, begin = unordered.where(unordered.owner.argsort(kind="stable")), 0
+            owners, counts = np.unique(rows.owner, return_counts=True)
+            for owner, end in zip(owners.tolist(), counts.cumsum().tolist(), strict=True):
+                parts.setdefault(owner, []).append(rows.where(slice(begin, end)))
+                begin = end
     return {owner: _factor(parts[owner], layout) for owner in sorted(parts)}
 
 

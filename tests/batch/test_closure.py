@@ -42,7 +42,7 @@ def path_of(laps: float) -> Recurrence:
 def test_a_loop_is_tried_after_a_good_part_of_the_second_lap() -> None:
     assert is_worth_trying(path_of(1.35), SETTINGS)
     assert not is_worth_trying(path_of(1.25), SETTINGS)
-    assert not is_worth_trying(path_of(1.35).denied(), SETTINGS)
+    assert not is_worth_trying(Recurrence(path_of(1.35).driven), SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_denied_recurrence_gives_open_curves() -> None:
     chain, detections = optimizer.system.chain, optimizer.system.detections
     recurrence = find_recurrence(chain.dead_reckoned(np.zeros(2)), SETTINGS)
     assert recurrence.recurs
-    state = start_odometry(chain, detections, SETTINGS, recurrence.denied())
+    state = start_odometry(chain, detections, SETTINGS, Recurrence(recurrence.driven))
     at = optimizer.system
     at.begin(state)
     assert not any(boundary.periodic for boundary in state.boundaries.values())

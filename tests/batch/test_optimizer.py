@@ -10,6 +10,7 @@ from pathspace_graph.batch.optimizer import (
     GATE_FACTOR,
     LOOSE_GATE,
     TOLERANCE_DECREASE,
+    Effort,
     Optimizer,
     extrapolation_factor,
 )
@@ -41,8 +42,8 @@ def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
     """Only with the last gate may the optimization end, however little has changed before."""
     system, state = noisy()
     gates: list[float] = []
-    optimizer = Optimizer(system, on_round=lambda: gates.append(system.kernel.gate))
-    _, convergence = optimizer.run(state, gate=8.0, rounds=12, tolerance=1e9)
+    optimizer = Optimizer(system, Effort(tolerance=1e9), lambda: gates.append(system.kernel.gate))
+    _, convergence = optimizer.run(state, gate=8.0, rounds=12)
     expected = [8.0 * GATE_FACTOR**k for k in range(2)] + [BATCH.gate]
     np.testing.assert_allclose(gates, expected)
     assert convergence.converged
@@ -80,7 +81,7 @@ def test_a_tolerance_ends_it_sooner() -> None:
     rounds = []
     for tolerance in (1.0, 100.0):
         system, state = noisy()
-        _, convergence = Optimizer(system).run(state, BATCH.gate, 40, tolerance)
+        _, convergence = Optimizer(system, Effort(tolerance=tolerance)).run(state, BATCH.gate, 40)
         rounds.append(convergence.rounds)
     assert rounds[1] < rounds[0]
 

@@ -20,6 +20,7 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, ORIGIN_KEY, Layout,
 
 for _module in (
     "front_end.gate",
+    "front_end.measurement",
     "front_end.scan_matching",
     "front_end.sightings",
     "graph.inactive",
@@ -249,6 +250,12 @@ CASES: dict[str, Arguments] = {
         information(rng, 3),
         rng.normal(size=(3, 2)),
         0.3,
+    ),
+    "centred": lambda rng: (
+        np.arange(0, COUNT, 5),
+        covariances(rng),
+        rng.normal(size=(COUNT, 2, 6)),
+        rng.normal(size=(COUNT, 2)),
     ),
     "usable": lambda rng: (
         rng.normal(size=(COUNT, 2)),
