@@ -104,17 +104,18 @@ def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
     first, second, gaps = np.concatenate(pairs, axis=1)
     if len(first) == 0:
         return None
-    points, variances = padded(full, MOST_DETECTIONS)
+    points, variances = _padded(full)
     both = variances[first][:, :, None] + variances[second][:, None]
     begin, end = stamps[first], stamps[second]
     return Pairs(begin, end, points[first], points[second], both, gaps, REACH * spacing)
 
 
-def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:
+def _padded(cycles: Sequence[Detections]) -> tuple[Array, Array]:
     """Return the nearest detections (C, m, 2) of each cycle, and a coordinate's variances (C, m), or NaN."""
-    points, variances = np.full((len(cycles), most, 2), np.nan), np.full((len(cycles), most), np.nan)
+    variances = np.full((len(cycles), MOST_DETECTIONS), np.nan)
+    points = np.stack([variances, variances], axis=2)
     for k, cycle in enumerate(cycles):
-        nearest = np.argsort(np.hypot(*cycle.points_vehicle.T), kind="stable")[:most]
+        nearest = np.argsort(np.hypot(*cycle.points_vehicle.T), kind="stable")[:MOST_DETECTIONS]
         points[k, : len(nearest)] = cycle.points_vehicle[nearest]
         variances[k, : len(nearest)] = 0.5 * np.trace(cycle.covariances[nearest], axis1=1, axis2=2)
     return points, variances
