@@ -4,7 +4,7 @@ A package adds one by an entry point of its name, in the group `pathspace_graph.
 `pathspace_graph.batch`, that refers to what makes it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -16,7 +16,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .errors import SettingsError, check_type
+from .errors import SettingsError, check_name, check_type
 from .run import BatchEstimator, OnlineEstimator
 
 MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
@@ -31,8 +31,11 @@ ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add
 BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
 
 
+_POINTS: Final = entry_points()  # looked up once, since that reads the metadata of every package
+
+
 def _installed(group: str) -> dict[str, Callable[[MapperSettings, KnownNoise], Any]]:
-    return {point.name: partial(_load, point) for point in entry_points(group=group)}
+    return {point.name: partial(_load, point) for point in _POINTS.select(group=group)}
 
 
 def _load(point: EntryPoint, settings: MapperSettings, noise: KnownNoise) -> Any:
@@ -65,17 +68,11 @@ BATCH: Final[dict[str, MakeBatch]] = {
 
 def check_online(name: str) -> None:
     """Raise a SettingsError that names the known estimators, unless the name is one of them."""
-    _check(name, ONLINE, "online")
+    check_name(name, ONLINE, f"--estimator: expected a known online estimator ({', '.join(sorted(ONLINE))})")
 
 
 def check_batch(name: str) -> None:
-    _check(name, BATCH, "batch")
-
-
-def _check(name: str, known: Mapping[str, Any], kind: str) -> None:
-    if name not in known:
-        names = ", ".join(sorted(known))
-        raise SettingsError(f"--estimator: expected a known {kind} estimator ({names}), found '{name}'")
+    check_name(name, BATCH, f"--estimator: expected a known batch estimator ({', '.join(sorted(BATCH))})")
 
 
 def for_map(name: str, kind: MapKind) -> str:

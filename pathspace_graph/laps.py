@@ -5,9 +5,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
-
-
 # what counts as passing the start line, the y axis of the map frame at the first pose
 MIN_PATH: Final = 25.0  # least length of a lap (m along the path); jitter may cross the line sooner
 MIN_DISTANCE: Final = 7.0  # least distance from the start that a lap leads to (m)
@@ -71,7 +68,7 @@ class LapCounter:
         return bool(behind or abs(crossing_y) <= GATE_HALF_WIDTH)
 
 
-def lap_end_indices(poses: Array) -> NDArray[np.intp]:
+def lap_end_indices(poses: NDArray[np.float64]) -> NDArray[np.intp]:
     """Return the index of the pose (k,) at which each complete lap ends, of poses (N, 3), map frame."""
     counter = LapCounter()
     laps = np.array([counter.update(pose) for pose in poses], dtype=int)

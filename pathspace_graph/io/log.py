@@ -257,15 +257,13 @@ def _read_odometry(table: Table) -> Odometry:
 
 def _increasing_times(table: Table) -> Array:
     t = table.numbers("t")
-    table.require(np.append(True, np.diff(t) > 0)[: len(t)], "expected a time later than the row before")
+    table.require(np.diff(t, prepend=-np.inf) > 0, "expected a time later than the row before")
     return t
 
 
 def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ...]:
-    if not len(table):
-        return ()
     t = table.numbers("t")
-    table.require(np.append(True, np.diff(t) >= 0), "expected a time not earlier than the row before")
+    table.require(np.diff(t, prepend=t[:1]) >= 0, "expected a time not earlier than the row before")
     table.require(t >= t_first, f"expected a time not before the first odometry row ({t_first:g} s)")
     late = f"expected a time at most {MAX_HOLD:g} s after the last odometry row ({t_last:g} s)"
     table.require(t <= t_last + MAX_HOLD, late)
@@ -274,7 +272,7 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
     table.require(is_positive_definite(*entries), wrong)
     cycles = cycles_of(t, points, covariances_of(*entries), labels_of(table))
     counts = [len(cycle.labels) for cycle in cycles]
-    if max(counts) > limits.MAX_DETECTIONS:
+    if max(counts, default=0) > limits.MAX_DETECTIONS:
         first = sum(counts[: int(np.argmax(counts))])
         table.fail(first, f"expected at most {limits.MAX_DETECTIONS} detections in a cycle, found more")
     return cycles

@@ -46,13 +46,15 @@ class Pairs:
         return len(self.begin)
 
     def distances(self, frame: Array, motion: Array) -> Array:
-        """Return the squared distances (P, m, m) of earlier from later detections, infinite without any.
+        """Return the squared distances (m, m, P) of earlier from later detections, infinite without any.
 
         frame (2, 2) leads from the log's frame to the vehicle's, motion (P, 3) from the later to the earlier.
         """
-        off = (self.before @ frame.T)[:, :, None] - self.laid(frame, motion)[:, None]
-        square = np.einsum("pijk,pijk->pij", off, off)
-        return np.where(np.isnan(square), np.inf, square)
+        before, after = self.before @ frame.T, self.laid(frame, motion)
+        # the pairs last, and contiguous, as there are far more of them than detections in a cycle
+        x, y = np.ascontiguousarray(np.nan_to_num(before, nan=np.inf).T)
+        u, v = np.ascontiguousarray(np.nan_to_num(after, nan=-np.inf).T)
+        return np.asarray((x[:, None] - u) ** 2 + (y[:, None] - v) ** 2)
 
     def laid(self, frame: Array, motion: Array) -> Array:
         """Return the later detections (P, m, 2) in the earlier vehicle frame."""
@@ -61,9 +63,10 @@ class Pairs:
 
     def explained(self, frame: Array, motion: Array) -> Array:
         """Return the share (P,) of the detections of both cycles that lie on one of the other cycle."""
-        weights = np.exp(self.distances(frame, motion) / (-2.0 * self.reach**2))
-        total = weights.max(axis=2).sum(axis=1) + weights.max(axis=1).sum(axis=1)
-        return np.asarray(total / np.maximum(self.count, 1))
+        square = self.distances(frame, motion)
+        nearest = np.concatenate([square.min(axis=0), square.min(axis=1)])
+        weights = np.exp(nearest / (-2.0 * self.reach**2))
+        return np.asarray(weights.sum(axis=0) / np.maximum(self.count, 1))
 
     def chosen(self, rows: BoolArray) -> Self:
         arrays = {name: value[rows] for name, value in vars(self).items() if name != "reach"}
@@ -101,17 +104,18 @@ def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
     first, second, gaps = np.concatenate(pairs, axis=1)
     if len(first) == 0:
         return None
-    points, variances = padded(full, MOST_DETECTIONS)
+    points, variances = _padded(full)
     both = variances[first][:, :, None] + variances[second][:, None]
     begin, end = stamps[first], stamps[second]
     return Pairs(begin, end, points[first], points[second], both, gaps, REACH * spacing)
 
 
-def padded(cycles: Sequence[Detections], most: int) -> tuple[Array, Array]:
+def _padded(cycles: Sequence[Detections]) -> tuple[Array, Array]:
     """Return the nearest detections (C, m, 2) of each cycle, and a coordinate's variances (C, m), or NaN."""
-    points, variances = np.full((len(cycles), most, 2), np.nan), np.full((len(cycles), most), np.nan)
+    variances = np.full((len(cycles), MOST_DETECTIONS), np.nan)
+    points = np.stack([variances, variances], axis=2)
     for k, cycle in enumerate(cycles):
-        nearest = np.argsort(np.hypot(*cycle.points_vehicle.T), kind="stable")[:most]
+        nearest = np.argsort(np.hypot(*cycle.points_vehicle.T), kind="stable")[:MOST_DETECTIONS]
         points[k, : len(nearest)] = cycle.points_vehicle[nearest]
         variances[k, : len(nearest)] = 0.5 * np.trace(cycle.covariances[nearest], axis1=1, axis2=2)
     return points, variances
@@ -342,7 +346,7 @@ def lever(motion: Array, arm: Array) -> Array:
 def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array, IntArray]:
     """Return offsets (n, 2) of mutually nearest detections, a coordinate's variances (n,), and pairs (n,)."""
     pairs = trials.pairs
-    square = pairs.distances(frame, motion)
+    square = np.moveaxis(pairs.distances(frame, motion), -1, 0)
     forth, back = square.argmin(axis=2), square.argmin(axis=1)
     mutual = np.take_along_axis(back, forth, axis=1) == np.arange(square.shape[1])
     near = np.take_along_axis(square, forth[..., None], axis=2)[..., 0] < (2.0 * pairs.reach) ** 2
