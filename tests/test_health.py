@@ -13,7 +13,7 @@ from pathspace_graph.health import (
     Evidence,
     Health,
     HealthMonitor,
-    Stretch,
+    HealthStretch,
     counts,
     stretches,
 )
@@ -132,8 +132,8 @@ def test_closing_and_restarting_forget_the_evidence_before() -> None:
 def test_stretches_and_counts_of_a_run() -> None:
     healths = [Health(GOOD), Health(LOST, "a"), Health(LOST, "b"), Health(GOOD), Health(DEGRADED, "c")]
     assert stretches([0.0, 0.1, 0.2, 0.3, 0.4], healths) == [
-        Stretch(LOST, 0.1, 0.2, "a"),
-        Stretch(DEGRADED, 0.4, 0.4, "c"),
+        HealthStretch(LOST, 0.1, 0.2, "a"),
+        HealthStretch(DEGRADED, 0.4, 0.4, "c"),
     ]
     assert counts(healths) == {"good": 2, "degraded": 1, "lost": 2}
     assert stretches([0.0], [Health()]) == []

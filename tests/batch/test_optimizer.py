@@ -132,7 +132,7 @@ def test_the_poses_alone_are_aligned_beside_the_map() -> None:
     shifted.variables.poses[1:, 1] += 0.3
     aligned = Optimizer(system).align_poses(shifted, 3, LOOSE_GATE)
     np.testing.assert_array_equal(aligned.map_points, truth.map_points)
-    np.testing.assert_array_equal(aligned.calibration, truth.calibration)
+    np.testing.assert_array_equal(aligned.variables.calibration, truth.variables.calibration)
     np.testing.assert_allclose(aligned.poses[:, 1], truth.poses[:, 1], atol=0.02)
 
 

@@ -117,7 +117,7 @@ def test_a_map_that_swings_in_one_step_keeps_its_shape() -> None:
         arm = (before - state.poses[0, :2]) @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
         np.testing.assert_allclose(points - state.poses[0, :2], arm, atol=1e-9)
     np.testing.assert_allclose(after.poses[:, 2], state.poses[:, 2] + turn)
-    np.testing.assert_array_equal(after.calibration, variables.calibration)
+    np.testing.assert_array_equal(after.variables.calibration, variables.calibration)
 
 
 def test_a_swing_of_the_map_with_its_poses_is_not_damped() -> None:

@@ -136,7 +136,7 @@ def test_the_table_of_the_camera_has_each_noise_and_the_landmarks_that_are_told_
     assert [label for label, _ in rows] == [
         "`fixed-lag`, stated",
         "`spline`, measured",
-        "landmarks, told all",
+        "landmarks, given all",
     ]
     assert [figures[0].value for _, figures in rows] == pytest.approx([0.3, 0.2, 0.2])
     assert rows[0][1][-1].value == pytest.approx(25.0) and rows[2][1][-1].value is None

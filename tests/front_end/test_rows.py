@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.front_end.sides import GAP, Row, follow_rows
+from pathspace_graph.front_end.sides import GAP, ConeRow, follow_rows
 from pathspace_graph.labels import LEFT, RIGHT
 
 Array = NDArray[np.float64]
 
 
-def begun(half_width: float = 1.75) -> dict[int, Row]:
+def begun(half_width: float = 1.75) -> dict[int, ConeRow]:
     """Two rows that begin beside a vehicle at the origin, which heads along x."""
     return {
-        LEFT: Row([], np.array([0.0, half_width]), 0.0),
-        RIGHT: Row([], np.array([0.0, -half_width]), 0.0),
+        LEFT: ConeRow([], np.array([0.0, half_width]), 0.0),
+        RIGHT: ConeRow([], np.array([0.0, -half_width]), 0.0),
     }
 
 
@@ -30,7 +30,7 @@ def bend(radius: float, half_width: float, gap: float, angle: float) -> tuple[Ar
     return rows[0], rows[1]
 
 
-def followed(rows: dict[int, Row], left: Array, right: Array) -> tuple[list[int], list[int]]:
+def followed(rows: dict[int, ConeRow], left: Array, right: Array) -> tuple[list[int], list[int]]:
     points = np.concatenate([left, right])
     votes = np.zeros((len(points), 2), np.intp)
     follow_rows(rows, points, votes, np.arange(len(points)))

@@ -13,7 +13,7 @@ from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop import map_repair
-from pathspace_graph.loop.map_repair import REPAIRED, Stretch, carried, led_through, newest_lap
+from pathspace_graph.loop.map_repair import REPAIRED, ContradictedStretch, carried, led_through, newest_lap
 from pathspace_graph.loop.relocalization import KnownLoop
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -127,7 +127,7 @@ def test_a_curve_is_led_through_new_cones_and_stays_elsewhere() -> None:
     tangent = boundary.evaluate(points, u, 1)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.hypot(*tangent.T)[:, None]
     cones = boundary.evaluate(points, u) + 1.5 * normal
-    after = sampled(led_through(track, LEFT, [Stretch(LEFT, cones[::-1])], poses), 0.25)
+    after = sampled(led_through(track, LEFT, [ContradictedStretch(LEFT, cones[::-1])], poses), 0.25)
     nearest = np.hypot(*(after[:, None] - cones).transpose(2, 0, 1)).min(axis=0)
     assert nearest.max() < 0.3
     away = np.hypot(*(before[:, None] - cones).transpose(2, 0, 1)).min(axis=1) > 8.0
@@ -137,7 +137,7 @@ def test_a_curve_is_led_through_new_cones_and_stays_elsewhere() -> None:
 
 def test_a_curve_without_contradictions_stays_to_the_bit() -> None:
     track = repaired()[0].smoother.map
-    same = led_through(track, RIGHT, [Stretch(LEFT, np.zeros((3, 2)))], np.zeros((2, 3)))
+    same = led_through(track, RIGHT, [ContradictedStretch(LEFT, np.zeros((3, 2)))], np.zeros((2, 3)))
     assert (same.control_points == track.state.spline(RIGHT).control_points).all()
 
 

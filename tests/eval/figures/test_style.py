@@ -60,12 +60,12 @@ def test_a_figure_is_as_high_as_what_is_drawn_and_a_margin() -> None:
     for axes in figure.axes:
         set_frame(axes, np.array([0.0, 0.0]), np.array([2.0, 2.0]))
     shared_legend(figure)
-    fit_height(figure, margin=0.1)
+    fit_height(figure)
     figure.draw_without_rendering()
     width, height = figure.get_size_inches()
     drawn = figure.get_tightbbox().height
     assert width == 7.0
-    assert drawn + 0.2 <= height < drawn + 0.4 < 4.5
+    assert drawn + 0.1 <= height < drawn + 0.2 < 4.5
 
 
 def test_a_frame_has_equal_scales() -> None:
