@@ -33,6 +33,25 @@ struct Turn {
   double c, s;
 };
 
+// Turn the pairs from each of `columns` on by an angle with this cosine and sine.
+void turn_pairs(double* values, const Ints& columns, double c, double s) {
+  for (Index k = 0; k < columns.size(); ++k) {
+    double* at = values + columns.data()[k];
+    const double x = at[0], y = at[1];
+    at[0] = c * x - s * y, at[1] = s * x + c * y;
+  }
+}
+
+// Move values from the map frame into that of a pose: graph.relative:to_frame.
+void to_frame(double* values, const Ints& turning, const Ints& headings, const double* frame, const Turn& turn) {
+  for (Index k = 0; k < turning.size(); ++k) {
+    double* at = values + turning.data()[k];
+    at[0] -= frame[0], at[1] -= frame[1];
+  }
+  turn_pairs(values, turning, turn.c, -turn.s);
+  for (Index k = 0; k < headings.size(); ++k) values[headings.data()[k]] -= frame[2];
+}
+
 // Solve A x = b for three unknowns by elimination with pivoting, in place.
 void solve3(double (*A)[3], double* b) {
   for (int k = 0; k < 3; ++k) {
@@ -710,12 +729,7 @@ Columns relative_block(const Array& root, const Array& right, const Array& local
   const double* frame = values.data() + q;
   const Turn turn(frame[2]);
   std::vector<double> there(values.data(), frame), off(q);
-  for (Index k = 0; k < turning.size(); ++k) {
-    double* at = &there[turning.data()[k]];
-    const double dx = at[0] - frame[0], dy = at[1] - frame[1];
-    at[0] = turn.c * dx + turn.s * dy, at[1] = -turn.s * dx + turn.c * dy;
-  }
-  for (Index k = 0; k < headings.size(); ++k) there[headings.data()[k]] -= frame[2];
+  to_frame(there.data(), turning, headings, frame, turn);
   for (Index j = 0; j < q; ++j) off[j] = there[j] - local.data()[j];
   Columns block(Shape{r, width + 1});
   std::vector<double> row(width);
@@ -827,12 +841,7 @@ Array link_means(const Array& values, const py::list& links, const Ints& frames,
     const Turn turn(frame[2]);
     z.resize(link->given.size), y.assign(link->offset.data(), link->offset.data() + link->left.size);
     for (Index j = 0; j < link->given.size; ++j) z[j] = now[link->given.columns[j]];
-    for (Index k = 0; k < link->given.turning.size(); ++k) {
-      double* at = &z[link->given.turning.data()[k]];
-      const double dx = at[0] - frame[0], dy = at[1] - frame[1];
-      at[0] = turn.c * dx + turn.s * dy, at[1] = -turn.s * dx + turn.c * dy;
-    }
-    for (Index k = 0; k < link->given.headings.size(); ++k) z[link->given.headings.data()[k]] -= frame[2];
+    to_frame(z.data(), link->given.turning, link->given.headings, frame, turn);
     for (Index i = 0; i < link->left.size; ++i)
       for (Index j = 0; j < link->given.size; ++j) y[i] += link->gain.data()[i * link->given.size + j] * z[j];
     for (Index k = 0; k < link->left.turning.size(); ++k) {
@@ -880,11 +889,7 @@ py::tuple origin_by_active(const Array& values, const py::list& links, const Int
     for (int r = 0; r < 3; ++r) {
       double *b = &by_mean[r * q], *g = &by_others[r * m], *e = &by_noise[r * q];
       for (Index i = 0; i < q; ++i) b[i] = A[r * n + link.left.columns[i]], A[r * n + link.left.columns[i]] = 0.0;
-      for (Index k = 0; k < link.left.turning.size(); ++k) {
-        double* at = b + link.left.turning.data()[k];
-        const double x = at[0], y = at[1];
-        at[0] = turn.c * x + turn.s * y, at[1] = -turn.s * x + turn.c * y;
-      }
+      turn_pairs(b, link.left.turning, turn.c, -turn.s);
       for (Index i = 0; i < q; ++i) {
         if (b[i] == 0.0) continue;
         for (Index j = 0; j < m; ++j) g[j] += b[i] * link.gain.data()[i * m + j];
@@ -896,11 +901,7 @@ py::tuple origin_by_active(const Array& values, const py::list& links, const Int
     add_by_frame(link.left, values.data(), frame, turn, by_mean.data(), -1.0, by_frame);
     for (int r = 0; r < 3; ++r) {
       double* g = &by_others[r * m];
-      for (Index k = 0; k < link.given.turning.size(); ++k) {
-        double* at = g + link.given.turning.data()[k];
-        const double x = at[0], y = at[1];
-        at[0] = turn.c * x - turn.s * y, at[1] = turn.s * x + turn.c * y;
-      }
+      turn_pairs(g, link.given.turning, turn.c, turn.s);
       for (Index j = 0; j < m; ++j) A[r * n + link.given.columns[j]] += g[j];
       for (int c = 0; c < 3; ++c) {
         A[r * n + link.frame + c] += by_frame[r][c];

@@ -161,7 +161,7 @@ def _closed(values: Values) -> str:
     return f"{values['closed']} of {values['runs']}{failed}"
 
 
-def _said(values: Values) -> str:
+def _notices(values: Values) -> str:
     """Return how many runs said what, shortened to 60 characters; the JSON file has all of it."""
     short = {text: text if len(text) <= 60 else f"{text[:60].rstrip()} …" for text in values["notices"]}
     said = (f"{number} of {values['runs']}: {short[text]}" for text, number in values["notices"].items())
@@ -190,7 +190,7 @@ COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {  # columns after fault
     "called degraded, lost [% of cycles]": _form(
         "{:.1f}, {:.1f}", "reported_degraded", "reported_lost", factor=100.0
     ),
-    "notices": _said,
+    "notices": _notices,
 }
 
 

@@ -60,7 +60,7 @@ def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
 
 
 def longest_divergence(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:
-    """Return the longest time (s) and way (m) for which a vehicle was astray, from a stamp (s) on.
+    """Return the longest time (s) and way (m) for which the estimate had diverged, from a stamp on (s).
 
     Counted from the first cycle that is wrong by more than a metre to the next one that is right, or the end.
     """
@@ -69,9 +69,9 @@ def longest_divergence(t: Array, poses: Array, truth: Truth, since: float) -> di
         return {}
     stamps, errors = t[after], np.linalg.norm(trajectory_errors(t[after], poses[after], truth)[:, :2], axis=1)
     driven = np.interp(stamps, truth.pose_t, path_lengths(truth.poses))
-    astray = np.append(errors > DIVERGED, False).astype(int)
-    begins = np.flatnonzero(np.diff(astray, prepend=0) == 1)
-    ends = np.minimum(np.flatnonzero(np.diff(astray, prepend=0) == -1), len(stamps) - 1)
+    diverged = np.append(errors > DIVERGED, False).astype(int)
+    begins = np.flatnonzero(np.diff(diverged, prepend=0) == 1)
+    ends = np.minimum(np.flatnonzero(np.diff(diverged, prepend=0) == -1), len(stamps) - 1)
     time, way = (float((of[ends] - of[begins]).max(initial=0.0)) for of in (stamps, driven))
     return {"divergence_time": time, "divergence_distance": way}
 

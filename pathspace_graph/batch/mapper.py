@@ -278,7 +278,7 @@ class BatchMapper:
             system.revisits, system.kernel = mapper.revisits, Biweight(LOOSE_GATE)
             watch.lap("start")
             found = optimizer.find(state)
-        at, convergence, known = _with_doubt(optimizer, *found)
+        at, convergence, known = _with_wider_priors(optimizer, *found)
         watch.lap("optimum")
         joint, vehicle = known.covariance(at.state.map_keys), _vehicle(at.state, known)
         watch.lap("covariance")
@@ -366,19 +366,19 @@ def find_open_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:
     return optimizer.find(start_odometry(system.chain, system.detections, system.settings, path))
 
 
-def _with_doubt(
+def _with_wider_priors(
     optimizer: Optimizer, at: Evaluation, convergence: Convergence
 ) -> tuple[Evaluation, Convergence, FactoredSystem]:
     """Return the optimum, searched again while it contradicts the prior of a calibration, and `_known`."""
     system, variables = optimizer.system, at.state.variables
     known = _known(system, at)
     variance = np.diag(known.covariance(variables.calibration_keys))
-    believed = with_inflated_priors(variables.calibrations, variance, system.settings)
-    if believed == system.settings:
+    inflated = with_inflated_priors(variables.calibrations, variance, system.settings)
+    if inflated == system.settings:
         return at, convergence, known
-    system.settings = believed
-    system.chain = replace(system.chain, calibration_sigma=np.array(believed.odometry.sigmas))
-    return _with_doubt(optimizer, *optimizer.find(at.state))
+    system.settings = inflated
+    system.chain = replace(system.chain, calibration_sigma=np.array(inflated.odometry.sigmas))
+    return _with_wider_priors(optimizer, *optimizer.find(at.state))
 
 
 def _map(state: State, joint: Array, scatter: Scatter) -> Map:

@@ -148,7 +148,7 @@ class InactiveChain(InactiveMap):
     def __init__(self) -> None:
         super().__init__()
         self.links: list[Link] = []
-        self._poses: IntArray = NO_KEYS  # (a,) keys of the origin and of past anchors, ascending
+        self._pose_keys: IntArray = NO_KEYS  # (a,) keys of the origin and of past anchors, ascending
         self.poses: dict[int, Array] = {}  # (3,) of the origin and of past anchors by key, as of `refresh`
 
     def __len__(self) -> int:
@@ -197,7 +197,7 @@ class InactiveChain(InactiveMap):
     def _changed(self) -> None:
         leaving = [link.leaving.keys for link in self.links]
         keys = np.concatenate([NO_KEYS, *leaving])
-        self.keys, self._poses = np.sort(keys[~are_poses(keys)]), np.sort(keys[are_poses(keys)])
+        self.keys, self._pose_keys = np.sort(keys[~are_poses(keys)]), np.sort(keys[are_poses(keys)])
         self.anchors = np.array([link.factor.frame for link in self.links[-1:]], np.intp)
         self._active = None
 
@@ -207,8 +207,8 @@ class InactiveChain(InactiveMap):
         known = self._with_poses(variables)
         known.values = _link_means(known.values, self.links, *self._columns(known.layout))
         variables.values[:] = known.of(variables.keys)
-        poses = known.of(self._poses).reshape(-1, POSE)
-        self.poses = dict(zip(self._poses.tolist(), poses, strict=True))
+        poses = known.of(self._pose_keys).reshape(-1, POSE)
+        self.poses = dict(zip(self._pose_keys.tolist(), poses, strict=True))
 
     def _columns(self, layout: Layout) -> tuple[IntArray, IntArray, IntArray]:
         """Return the columns of the links' frames (l,), and those of all y and of all z, link after link."""
@@ -278,7 +278,7 @@ class InactiveChain(InactiveMap):
     def _with_poses(self, variables: Variables) -> Variables:
         """Return the variables with the origin and past anchors, as of `refresh`."""
         known, poses = variables.copy(), self.poses
-        keys = self._poses if self.links else np.array([ORIGIN_KEY])
+        keys = self._pose_keys if self.links else np.array([ORIGIN_KEY])
         values = [poses.get(key, np.zeros(POSE)) for key in keys.tolist()]
         reference = np.concatenate(values) * np.repeat(keys != ORIGIN_KEY, POSE)
         known.insert(keys, np.concatenate(values), reference)

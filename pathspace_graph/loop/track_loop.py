@@ -139,8 +139,8 @@ class TrackLoop:
             return ""
         before = self._inflated
         self._inflated = inflate_priors(self._smoother, before, reading.sensor_doubted, reading.measured)
-        doubted = before == self.settings != self._inflated and reading.measured is None
-        return LEARNED if doubted else ""
+        is_new = before == self.settings != self._inflated and reading.measured is None
+        return LEARNED if is_new else ""
 
     # --- the batch of the open lap -----------------------------------------------------------------------
 
