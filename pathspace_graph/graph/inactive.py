@@ -211,7 +211,7 @@ class InactiveChain(InactiveMap):
         self.poses = dict(zip(self._pose_keys.tolist(), poses, strict=True))
 
     def _columns(self, layout: Layout) -> tuple[IntArray, IntArray, IntArray]:
-        """Return the columns of the links' frames (l,), and those of all y and of all z, link after link."""
+        """Return the columns of the links' frames (l,), and of their variables y and z, link after link."""
         frames, leaving, others = zip(
             *((link.factor.frame, link.leaving.keys, link.others.keys) for link in self.links), strict=True
         )
@@ -263,7 +263,7 @@ class InactiveChain(InactiveMap):
     def marginal(self, prior: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.GaussianFactorGraph:
         """Return the prior of the active variables, linearized at the refreshed values.
 
-        All that the links say of these is where the origin is, which is at (0, 0, 0).
+        The links constrain them only through the pose of the origin, which is (0, 0, 0) by definition.
         """
         known, (active, entries) = self._with_poses(variables), self.active(variables.layout)
         columns = self._columns(known.layout)
@@ -329,7 +329,7 @@ def new_link(
 def _link_means(
     values: Array, links: Sequence[Link], frames: IntArray, leaving: IntArray, others: IntArray
 ) -> Array:
-    """Return all values (n,) with those that left at their means, given the active ones, the newest first.
+    """Return all values (n,), with the inactive variables at their conditional means, newest link first.
 
     The columns are those of `InactiveChain._columns`.
     """
@@ -345,10 +345,10 @@ def _link_means(
 def _origin_by_active(
     values: Array, links: Sequence[Link], frames: IntArray, leaving: IntArray, others: IntArray, origin: int
 ) -> tuple[Array, Array]:
-    """Return the derivative (3, n) of the origin, at its column, by active variables, and its covariance.
+    """Return the derivative (3, n) of the origin's pose by the active variables, and its covariance (3, 3).
 
-    From the oldest link on, what has left is replaced by its conditional: `y = from(G to(z, f) + e + N w, f)`
-    in the frame f, with w of unit covariance. The covariance (3, 3) is that given the active variables.
+    Each link, oldest first, replaces its variables y by `from(G to(z, f) + e + N w, f)` in its frame f, with w
+    of unit covariance. The covariance is conditional on the active variables; `origin` is the pose's column.
     """
     by_all, covariance = np.zeros((POSE, len(values))), np.zeros((POSE, POSE))
     by_all[:, origin : origin + POSE] = np.eye(POSE)
