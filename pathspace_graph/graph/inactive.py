@@ -347,8 +347,8 @@ def _origin_by_active(
 ) -> tuple[Array, Array]:
     """Return the derivative (3, n) of the origin's pose by the active variables, and its covariance (3, 3).
 
-    Each link, oldest first, replaces its variables y by `from(G to(z, f) + e + N w, f)` in its frame f, with w
-    of unit covariance. The covariance is conditional on the active variables; `origin` is the pose's column.
+    Each link, oldest first, replaces its variables y by `from(G to(z, f) + e + N w, f)` in its frame f, with
+    w of unit covariance. The covariance is conditional on the active variables; `origin` is the pose's column.
     """
     by_all, covariance = np.zeros((POSE, len(values))), np.zeros((POSE, POSE))
     by_all[:, origin : origin + POSE] = np.eye(POSE)
