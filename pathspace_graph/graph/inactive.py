@@ -348,7 +348,7 @@ def _origin_by_active(
     """Return the derivative (3, n) of the origin's pose by the active variables, and its covariance (3, 3).
 
     Each link, oldest first, replaces its variables y by `from(G to(z, f) + e + N w, f)` in its frame f, with
-    w of unit covariance. The covariance is conditional on the active variables; `origin` is the pose's column.
+    w of unit covariance. The covariance is given the active variables; `origin` is the column of its pose.
     """
     by_all, covariance = np.zeros((POSE, len(values))), np.zeros((POSE, POSE))
     by_all[:, origin : origin + POSE] = np.eye(POSE)
