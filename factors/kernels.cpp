@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <memory>
 #include <stdexcept>
 #include <vector>
 
@@ -125,10 +126,11 @@ class Search {
  public:
   Search(const py::object& spans, const Array& control_points, const Array& points, const Ints& curve,
          const Array& u_low, const Array& u_high, const Tolerances& tolerances)
-      : spans_(spans), points_(points), curve_(curve), eps_(tolerances), size_(points.shape(0)) {
+      : spans_(spans), points_(points), curve_(curve), eps_(tolerances), size_(points.shape(0)),
+        control_points_(control_points.data()), is_known_(spans_.columns.shape(0), false),
+        polynomials_(new double[is_known_.size() * 6 * (spans_.degree + 1)]) {
     expect(points.size() == 2 * size_ && curve.size() == size_);
     expect(u_low.size() == size_ && u_high.size() == size_);
-    coefficients(control_points);
     stretches(u_low.data(), u_high.data());
   }
 
@@ -146,26 +148,25 @@ class Search {
   std::vector<double> reach(double by) const { return std::vector<double>(size_, by); }
 
  private:
-  // C (n, 3, p + 1, 2): on span i, d^r S / du^r = sum_k C[i, r, k] s^k.
-  void coefficients(const Array& control_points) {
-    const Index p = spans_.degree + 1, spans = spans_.columns.shape(0);
-    const double* basis = spans_.by_span.data();
-    const double* points = control_points.data();
-    polynomials_.assign(spans * 3 * p * 2, 0.0);
-    for (Index i = 0; i < spans; ++i) {
-      const Index* columns = spans_.columns.data() + i * p;
-      for (Index k = 0; k < p; ++k)
-        for (Index r = 0; r < 3; ++r) {
-          const double* row = basis + (i * 3 * p + k * 3 + r) * p;
-          double x = 0.0, y = 0.0;
-          for (Index j = 0; j < p; ++j) {
-            x += row[j] * points[2 * columns[j]];
-            y += row[j] * points[2 * columns[j] + 1];
-          }
-          double* at = &polynomials_[((i * 3 + r) * p + k) * 2];
-          at[0] = x, at[1] = y;
+  // C (3, p + 1, 2) of a span, on which d^r S / du^r = sum_k C[r, k] s^k; most spans are never asked for.
+  const double* polynomials(Index span) const {
+    const Index p = spans_.degree + 1;
+    double* own = &polynomials_[span * 3 * p * 2];
+    if (is_known_[span]) return own;
+    is_known_[span] = true;
+    const Index* columns = spans_.columns.data() + span * p;
+    for (Index k = 0; k < p; ++k)
+      for (Index r = 0; r < 3; ++r) {
+        const double* row = spans_.by_span.data() + (span * 3 * p + k * 3 + r) * p;
+        double x = 0.0, y = 0.0;
+        for (Index j = 0; j < p; ++j) {
+          x += row[j] * control_points_[2 * columns[j]];
+          y += row[j] * control_points_[2 * columns[j] + 1];
         }
-    }
+        double* at = own + (r * p + k) * 2;
+        at[0] = x, at[1] = y;
+      }
+    return own;
   }
 
   void stretches(const double* u_low, const double* u_high) {
@@ -201,7 +202,7 @@ class Search {
 
   void evaluate(Index number, double s, int order, double* out) const {
     const Index p = spans_.degree + 1;
-    const double* terms = &polynomials_[(number * 3 + order) * p * 2];
+    const double* terms = polynomials(number) + order * p * 2;
     double x = terms[2 * (p - 1)], y = terms[2 * (p - 1) + 1];
     for (Index k = p - 2; k >= 0; --k) x = x * s + terms[2 * k], y = y * s + terms[2 * k + 1];
     out[0] = x, out[1] = y;
@@ -235,7 +236,9 @@ class Search {
   Ints curve_;
   Tolerances eps_;
   Index size_;
-  std::vector<double> polynomials_;
+  const double* control_points_;  // of the caller, who holds them
+  mutable std::vector<char> is_known_;
+  std::unique_ptr<double[]> polynomials_;
   std::vector<Stretch> stretch_;
   std::vector<Probe> probe_;
 };

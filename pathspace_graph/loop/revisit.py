@@ -223,14 +223,16 @@ def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) ->
     variance = np.linalg.eigvalsh(covariance[:2, :2])[-1]
     wide = np.diag([variance, variance, covariance[2, 2]])
     prior = np.asarray(np.linalg.inv(wide * settings.prior_scale**2), np.float64)
-    found: list[RecognizedPlace] = []
+    found: RecognizedPlace | None = None
     for vector, low in _starts(state, prior, settings):
         place = _register(state, newest, Motion(centre, vector), low, prior, settings)
-        if place is not None and all(
-            np.hypot(*(place.motion.vector - other.motion.vector)[:2]) >= settings.overlap for other in found
-        ):
-            found.append(place)
-    return found[0] if len(found) == 1 else None
+        if place is None:
+            continue
+        if found is None:
+            found = place
+        elif np.hypot(*(place.motion.vector - found.motion.vector)[:2]) >= settings.overlap:
+            return None  # two places are enough
+    return found
 
 
 def newest_stretch(state: State) -> dict[int, tuple[Array, Array]]:

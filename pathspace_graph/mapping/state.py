@@ -98,6 +98,7 @@ class State:
         index from the boundary's first control point."""
         self.pose_u: dict[int, Array] = {}  # (P,) parameters of the poses, increasing from lap to lap
         self._curves: Curves | None = None
+        self._whole_curves: Curves | None = None
 
     def copy(self) -> Self:
         """Return a state whose boundaries, values and pose parameters can change independently."""
@@ -157,10 +158,14 @@ class State:
 
     @property
     def whole_curves(self) -> Curves:
-        """Return the boundaries side by side, with their inactive control points."""
+        """Return the boundaries side by side, with their inactive control points; the result is cached."""
         if self.whole:
             return self.curves
-        return Curves.of(self.boundaries, {label: b.everything for label, b in self.boundaries.items()})
+        known = self._whole_curves
+        if known is None or not known.is_of(self.boundaries, {}):
+            everything = {label: boundary.everything for label, boundary in self.boundaries.items()}
+            known = self._whole_curves = Curves.of(self.boundaries, everything)
+        return known
 
     def add_boundary(self, label: int, boundary: Boundary, control_points: Array) -> None:
         """Add a boundary with control points (m, 2)."""

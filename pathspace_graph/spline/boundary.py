@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
+from pathspace_graph.factors.bspline import SpanPolynomials, Spans, lay_out
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_joint_foot_points
 from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.factors.se2 import move_points, path_lengths
@@ -132,12 +132,16 @@ class Boundary:
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
         """Search the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
-        s, first = self.settings, 0
-        if not self.periodic:
-            first = int(self.tables.locate(np.min(low, initial=np.inf, keepdims=True))[0][0])
-        spans = lay_out([self.tables.tail(first) if first else self.tables], [first], [self.size])
-        alone, search = np.zeros(len(points), np.intp), (s.search_step, s.search_iterations)
+        s, alone = self.settings, np.zeros(len(points), np.intp)
+        spans, search = self._spans_from(low), (s.search_step, s.search_iterations)
         return joint_foot_points(spans, control_points, points, alone, low, high, *search)
+
+    def _spans_from(self, low: Array) -> Spans:
+        """Return the spans on the distinct control points; of an open curve, from the least limit (m,) on."""
+        if self.periodic:
+            return lay_out([self.tables], [0], [self.size])
+        first = int(self.tables.locate(np.min(low, initial=np.inf, keepdims=True))[0][0])
+        return lay_out([self.tables.tail(first)], [first]) if first else self.tables.alone
 
     def find_anywhere(self, control_points: Array, points: Array) -> FootPoints:
         low, high = np.full((len(points), 2), [self.tables.low, self.tables.high]).T
