@@ -98,22 +98,14 @@ class NoiseLearner:
             covariances = measured.inflated(points, detections.covariances)
         return Detections(detections.t, points, covariances, detections.labels)
 
-    def for_lap(
-        self, motions: Sequence[MeasuredMotion], detections: Sequence[Detections]
-    ) -> tuple[list[MeasuredMotion], list[Detections]]:
-        """Return the readings of a drive, with stated covariances, with the noise that is known now.
+    def motions_of_lap(self, motions: Sequence[MeasuredMotion]) -> Sequence[MeasuredMotion]:
+        """Return the motions of a drive with the noise that is known now.
 
         Its first seconds were driven before any was measured, and decide the heading of the map.
         """
         if self.of_odometry and self.measured is not None:
-            motions = [motion.with_sigma(self.twist_sigma) for motion in motions]
-        points = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in detections)])
-        stated = np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in detections)])
-        used = self.for_map(Detections(0.0, points, stated, np.zeros(len(points), np.intp))).covariances
-        parts = np.split(used, np.cumsum([len(cycle.labels) for cycle in detections])[:-1])
-        return list(motions), [
-            replace(cycle, covariances=part) for cycle, part in zip(detections, parts, strict=True)
-        ]
+            return [motion.with_sigma(self.twist_sigma) for motion in motions]
+        return motions
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
         """Return settings with measured priors of the calibrations where one of the old ones is contradicted.

@@ -66,13 +66,13 @@ class DriveRecord:
         self.settings = settings
         self._noise = noise
         self.unsolvable: str | None = None  # why the drive cannot be solved as a batch; None if it can be
-        self.poses: list[Array] = []  # (3,) of each cycle, map frame, as of then or the newest batch
+        self.poses: Array = np.zeros((0, 3))  # of each cycle, map frame, as of then or the newest batch
         self.stamps: list[float] = []  # stamp of each cycle (s)
         self._motions: list[MeasuredMotion] = []  # that lead to each cycle
         self._seen: list[Detections] = []  # of each cycle, with their stated covariances
         self._orange: list[Detections] = []  # those of orange cones
-        self._beside: dict[int, list[float]] = {}  # parameter on each curve by cycle, NaN before it
-        self._reckoned: list[Array] = []
+        self._beside: dict[int, Array] = {}  # (n,) parameter of each cycle on each curve, NaN before it
+        self._reckoned: Array = np.zeros((0, 3))  # pose of each cycle by the odometry alone
         self._prepared = False
 
     def give_up(self, reason: str) -> None:
@@ -89,8 +89,8 @@ class DriveRecord:
         self._motions.append(reading.motion)
         self._seen.append(Detections(seen.t, seen.points_vehicle, reading.stated, seen.labels))
         self._orange.append(reading.orange)
-        last = self._reckoned[-1] if self._reckoned else np.zeros(3)
-        self._reckoned.append(_kept(compose(last, reading.motion.odometry.delta)))
+        last = self._reckoned[-1] if len(self._reckoned) else np.zeros(3)
+        self._reckoned = _extended(self._reckoned, compose(last, reading.motion.odometry.delta))
         if len(self.stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
@@ -104,17 +104,18 @@ class DriveRecord:
         if state.closed and self.unsolvable is not None:
             return
         for label in () if state.closed else state.boundaries:
-            self._beside.setdefault(label, [nan] * len(self.poses)).append(float(state.pose_u[label][-1]))
-        self.poses.append(_kept(state.poses[-1].copy()))
+            known = self._beside.get(label, np.full(len(self.poses), nan))
+            self._beside[label] = _extended(known, state.pose_u[label][-1])
+        self.poses = _extended(self.poses, state.poses[-1])
 
     def replaced(self, earlier: Array, window: Array) -> None:
         """Replace all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
-        self.poses = [*_kept(unwrap(np.concatenate([earlier, window])))]
+        self.poses = _kept(unwrap(np.concatenate([earlier, window])))
 
     def bent(self, keyframes: Mapping[int, Array], smoother: CurveSmoother) -> None:
         """Replace the poses: the window has its own, earlier ones move with the keyframes (3,), by cycle."""
         first = smoother.first_cycle
-        earlier, window = unwrap(np.array(self.poses[: first + 1])), smoother.variables.poses
+        earlier, window = unwrap(self.poses[: first + 1]), smoother.variables.poses
         bent = bend(earlier, {0: earlier[0], **keyframes, first: window[0]})
         self.replaced(bent[:first], window)
 
@@ -126,13 +127,13 @@ class DriveRecord:
 
     def recurrence(self) -> Recurrence | None:
         """Return the recurrence of the path driven, if odometry alone says that the lap is over."""
-        found = find_recurrence(np.array(self._reckoned), self.settings)
+        found = find_recurrence(self._reckoned, self.settings)
         return found if is_worth_trying(found, self.settings) else None
 
     def recurrence_since(self, label: int, u: float) -> Recurrence:
         """Return the recurrence of the path driven since the vehicle was beside a place (m) of a boundary."""
-        poses = np.array(self._reckoned)
-        before = int(np.nanargmin(np.abs(np.array(self._beside[label]) - u)))
+        poses = self._reckoned
+        before = int(np.nanargmin(np.abs(self._beside[label] - u)))
         driven, turn = path_lengths(poses), float(poses[-1, 2] - poses[before, 2])
         return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)
 
@@ -150,14 +151,16 @@ class DriveRecord:
     def closed_map(self, smoother: CurveSmoother) -> ClosedMap:
         """Return the map that has just been closed, with the poses of all cycles in its frame."""
         state = smoother.map.state
-        poses = unwrap(np.array([*self.poses[: smoother.first_cycle], *smoother.variables.poses]))
+        poses = unwrap(np.concatenate([self.poses[: smoother.first_cycle], smoother.variables.poses]))
         return ClosedMap(state.splines, poses, state.variables.calibrations.copy())
 
     def lap(self, first_kept: int, start: ClosedMap | Recurrence, settings: MapperSettings) -> OpenLap:
         """Return the lap; the priors of its calibrations are those of the settings, which may be wide."""
-        motions, detections = self._noise.for_lap(self._motions, self._seen)
-        chain = chained(self.stamps, motions, settings.odometry)
-        return OpenLap(settings, chain, DetectionTable.of(detections, twists=chain.twists), first_kept, start)
+        chain = chained(self.stamps, self._noise.motions_of_lap(self._motions), settings.odometry)
+        table = DetectionTable.of(self._seen, twists=chain.twists)
+        seen = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
+        table = replace(table, covariance=seen.covariances)
+        return OpenLap(settings, chain, table, first_kept, start)
 
 
 def _together(a: Detections, b: Detections) -> Detections:
@@ -165,9 +168,14 @@ def _together(a: Detections, b: Detections) -> Detections:
     return Detections(a.t, *(np.concatenate([getattr(a, name), getattr(b, name)]) for name in names))
 
 
-def _kept(poses: Array) -> Array:
-    poses.flags.writeable = False
-    return poses
+def _extended(known: Array, newest: Array) -> Array:
+    return _kept(np.concatenate([known, newest[None]]))
+
+
+def _kept(array: Array) -> Array:
+    """Return an array that copies of the estimator share, since it can't be written."""
+    array.flags.writeable = False
+    return array
 
 
 class LapBatch:

@@ -81,9 +81,9 @@ class Revisits:
         if length < self._next or not smoother.keyframe_cycles or record.unsolvable is not None:
             return None
         self._next = length + ATTEMPTS
-        poses = unwrap(np.array([*record.poses[: smoother.first_cycle], *smoother.variables.poses]))
+        poses = np.concatenate([record.poses[: smoother.first_cycle], smoother.variables.poses])
         place = earlier_pass(poses)
-        revisit = None if place is None else self._measured(poses, place)
+        revisit = None if place is None else self._measured(unwrap(poses), place)
         if revisit is None:
             return None
         self._next = length + INTERVAL
@@ -132,8 +132,11 @@ def earlier_pass(poses: Array) -> int | None:
 
     Where the ways to both passes never part, the drive has come by way of its start, as a lap does.
     """
-    stations, newest = path_lengths(poses), poses[-1]
+    newest = poses[-1]
     near = np.hypot(*(poses[:, :2] - newest[:2]).T) < RADIUS
+    if path_lengths(poses[near.argmax() :])[-1] <= RETURN:
+        return None  # only the newest poses are near
+    stations = path_lengths(poses)
     near &= np.cos(poses[:, 2] - newest[2]) > np.cos(HEADING)
     near &= stations < stations[-1] - RETURN
     cycles = np.flatnonzero(near)

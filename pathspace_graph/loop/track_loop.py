@@ -177,13 +177,13 @@ class TrackLoop:
         if not self.closed and batch is None:
             jump = self.revisits.use()
             if jump is not None:
-                self.corrected_poses = np.array(self.record.poses)
+                self.corrected_poses = self.record.poses
                 return jump, REVISITED if len(self.revisits.found) == 1 else ""
         if batch is None:
             self._hold_gauge()
             may_repair = self._known_loop.is_whole and self._search is None and self.record.unsolvable is None
             if may_repair and self.map_repair.is_due(self._known_loop, self._path.length):
-                self._begin_batch(self.map_repair.begin(np.array(self.record.poses)))
+                self._begin_batch(self.map_repair.begin(self.record.poses))
         elif self._smoother.next_cycle - 1 >= batch.due:
             return self._end(batch, spent)
         return None, ""
@@ -245,7 +245,7 @@ class TrackLoop:
         if splines is None:
             self._smoother.refresh()
             splines = self._smoother.map.state.splines
-        driven = np.array(self.record.poses)[:, :2]
+        driven = self.record.poses[:, :2]
         return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE, driven)
 
     def _hold_gauge(self) -> None:
