@@ -123,8 +123,9 @@ def _array(value: Any, memo: Memo) -> Any:
 def _sequence(value: Any, memo: Memo) -> Any:
     """Return a copy of a list, a tuple, a set or a deque; one of shared values is copied at once."""
     kinds = set(map(type, value))
-    fixed = kinds == {np.ndarray} and not any(one.flags.writeable for one in value)
-    if fixed or all(_COPIERS.get(kind, _object) is None for kind in kinds):
+    arrays = [one for one in value if type(one) is np.ndarray] if np.ndarray in kinds else []
+    fixed = all(_COPIERS.get(kind, _object) is None for kind in kinds - {np.ndarray})
+    if fixed and not any(one.flags.writeable for one in arrays):
         return value if type(value) is tuple else value.copy()
     if isinstance(value, tuple):
         items = [copied(one, memo) for one in value]

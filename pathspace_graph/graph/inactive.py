@@ -23,7 +23,7 @@ from typing import Final, Protocol
 import gtsam
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.se2 import compose, inverse
@@ -207,7 +207,7 @@ class InactiveChain(InactiveMap):
         known = self._with_poses(variables)
         known.values = _link_means(known.values, self.links, *self._columns(known.layout))
         variables.values[:] = known.of(variables.keys)
-        poses = known.of(self._pose_keys).reshape(-1, POSE)
+        poses = read_only(known.of(self._pose_keys).reshape(-1, POSE))
         self.poses = dict(zip(self._pose_keys.tolist(), poses, strict=True))
 
     def _columns(self, layout: Layout) -> tuple[IntArray, IntArray, IntArray]:
@@ -246,7 +246,7 @@ class InactiveChain(InactiveMap):
         near = relative_factor(prior, anchor, *pose_and_reference(anchor, variables), variables)
         self.refresh(variables)
         motion = inverse(self.origin)
-        moved = compose(motion, np.array([*self.poses.values()]))
+        moved = read_only(compose(motion, np.array([*self.poses.values()])))
         self.poses = dict(zip(self.poses, moved, strict=True))
         variables.values = from_frame(variables.values, motion, variables.layout)
         for one in attached:

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 
 import gtsam
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, relative, wrap_angle
 
@@ -153,7 +154,8 @@ class Submaps:
         self.finished: list[RelativeFactor] = []  # submaps, in the order of the drive
         self.keyframes: dict[int, tuple[Array, Array]] = {}
         """Pose (3,), when it was marginalized, and reference (3,) of each keyframe by key."""
-        self._attached: dict[int, tuple[int, Array]] = {}  # a keyframe's anchor, and its pose in that frame
+        self._attached: dict[int, tuple[int, Array]] = {}
+        """Anchor of a keyframe, and its pose (3,) in that frame; the newest keyframes have none yet."""
         self._graph: gtsam.GaussianFactorGraph | None = None
         self._keyframe = 0
         self._driven = 0.0
@@ -168,7 +170,8 @@ class Submaps:
         entries = variables.layout.entries(np.array([pose]))
         if self._graph is None:
             self._keyframe, self._graph, self._driven = pose, factors, 0.0
-            self.keyframes[pose] = variables.linearized[entries].copy(), variables.reference[entries].copy()
+            at = read_only(variables.linearized[entries]), read_only(variables.reference[entries])
+            self.keyframes[pose] = at
         else:
             self._graph = marginalize(graph_of(self._graph, factors), np.array([pose]))
         following = variables.linearized[variables.layout.entries(np.array([pose + 1]))]
@@ -183,14 +186,13 @@ class Submaps:
 
     def attach(self, anchor: int, pose: Array) -> None:
         """Attach all new keyframes to an anchor, by its key, which is at a pose (3,); they move with it."""
-        for key, (keyframe, _) in self.keyframes.items():
-            if key not in self._attached:
-                self._attached[key] = anchor, relative(pose, keyframe)
+        for key, (keyframe, _) in islice(self.keyframes.items(), len(self._attached), None):
+            self._attached[key] = anchor, read_only(relative(pose, keyframe))
 
     def place_attached(self, anchors: Mapping[int, Array]) -> None:
         """Place all attached keyframes anew, given the poses (3,) of their anchors."""
         for key, (anchor, local) in self._attached.items():
-            self.keyframes[key] = compose(anchors[anchor], local), self.keyframes[key][1]
+            self.keyframes[key] = read_only(compose(anchors[anchor], local)), self.keyframes[key][1]
         self._attached = {}
 
     def remove_information(self, keys: IntArray, variables: Variables) -> None:
@@ -210,7 +212,7 @@ class Submaps:
     def place(self, variables: Variables) -> dict[int, Array]:
         """Keep the keyframes where they have been solved to be, and return their poses (3,) by cycle."""
         keys = np.array([*self.keyframes], np.intp)
-        poses = variables.of(keys).reshape(-1, POSE)
+        poses = read_only(variables.of(keys).reshape(-1, POSE))
         self.keyframes = {
             key: (pose, self.keyframes[key][1]) for key, pose in zip(keys.tolist(), poses, strict=True)
         }

@@ -18,7 +18,7 @@ from joblib.externals import loky
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_trying, solve_lap
 from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
 from pathspace_graph.errors import SingularSystemError
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, read_only
 from pathspace_graph.factors.se2 import compose, path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.front_end.front_end import Reading
@@ -110,7 +110,7 @@ class DriveRecord:
 
     def replaced(self, earlier: Array, window: Array) -> None:
         """Replace all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
-        self.poses = _kept(unwrap(np.concatenate([earlier, window])))
+        self.poses = read_only(unwrap(np.concatenate([earlier, window])))
 
     def bent(self, keyframes: Mapping[int, Array], smoother: CurveSmoother) -> None:
         """Replace the poses: the window has its own, earlier ones move with the keyframes (3,), by cycle."""
@@ -169,13 +169,7 @@ def _together(a: Detections, b: Detections) -> Detections:
 
 
 def _extended(known: Array, newest: Array) -> Array:
-    return _kept(np.concatenate([known, newest[None]]))
-
-
-def _kept(array: Array) -> Array:
-    """Return an array that copies of the estimator share, since it can't be written."""
-    array.flags.writeable = False
-    return array
+    return read_only(np.concatenate([known, newest[None]]))
 
 
 class LapBatch:

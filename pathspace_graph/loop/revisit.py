@@ -78,7 +78,9 @@ class Revisits:
     def use(self) -> Array | None:
         """Look for a revisit, optimize the open map with it, and return the jump (3,) of the newest pose."""
         smoother, record, length = self._smoother, self._record, self._path.length
-        if length < self._next or not smoother.keyframe_cycles or record.unsolvable is not None:
+        if length < self._next or record.unsolvable is not None:
+            return None
+        if smoother.submaps is None or not smoother.submaps.keyframes:
             return None
         self._next = length + ATTEMPTS
         poses = np.concatenate([record.poses[: smoother.first_cycle], smoother.variables.poses])
