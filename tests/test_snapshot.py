@@ -21,7 +21,7 @@ from pathspace_graph.snapshot import Decoder, Encoder, archive, known_classes, r
 
 from .scenes.digest import digest
 from .scenes.drives import ODOMETRY_SIGMA, ahead, corridor, exact_log
-from .scenes.kills import dies
+from .scenes.kills import kills, leftovers
 
 Estimator = LandmarkFixedLag | CkfMapper | LandmarkCkf
 
@@ -155,19 +155,14 @@ def test_a_number_that_json_does_not_have_is_no_structure(tmp_path: Path) -> Non
 
 
 def test_a_kill_at_any_step_leaves_the_old_file_or_the_new_one(tmp_path: Path) -> None:
-    file, step, kills = tmp_path / "a.snap", 0, 0
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    file = folder / "a.snap"
     write(file, {"root": "old"}, np.zeros(1, np.uint8))
-    old = file.read_bytes()
-    killed = True
-    while killed:
-        step += 1
-        killed = dies(lambda: write(file, {"root": "new"}, np.zeros(1, np.uint8)), tmp_path, step)
-        kills += killed
+    for step, _ in enumerate(kills(lambda: write(file, {"root": "new"}, np.zeros(1, np.uint8)), folder)):
         assert read(file)[0]["root"] in ("old", "new")
-        for backup in tmp_path.glob("a.snap.~*"):
-            assert read(backup)
-            backup.unlink()
-        file.write_bytes(old)
-    assert kills > 3
-    write(file, {"root": "new"}, np.zeros(1, np.uint8))
-    assert {path.name for path in tmp_path.iterdir()} == {"a.snap", "a.snap.~1~"}
+        assert all(read(backup) for backup in folder.glob("a.snap.~*"))
+        write(file, {"root": "new"}, np.zeros(1, np.uint8))
+        assert leftovers(folder) == []
+    assert step > 3
+    assert {path.name for path in folder.iterdir()} == {"a.snap", "a.snap.~1~", "a.snap.~2~"}

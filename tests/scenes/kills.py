@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pathspace_graph.io.files import RENAME, SYNC
@@ -17,32 +18,28 @@ Contents = dict[str, bytes]
 
 STEPS = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.truncate", SYNC, RENAME}
 """Python announces a change of the disk by one of these audit events, or by `open`."""
-DIED, COMPLETED, RAISED = 41, 42, 43
-"""A child process ends with one of these exit codes."""
 
 
-class Killer:
-    """Ends the process before its step of this number (from 1), as if the power were cut.
+class Recorder:
+    """Keeps, for each step of a process, what a folder would be if the power were cut before it.
 
     What was written since it began, and not flushed, is empty then.
     """
 
-    def __init__(self, root: Path, at: int) -> None:
-        self._root = root
-        self._left = at
+    def __init__(self, root: Path, cuts: Path) -> None:
+        self._root, self._cuts, self._steps = root, cuts, 0
         self._kept = {file.stat().st_ino for file in root.rglob("*") if file.is_file()}
-        self._dead = False
+        self._is_recording = False
 
     def __call__(self, event: str, arguments: tuple[object, ...]) -> None:
-        if self._dead or not self._is_step(event, arguments):
+        if self._is_recording or not self._is_step(event, arguments):
             return
-        self._left -= 1
-        if self._left == 0:
-            self._dead = True
-            self._lose()
-            os._exit(DIED)
+        self._is_recording = True
+        self._steps += 1
+        shutil.copytree(self._root, self._cuts / str(self._steps), copy_function=self._copy)
         if event == SYNC:
             self._kept.add(Path(str(arguments[0])).stat().st_ino)
+        self._is_recording = False
 
     def _is_step(self, event: str, arguments: tuple[object, ...]) -> bool:
         if event == "open":
@@ -51,28 +48,35 @@ class Killer:
             return bool(writes) and str(path).startswith(str(self._root))
         return event in STEPS
 
-    def _lose(self) -> None:
-        for file in self._root.rglob("*"):
-            if file.is_file() and file.stat().st_ino not in self._kept:
-                os.truncate(file, 0)
+    def _copy(self, source: str, target: str) -> None:
+        is_flushed = Path(source).stat().st_ino in self._kept
+        Path(target).write_bytes(Path(source).read_bytes() if is_flushed else b"")
 
 
-def dies(work: Callable[[], object], root: Path, at: int) -> bool:
-    """Whether the work of a child process ends at its step of this number; else it was done in fewer."""
+def kills(work: Callable[[], object], root: Path) -> Iterator[bool]:
+    """Leave a folder as a kill before each step of the work does, then, with False, as all of it does.
+
+    The work is done once, in a process of its own, which holds none of its locks any more.
+    """
+    cuts = root.with_name(f"{root.name}-cuts")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of a fork where there are threads
         child = os.fork()
     if child == 0:
-        sys.addaudithook(Killer(root, at))
+        sys.addaudithook(Recorder(root, cuts))
         try:
             work()
         except BaseException:
             traceback.print_exc()
-            os._exit(RAISED)
-        os._exit(COMPLETED)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    assert code in (DIED, COMPLETED)
-    return code == DIED
+            os._exit(1)
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    count = len([*cuts.iterdir()])
+    root.rename(cuts / str(count + 1))
+    for step in range(1, count + 2):
+        shutil.rmtree(root, ignore_errors=True)
+        (cuts / str(step)).rename(root)
+        yield step <= count
 
 
 def results(folder: Path, name: str) -> list[Contents]:
