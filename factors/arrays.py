@@ -10,5 +10,5 @@ BoolArray = NDArray[np.bool_]
 
 def read_only(array: Array) -> Array:
     """Return an array that can't be written from now on, so that copies of an estimator share it."""
-    array.flags.writeable = False
+    array.setflags(write=False)
     return array
