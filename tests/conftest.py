@@ -17,6 +17,12 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 from pathspace_graph.checkpoint import Recovery
 
 
+@pytest.fixture
+def png_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let commands that write several figures write PNG only: most of a PDF's time goes into its fonts."""
+    monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
+
+
 @pytest.fixture(autouse=True)
 def failures_are_seen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Fails a test in which an update failed, unless it is marked `failing`."""

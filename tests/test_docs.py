@@ -42,6 +42,7 @@ from pathspace_graph.sim.track_generator import generate_track
 from .scenes.drives import beginning
 from .scenes.jacobians import numeric_jacobian
 from .scenes.paths import ROOT, modules
+from .scenes.pretenders import write_round_track
 from .test_prose import texts
 from .test_rooms import ARROWS, LEAVES
 
@@ -369,14 +370,17 @@ def test_the_new_estimator_is_compared(installed: Path, log_folder: Path) -> Non
 @pytest.mark.slow
 def test_the_new_estimator_is_ablated(installed: Path) -> None:
     (installed / "study.toml").write_text(file_blocks(EXTENDING)["dead_reckoning.toml"])
-    run_command(installed, "ablate study.toml --out study --tracks 0 --jobs 1")
+    track = write_round_track(installed)
+    run_command(installed, f"ablate study.toml --out study --tracks {track} --jobs 1")
     rows = csv_rows(installed / "study" / "results.csv")
     assert {row["estimator"] for row in rows} == {"fixed-lag", "dead-reckoning"}
 
 
 @pytest.mark.slow
 def test_the_new_estimator_is_scaled(installed: Path) -> None:
-    run_command(installed, "scale --out scaling --quick --estimators dead-reckoning")
+    little = "cones-min 20 cones-max 80 bins 3 fit-from 20 readings-cones 40 warm-up 5 laps 3 laps-cones 40"
+    options = re.sub(r"([a-z-]+) (\d+)", r"--scaling.\1 \2", little)
+    run_command(installed, f"scale --out scaling {options} --estimators dead-reckoning")
     rows = csv_rows(installed / "scaling" / "points.csv")
     assert {row["estimator"] for row in rows} == {"dead-reckoning"}
 
@@ -466,7 +470,7 @@ def run_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_tutorial(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], png_only: None
 ) -> None:
     """As a new user types it."""
     pytest.importorskip("rosbags")

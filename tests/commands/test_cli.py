@@ -162,8 +162,8 @@ def test_the_summary_says_how_and_how_well(map_folder: Path) -> None:
 
 @pytest.mark.slow
 def test_settings_of_the_mapper_are_options(log_folder: Path, tmp_path: Path) -> None:
-    options = ["--lag", "1.5", "--growth.reach", "6.5"]
-    assert main(["online", str(log_folder), "--out", str(tmp_path / "map"), *options]) == 0
+    log, options = beginning_of(log_folder, tmp_path / "log"), ["--lag", "1.5", "--growth.reach", "6.5"]
+    assert main(["online", str(log), "--out", str(tmp_path / "map"), *options]) == 0
     settings = json.loads((tmp_path / "map" / "summary.json").read_text())["settings"]
     assert (settings["lag"], settings["growth"]["reach"]) == (1.5, 6.5)
 
@@ -251,7 +251,8 @@ def test_a_log_without_detections_says_what_it_could_not_map(
 def test_a_log_of_one_boundary_maps_that_one(
     label: int, log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_log(with_labels(read_log(log_folder), {label}), tmp_path / "log")
+    log = read_log(beginning_of(log_folder, tmp_path / "both", 60))
+    write_log(with_labels(log, {label}), tmp_path / "log")
     assert main(["online", str(tmp_path / "log"), "--out", str(tmp_path / "map")]) == 0
     other = NAMES[LEFT + RIGHT - label]
     assert capsys.readouterr().err == f"{other} boundary: not mapped, no {other} detections\n"

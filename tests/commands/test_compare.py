@@ -29,12 +29,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_logs(tmp_path_factory.mktemp("drives") / "round")
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures as PNG only."""
-    monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
-
-
 def without_truth(folder: Path, out: Path) -> Path:
     write_log(replace(read_log(folder), truth=None), out)
     return out
@@ -72,7 +66,7 @@ def test_the_command_writes_tables_figures_and_maps(
 
 @pytest.mark.slow
 def test_a_second_comparison_keeps_the_first_and_a_failure_ends_in_3(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], quick: None
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], png_only: None
 ) -> None:
     out = tmp_path / "out"
     command = ["compare", str(folder / "a"), "--out", str(out), "--estimators", "broken", "rings"]
@@ -101,7 +95,7 @@ def test_where_all_fail_the_tables_say_so(
 
 @pytest.mark.slow
 def test_several_logs_have_folders_of_their_own_and_intervals(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], quick: None
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], png_only: None
 ) -> None:
     out = tmp_path / "out"
     assert main(["compare", str(folder), "--out", str(out), "--estimators", "rings", "gaps"]) == 0
@@ -114,7 +108,7 @@ def test_several_logs_have_folders_of_their_own_and_intervals(
 
 
 def test_without_truth_the_command_says_so_and_draws_the_maps(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], quick: None
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], png_only: None
 ) -> None:
     log, out = without_truth(folder / "a", tmp_path / "bare"), tmp_path / "out"
     assert main(["compare", str(log), "--out", str(out), "--estimators", "rings", "gaps"]) == 0

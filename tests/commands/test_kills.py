@@ -187,7 +187,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new(
     if old:
         place(target, new)
     before = [content_of(target)] if old else []
-    for step, died in enumerate(kills(work, folder), 1):
+    for step, _ in enumerate(kills(work, folder), 1):
         if old or target.exists():
             check(target, [*before, new])
         if old and step % every == 0:

@@ -77,7 +77,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[Slow]:
 
 @cache
 def log() -> Log:
-    return noisy(lap_log(bean_track(), overrun=60.0), seed=3)
+    return noisy(lap_log(bean_track(), overrun=40.0), seed=3)
 
 
 def with_settings(**changes: object) -> FixedLagMapper:

@@ -37,7 +37,7 @@ IntArray = NDArray[np.intp]
 
 @cache
 def log() -> Log:
-    return noisy(lap_log(bean_track(), overrun=60.0), seed=3)
+    return noisy(lap_log(bean_track(), overrun=40.0), seed=3)
 
 
 @cache
@@ -257,7 +257,7 @@ def test_a_users_factors_keep_the_prior_and_it_is_said() -> None:
 
 def test_the_poses_of_the_lap_are_corrected_as_soon_as_the_loop_closes() -> None:
     """The odometry has turned the open map by then; the cycle's own pose was right only at its end."""
-    drive = lap_log(bean_track(), overrun=60.0)
+    drive = lap_log(bean_track(), overrun=40.0)
     drive = noisy(replace(drive, odometry_sigma=np.array([0.1, 0.1, 0.02])), seed=3)
     mapper, results = FixedLagMapper(MapperSettings(), drive.odometry_sigma), []
     for cycle in split_odometry(drive):

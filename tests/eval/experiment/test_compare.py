@@ -33,6 +33,8 @@ from pathspace_graph.spline.bspline import BSpline
 
 from ...scenes.rings import CENTRE, Gaps, Rings, RingsBatch, register, write_logs
 
+pytestmark = pytest.mark.usefixtures("png_only")
+
 
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch: pytest.MonkeyPatch) -> None:

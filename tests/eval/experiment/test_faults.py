@@ -20,6 +20,8 @@ from pathspace_graph.eval.experiment.faults import (
 )
 from pathspace_graph.eval.experiment.study import Study
 
+pytestmark = pytest.mark.usefixtures("png_only")
+
 NOISE = {
     "clean": {},
     "latency: 20 ms": {"faults.sensor.latency": 0.02},
@@ -149,7 +151,7 @@ def test_the_files_hold_every_value(frame: pd.DataFrame, tmp_path: Path) -> None
         np.testing.assert_allclose(flat[name], [row[name] for row in expected], err_msg=name)
     assert json.loads(flat["notices"][1]) == {"a notice": 1}
     written = {file.name for file in tmp_path.iterdir()}
-    forms = {f"faults.{suffix}" for suffix in ("txt", "md", "tex", "csv", "json", "png", "pdf")}
+    forms = {f"faults.{suffix}" for suffix in ("txt", "md", "tex", "csv", "json", "png")}
     assert written == forms | {"results.csv", "times.csv"}
 
 

@@ -23,6 +23,8 @@ from pathspace_graph.io.log import Log
 
 from ...scenes.pretenders import Fragile, Pretender, contents, register, write_round_track
 
+pytestmark = pytest.mark.usefixtures("png_only")
+
 
 @pytest.fixture(scope="module")
 def track(tmp_path_factory: pytest.TempPathFactory) -> Path:

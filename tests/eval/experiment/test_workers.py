@@ -41,7 +41,7 @@ def test_processes_give_the_same_as_one(real: Study, alone: pd.DataFrame) -> Non
 def cluster() -> Iterator[str]:
     distributed = pytest.importorskip("distributed", reason="dask isn't installed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
     ) as local:
         yield local.scheduler_address
 
