@@ -1766,6 +1766,60 @@ py::tuple centred(const Ints& begins, const Array& information, const Array& col
   return py::make_tuple(moved, off, own, vectors);
 }
 
+Array by_constants(const Array& seen, const Array& twists, const Array& poses, const Array& by_bias,
+                   const Ints& first) {
+  const Index n = seen.shape(0), width = kSensor + 1;
+  expect(seen.size() == 2 * n && twists.size() == 3 * n && poses.size() == 3 * n);
+  expect(by_bias.size() == 3 * n && first.size() == n);
+  Array columns(Shape{n, 2, width});
+  double C[2][kSensor];
+  for (Index i = 0; i < n; ++i) {
+    const Index at = first.data()[i];
+    expect(0 <= at && at < n);
+    const double *z = seen.data() + 2 * i, *pose = poses.data() + 3 * i, *began = poses.data() + 3 * at;
+    const double *bias = by_bias.data() + 3 * i, *then = by_bias.data() + 3 * at;
+    const Turn turn(pose[2]);
+    double* out = columns.mutable_data() + 2 * width * i;
+    sensor_columns(z, twists.data() + 3 * i, C);
+    for (Index k = 0; k < kSensor; ++k) {
+      out[k] = turn.c * C[0][k] - turn.s * C[1][k];
+      out[width + k] = turn.s * C[0][k] + turn.c * C[1][k];
+    }
+    const double x = turn.c * z[0] - turn.s * z[1], y = turn.s * z[0] + turn.c * z[1], turned = bias[2] - then[2];
+    out[kSensor] = bias[0] - then[0] + then[2] * (pose[1] - began[1]) - turned * y;
+    out[width + kSensor] = bias[1] - then[1] - then[2] * (pose[0] - began[0]) + turned * x;
+  }
+  return columns;
+}
+
+py::tuple references(const Ints& cone, const Array& t, const Array& ranges, const Array& weight,
+                     const Array& values, const py::tuple& sought) {
+  const Index n = cone.size(), width = values.shape(1);
+  const double share = sought[0].cast<double>(), time = sought[1].cast<double>();
+  expect(t.size() == n && ranges.size() == n && weight.size() == n && values.shape(0) == n);
+  std::vector<Index> rows, counts;
+  std::vector<double> means, sums(1 + width);
+  for (Index begin = 0, end = 0; begin < n; begin = end) {
+    while (end < n && cone.data()[end] == cone.data()[begin]) ++end;
+    for (Index i = begin; i < end; ++i) {
+      Index count = 0;
+      double total = 0.0;
+      std::fill(sums.begin(), sums.end(), 0.0);
+      for (Index j = begin; j < end; ++j) {
+        const double lag = std::abs(t.data()[j] - t.data()[i]), w = weight.data()[j];
+        if (!(lag < time && ranges.data()[j] < share * ranges.data()[i])) continue;
+        ++count, total += w, sums[0] += w * lag;
+        for (Index k = 0; k < width; ++k) sums[1 + k] += w * values.data()[width * j + k];
+      }
+      if (count < 2) continue;
+      rows.push_back(i), counts.push_back(count);
+      for (const double sum : sums) means.push_back(sum / total);
+    }
+  }
+  const Index k = rows.size();
+  return py::make_tuple(Ints(k, rows.data()), Ints(k, counts.data()), Array(Shape{k, 1 + width}, means.data()));
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_kernels, module) {
@@ -1801,6 +1855,8 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("matched", &matched);
   module.def("followed", &followed);
   module.def("centred", &centred);
+  module.def("by_constants", &by_constants);
+  module.def("references", &references);
   module.def("off_prediction", &off_prediction);
   module.def("squared", &squared);
   module.def("learned", &learned);

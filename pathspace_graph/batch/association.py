@@ -57,8 +57,10 @@ def locate_poses(state: State, settings: AssociationSettings) -> None:
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
         position, tangent = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
         tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
-        square = (poses[:, :1] - position[:, 0]) ** 2 + (poses[:, 1:2] - position[:, 1]) ** 2
-        square[headings(poses) @ tangent.T < SAME_DIRECTION] += settings.direction_penalty**2
+        square = (poses[:, :1] - position[:, 0]) ** 2
+        square += (poses[:, 1:2] - position[:, 1]) ** 2
+        against = headings(poses) @ tangent.T < SAME_DIRECTION
+        np.add(square, settings.direction_penalty**2, out=square, where=against)
         if boundary.periodic:
             state.pose_u[label] = np.unwrap(u[square.argmin(axis=1)], period=boundary.length)
         else:

@@ -84,6 +84,7 @@ class Optimizer:
         """Return the state after Gauss-Newton steps of the poses alone, beside its map and calibration."""
         self.system.begin(state)
         for _ in range(steps):
+            locate_poses(state, self.settings.association)
             state = moved(state, self.system.poses_alone(self._refreshed(state, gate, False)))
         return state
 
@@ -106,6 +107,8 @@ class Optimizer:
             strict = gate <= self.settings.gate
             system.kernel = Biweight(gate)
             held, searched = searched >= search, searched + strict
+            if not strict and done > 1:
+                locate_poses(state, self.settings.association)
             before = self._refreshed(state, gate, strict, held)
             at = self._step(before)
             state, gain, cost = at.state, abs(cost - at.cost), at.cost
@@ -131,8 +134,6 @@ class Optimizer:
         Its foot points have arrived: else the cost would change without a step.
         """
         system = self.system
-        if not strict:
-            locate_poses(state, self.settings.association)
         system.detections.correct(state.variables.sensor)
         if not held:
             associate(state, system.detections, system.settings, gate, strict)

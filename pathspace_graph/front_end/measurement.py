@@ -48,8 +48,8 @@ FIRST_SHARE: Final = 0.5  # share of a cone's error that stays with it, unless c
 FIRST_CONES: Final = 8.0  # number of cones that `FIRST_SHARE` counts as much as
 LEAST: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
 
-Lagged = tuple[IntArray, IntArray, Array]
-"""Pairs of sightings of one cone, by index, and their lags (s)."""
+Lagged = tuple[IntArray, IntArray, Array, IntArray]
+"""Pairs of sightings of one cone, by index, their lags (s), and the number of the edge before in `LAGS`."""
 
 
 @dataclass(eq=False)
@@ -59,7 +59,6 @@ class _Cones:
     table: Sightings
     begins: IntArray  # (c,) row of each cone's first sighting
     counts: IntArray  # (c,) number of its sightings
-    pairs: tuple[IntArray, IntArray]  # of one cone's sightings less than `NEAR_TIME` apart, by index
     ranges: Array  # (n,) range of the cone as the sensor measures it, without noise (m)
     ray: Array  # (n, 2) unit vector along the ray, map frame
     side: Array
@@ -98,22 +97,25 @@ def _cones(sightings: Sightings) -> _Cones | None:
     ranges = np.maximum(np.hypot(*table.point.T), np.finfo(float).tiny)
     turn = rotations(table.pose[:, 2])
     ray = np.einsum("nij,nj->ni", turn, table.point / ranges[:, None])
-    i, j = pairs(table.cone)
-    near = np.abs(table.t[j] - table.t[i]) < NEAR_TIME
-    known = (i[near], j[near]), ranges, ray, left_of(ray), to_map(table.point, table.pose)
+    known = ranges, ray, left_of(ray), to_map(table.point, table.pose)
     columns = _columns(table, np.repeat(begins, counts), table.point)
     return _Cones(table, begins, counts, *known, columns)
 
 
 def _columns(table: Sightings, first: IntArray, seen: Array) -> Array:
+    return _by_constants(seen, table.twist, table.pose, table.by_bias, first)
+
+
+@compiled
+def _by_constants(seen: Array, twists: Array, poses: Array, by_bias: Array, first: IntArray) -> Array:
     """Return the derivatives (n, 2, 6) of sightings at points (n, 2), vehicle frame, in the map frame.
 
-    The bias of the yaw rate counts from each cone's first sighting, at rows (n,): before, it turns all of the
-    cone's alike.
+    They are by the sensor's errors and by the bias of the yaw rate. This one counts from each cone's first
+    sighting, at rows (n,): before, it turns all of the cone's alike.
     """
-    by_bias, then, moved = table.by_bias, table.by_bias[first], table.pose[:, :2] - table.pose[first, :2]
-    c, s = np.cos(table.pose[:, 2:]), np.sin(table.pose[:, 2:])
-    (x, y), (ahead, left) = by_sensor(seen, table.twist).transpose(1, 0, 2), np.hsplit(seen, 2)
+    then, moved = by_bias[first], poses[:, :2] - poses[first, :2]
+    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    (x, y), (ahead, left) = by_sensor(seen, twists).transpose(1, 0, 2), np.hsplit(seen, 2)
     columns, turned = np.empty((len(seen), 2, SENSOR_SIZE + 1)), by_bias - then
     columns[:, 0, :SENSOR_SIZE], columns[:, 1, :SENSOR_SIZE] = c * x - s * y, s * x + c * y
     in_map = np.concatenate([c * ahead - s * left, s * ahead + c * left], axis=1)
@@ -180,31 +182,38 @@ def _residuals(
     The offsets (2, k) along and across the ray (m) are without the constant errors. With them come the
     variances (2, k) of reference and odometry (m^2), with the drift (3,) by root of s of white noise.
     """
-    (i, j), t, ranges = cones.pairs, cones.table.t, cones.ranges
-    near = ranges[j] < NEAR * ranges[i]
-    i, j = i[near], j[near]
-    begins = np.flatnonzero(np.diff(i, prepend=-1))
-    rows, counts = i[begins], np.diff(np.append(begins, len(i)))
-    enough = counts >= 2
-    if not enough.any():
-        return np.zeros(0, np.intp), np.zeros((2, 0)), np.zeros((2, 0))
-    points = cones.points + cones.columns @ errors
-    sigmas = [one.sigmas(ranges) for one in noise]
-    weight = (1.0 / (0.5 * (sigmas[0] ** 2 + sigmas[1] ** 2)))[j]
-    total = np.add.reduceat(weight, begins)
-
-    def mean(values: Array) -> Array:
-        """Return the weighted mean of values (p,) of the pairs over the references of each row."""
-        return np.asarray(np.add.reduceat(weight * values, begins) / total)
-
-    lag = mean(np.abs(t[j] - t[i]))
-    off = points[rows] - np.stack([mean(of[j]) for of in points.T], axis=1)
+    points, sigmas = cones.points + cones.columns @ errors, [one.sigmas(cones.ranges) for one in noise]
+    weight = 1.0 / (0.5 * (sigmas[0] ** 2 + sigmas[1] ** 2))
+    values, sought = np.column_stack([points, *sigmas]), (NEAR, NEAR_TIME)
+    rows, counts, means = _references(cones.table.cone, cones.table.t, cones.ranges, weight, values, sought)
+    off, lag = points[rows] - means[:, 1:3], means[:, 0]
     offsets = np.array([(off * axis[rows]).sum(axis=1) for axis in (cones.ray, cones.side)])
-    across = odometry[1] ** 2 + (odometry[2] * ranges[rows]) ** 2
+    across = odometry[1] ** 2 + (odometry[2] * cones.ranges[rows]) ** 2
     known = np.array([odometry[0] ** 2 * lag, across * lag])
     for axis, one in enumerate(noise):
-        known[axis] += mean(sigmas[axis][j]) ** 2 * np.maximum(1.0 / counts, one.share)
-    return rows[enough], offsets[:, enough], known[:, enough]
+        known[axis] += means[:, 3 + axis] ** 2 * np.maximum(1.0 / counts, one.share)
+    return rows, offsets, known
+
+
+@compiled
+def _references(
+    cone: IntArray, t: Array, ranges: Array, weight: Array, values: Array, sought: tuple[float, float]
+) -> tuple[IntArray, IntArray, Array]:
+    """Return the rows (k,) of sightings with two references or more, their counts, and means (k, 1 + q).
+
+    References of a sighting (n,) are those of its cone within a share of its range and a time of it (s). The
+    weighted means over them are of the time to them and of values (n, q).
+    """
+    share, time = sought
+    i, j = pairs(cone)
+    chosen = (np.abs(t[j] - t[i]) < time) & (ranges[j] < share * ranges[i])
+    i, j = i[chosen], j[chosen]
+    begins = np.flatnonzero(np.diff(i, prepend=-1))
+    rows, counts = i[begins], np.diff(np.append(begins, len(i)))
+    both, total = np.column_stack([np.abs(t[j] - t[i]), values[j]]), np.add.reduceat(weight[j], begins)
+    means = np.add.reduceat(weight[j, None] * both, begins) / total[:, None]
+    enough = counts >= 2
+    return rows[enough], counts[enough], means[enough]
 
 
 def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
@@ -249,20 +258,19 @@ def _line(ranges: Array, sigma: Array) -> Array:
 
 
 def _lagged(cone: IntArray, t: Array) -> Lagged:
-    """Return the pairs of one cone's sightings (k,) whose lag is inside of `LAGS`, and the lags (s)."""
+    """Return the pairs of one cone's sightings (k,) whose lag is inside of `LAGS`."""
     i, j = pairs(cone)
     lag = t[j] - t[i]
     inside = (lag >= LAGS[0]) & (lag < LAGS[-1])
-    return i[inside], j[inside], lag[inside]
+    return i[inside], j[inside], lag[inside], np.digitize(lag[inside], LAGS)
 
 
 def _staying(lagged: Lagged, off: Array, reference: Array, sigma: Array) -> tuple[float, float]:
     """Return share and correlation time (s) of the errors (k,) of a cone that stay with it."""
     whitened, own = np.clip(off / sigma, -3.0, 3.0), reference / sigma**2
-    i, j, lag = lagged
+    i, j, lag, place = lagged
     product = whitened[i] * whitened[j] - 0.5 * (own[i] + own[j])
     scale = max(float((whitened**2 - own).mean()), 0.25)
-    place = np.digitize(lag, LAGS)
     counts = np.bincount(place, minlength=len(LAGS))
     enough = np.flatnonzero(counts >= MIN_ROWS // 2)
     if len(enough) == 0:

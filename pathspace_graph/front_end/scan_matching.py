@@ -206,9 +206,9 @@ class SensorErrors:
         """Return whether the errors contradict the sensor's prior, by `settings.doubt` sigmas."""
         if not settings.sensor:
             return False
-        limit, prior = settings.doubt**2, settings.sigmas
-        known = zip(self.mean.tolist(), self.covariance.diagonal().tolist(), ERRORS, strict=True)
-        return any(mean**2 > limit * (variance + prior[at] ** 2) for mean, variance, at in known)
+        limit, prior = settings.doubt**2, (settings.sigma_yaw, settings.sigma_latency)
+        known = zip(self.mean.tolist(), self.covariance.diagonal().tolist(), prior, strict=True)
+        return any(mean**2 > limit * (variance + sigma**2) for mean, variance, sigma in known)
 
     def follow(self, velocity: Array, dt: float) -> None:
         """Take the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""

@@ -257,6 +257,17 @@ CASES: dict[str, Arguments] = {
         rng.normal(size=(COUNT, 2, 6)),
         rng.normal(size=(COUNT, 2)),
     ),
+    "by_constants": lambda rng: (
+        9.0 * rng.normal(size=(COUNT, 2)),
+        *(poses(rng) for _ in range(3)),
+        np.arange(COUNT) // 3 * 3,
+    ),
+    "references": lambda rng: (
+        np.sort(rng.integers(0, 3, COUNT)),
+        *rng.uniform(0.5, 9.0, (3, COUNT)),
+        rng.normal(size=(COUNT, 4)),
+        (0.6, 6.0),
+    ),
     "usable": lambda rng: (
         rng.normal(size=(COUNT, 2)),
         covariances(rng) * rng.choice([1.0, -1.0], (COUNT, 1, 1)),
