@@ -75,7 +75,7 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    twist=arrays(float, (4, 3), elements=numbers_up_to(MAX_HELD)),
+    twist=arrays(float, (4, 3), elements=numbers_up_to(0.999 * MAX_HELD)),  # stamps have round-off
     point=arrays(float, (2,), elements=numbers_up_to(MAX_RANGE)),
     t0=numbers_up_to(1e6),
 )
