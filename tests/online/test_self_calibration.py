@@ -19,6 +19,8 @@ from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
+from ..scenes.drives import SHORT
+
 SETTINGS = MapperSettings()
 KNOWN = replace(SETTINGS, calibration=replace(SETTINGS.calibration, sensor=False))
 
@@ -28,7 +30,7 @@ def driven(name: str = "", value: float = 0.0) -> Log:
     """Returns a lap and the first metres of the next one, by a sensor that has one error."""
     faults = Faults(sensor=SensorFaults(**({name: value} if name else {})))
     settings = SimulationSettings(laps=1, faults=faults)
-    return simulate(generate_track(np.random.default_rng(3)), settings, 3)
+    return simulate(generate_track(np.random.default_rng(3), SHORT), settings, 3)
 
 
 @cache
