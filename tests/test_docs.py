@@ -359,6 +359,15 @@ def test_the_new_estimator_maps_online(installed: Path, log_folder: Path) -> Non
 
 
 @pytest.mark.slow
+def test_the_new_estimator_is_compared(installed: Path, log_folder: Path) -> None:
+    names = ["dead-reckoning", "landmark-fixed-lag"]
+    run_command(installed, f"compare {log_folder} --out comparison --estimators {' '.join(names)}")
+    rows = csv_rows(installed / "comparison" / "table.csv")
+    assert [row["estimator"] for row in rows] == names
+    assert all(0.0 < float(row["rmse"]) < 1.0 and float(row["missed"]) < 0.9 for row in rows)
+
+
+@pytest.mark.slow
 def test_the_new_estimator_is_ablated(installed: Path) -> None:
     (installed / "study.toml").write_text(file_blocks(EXTENDING)["dead_reckoning.toml"])
     track = write_round_track(installed)
@@ -366,6 +375,13 @@ def test_the_new_estimator_is_ablated(installed: Path) -> None:
     rows = csv_rows(installed / "study" / "results.csv")
     assert {row["estimator"] for row in rows} == {"fixed-lag", "dead-reckoning"}
     assert all(0.0 < float(row["rmse"]) < 1.0 and float(row["missed"]) < 0.9 for row in rows)
+
+
+@pytest.mark.slow
+def test_the_new_estimator_is_scaled(installed: Path) -> None:
+    run_command(installed, "scale --out scaling --quick --estimators dead-reckoning")
+    rows = csv_rows(installed / "scaling" / "points.csv")
+    assert {row["estimator"] for row in rows} == {"dead-reckoning"}
 
 
 def test_the_new_factor_has_the_jacobian_that_it_says() -> None:

@@ -189,15 +189,13 @@ def test_a_bad_map_folder(
     assert not (tmp_path / "map.png").exists()
 
 
-@pytest.mark.parametrize(
-    ("command", "column", "value"),
-    [("online", "vx", "900"), ("batch", "vy", "-101"), ("compare", "wz", "10.5")],
-)
+@pytest.mark.parametrize(("command", "out"), [("online", "map"), ("batch", "map"), ("compare", "table")])
+@pytest.mark.parametrize(("column", "value"), [("vx", "900"), ("vy", "-101"), ("wz", "10.5")])
 def test_a_motion_that_no_vehicle_can_make(
-    command: str, column: str, value: str, log: Path, capsys: pytest.CaptureFixture[str]
+    command: str, out: str, column: str, value: str, log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (log / "odometry.csv").write_text(with_cell(GOOD["odometry.csv"], 2, column, value))
-    assert main([command, str(log), "--out", str(log.parent / "map")]) == 2
+    assert main([command, str(log), "--out", str(log.parent / out)]) == 2
     line = capsys.readouterr().err
     assert line.count("\n") == 1
     assert f"{log / 'odometry.csv'}, row 2: cycle at 0.1 s: " in line
