@@ -260,14 +260,13 @@ class BatchMapper:
         """
         watch = Stopwatch()
         judged = judge_log(log, self.noise, own_settings(self.settings))
-        settings = judged.settings
-        chain, detections = judged.chain, DetectionTable.of(judged.cycles, twists=judged.chain.twists)
-        system = BatchSystem(detections, chain, settings, Biweight(LOOSE_GATE))
-        optimizer = Optimizer(system, on_round=on_round)
+        settings, chain = judged.settings, judged.chain
         watch.lap("integrate")
         start, online = start or self.settings.batch.start, None
+        optimizer = _optimizer(judged, on_round)
         found = None if start == "online" else find_closed_optimum(optimizer)
         if found is None and start == "odometry":
+            optimizer = _optimizer(judged, on_round)
             found = find_open_optimum(optimizer)
         if found is None:
             if self.online is None:
@@ -275,14 +274,16 @@ class BatchMapper:
             watch.lap("optimum")
             mapper = self.online(replace(self.settings, scale=1.0), self.noise)
             state, online = start_online(log, mapper)
-            system.revisits, system.kernel = mapper.revisits, Biweight(LOOSE_GATE)
+            optimizer = _optimizer(judged, on_round)
+            optimizer.system.revisits = mapper.revisits
             watch.lap("start")
             found = optimizer.find(state)
+        system = optimizer.system
         at, convergence, known = _with_wider_priors(optimizer, *found)
         watch.lap("optimum")
         joint, vehicle = known.covariance(at.state.map_keys), _vehicle(at.state, known)
         watch.lap("covariance")
-        detections = deepcopy(detections)  # the result's problem keeps its own associations
+        detections = deepcopy(system.detections)  # the result's problem keeps its own associations
         state, change = simplified(at.state, detections, settings)
         joint = change @ joint @ change.T
         scatter = scatter_of_cones(state, detections, settings)
@@ -310,6 +311,13 @@ class BatchMapper:
             optimum=at,
             objection=unmapped(detections, state.poses),
         )
+
+
+def _optimizer(judged: JudgedLog, on_round: Callable[[], None] | None) -> Optimizer:
+    """Return an optimizer with a system and detections of its own: a search begins with nothing of another."""
+    detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
+    system = BatchSystem(detections, judged.chain, judged.settings, Biweight(LOOSE_GATE))
+    return Optimizer(system, on_round=on_round)
 
 
 def unmapped(detections: DetectionTable, poses: Array) -> str:
