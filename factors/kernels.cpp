@@ -1209,36 +1209,60 @@ py::tuple gated(const Ints& rows, const Ints& cycle, const Ints& label, const Ar
 
 void inverse2(const double* A, double* out);
 
+struct MergeGate {  // mapping.tentative: a radius, its multiple for smeared detections, and their sigmas
+  explicit MergeGate(const py::tuple& limits)
+      : radius(limits[0].cast<double>()), most(limits[1].cast<double>()), chi(limits[2].cast<double>()) {}
+  double radius, most, chi;
+};
+
+// The track of a detection z with covariance K, of n tracks; -1 if it belongs to none.
+Index track_of(const double* z, const double* K, const double* place, const double* inform, Index n,
+               const MergeGate& gate) {
+  double least = kInfinity;
+  Index track = -1;
+  for (Index j = 0; j < n; ++j) {
+    const double distance = std::hypot(z[0] - place[2 * j], z[1] - place[2 * j + 1]);
+    if (distance < least) least = distance, track = j;
+  }
+  if (least < gate.radius) return track;
+  track = -1, least = gate.chi * gate.chi;
+  const double farthest = gate.most * gate.radius;
+  for (Index j = 0; j < n; ++j) {
+    const double dx = z[0] - place[2 * j], dy = z[1] - place[2 * j + 1];
+    if (!(dx * dx + dy * dy < farthest * farthest)) continue;
+    double joint[4], weight[4];
+    inverse2(inform + 4 * j, joint);
+    for (int k = 0; k < 4; ++k) joint[k] += K[k];
+    inverse2(joint, weight);
+    const double square = dx * (weight[0] * dx + weight[1] * dy) + dy * (weight[2] * dx + weight[3] * dy);
+    if (square < least) least = square, track = j;
+  }
+  return track;
+}
+
+// Add a detection z with information `weight` to a track.
+void add_to(double* at, double* sum, const double* z, const double* weight) {
+  double gain[4];
+  for (int k = 0; k < 4; ++k) sum[k] += weight[k];
+  const double dx = z[0] - at[0], dy = z[1] - at[1];
+  const double gx = weight[0] * dx + weight[1] * dy, gy = weight[2] * dx + weight[3] * dy;
+  inverse2(sum, gain);
+  at[0] += gain[0] * gx + gain[1] * gy, at[1] += gain[2] * gx + gain[3] * gy;
+}
+
 // The tracks with detections merged into them; the new ones come last.
 py::tuple merged(const py::tuple& known, const Array& points, const Array& covariances, double t,
                  const py::tuple& limits) {
   const Array place = known[0].cast<Array>(), inform = known[1].cast<Array>(), stamps = known[3].cast<Array>();
   const Ints number = known[2].cast<Ints>();
-  const double radius = limits[0].cast<double>(), most = limits[1].cast<double>(), chi = limits[2].cast<double>();
+  const MergeGate gate(limits);
   const Index n = place.shape(0), m = points.shape(0);
   expect(inform.size() == 4 * n && number.size() == n && stamps.size() == n);
   expect(points.size() == 2 * m && covariances.size() == 4 * m);
   std::vector<Index> track(m, -1);
   Index count = n;
   for (Index i = 0; i < m; ++i) {
-    const double* z = points.data() + 2 * i;
-    double least = kInfinity;
-    for (Index j = 0; j < n; ++j) {
-      const double distance = std::hypot(z[0] - place.data()[2 * j], z[1] - place.data()[2 * j + 1]);
-      if (distance < least) least = distance, track[i] = j;
-    }
-    if (least < radius) continue;
-    track[i] = -1, least = chi * chi;
-    for (Index j = 0; j < n; ++j) {
-      const double dx = z[0] - place.data()[2 * j], dy = z[1] - place.data()[2 * j + 1];
-      if (!(dx * dx + dy * dy < most * radius * (most * radius))) continue;
-      double joint[4], weight[4];
-      inverse2(inform.data() + 4 * j, joint);
-      for (int k = 0; k < 4; ++k) joint[k] += covariances.data()[4 * i + k];
-      inverse2(joint, weight);
-      const double square = dx * (weight[0] * dx + weight[1] * dy) + dy * (weight[2] * dx + weight[3] * dy);
-      if (square < least) least = square, track[i] = j;
-    }
+    track[i] = track_of(points.data() + 2 * i, covariances.data() + 4 * i, place.data(), inform.data(), n, gate);
     if (track[i] < 0) ++count;
   }
   Array place_out(Shape{count, 2}), inform_out(Shape{count, 2, 2}), stamps_out(count);
@@ -1257,19 +1281,212 @@ py::tuple merged(const py::tuple& known, const Array& points, const Array& covar
       number_out.mutable_data()[next] = 1, stamps_out.mutable_data()[next++] = t;
       continue;
     }
-    double* at = place_out.mutable_data() + 2 * track[i];
-    double* sum = inform_out.mutable_data() + 4 * track[i];
-    double gain[4];
-    for (int k = 0; k < 4; ++k) sum[k] += weight[k];
-    const double dx = z[0] - at[0], dy = z[1] - at[1];
-    const double gx = weight[0] * dx + weight[1] * dy, gy = weight[2] * dx + weight[3] * dy;
-    inverse2(sum, gain);
-    at[0] += gain[0] * gx + gain[1] * gy, at[1] += gain[2] * gx + gain[3] * gy;
+    add_to(place_out.mutable_data() + 2 * track[i], inform_out.mutable_data() + 4 * track[i], z, weight);
     ++number_out.mutable_data()[track[i]];
     double& last = stamps_out.mutable_data()[track[i]];
     last = std::max(last, t);  // a late detection makes no track older
   }
   return py::make_tuple(place_out, inform_out, number_out, stamps_out);
+}
+
+// The tracks of detections that are added one after another.
+py::tuple merged_in_turn(const Array& points, const Array& covariances, const py::tuple& limits) {
+  const Index m = points.shape(0);
+  expect(points.size() == 2 * m && covariances.size() == 4 * m);
+  const MergeGate gate(limits);
+  std::vector<double> place, inform;
+  std::vector<Index> number;
+  for (Index i = 0; i < m; ++i) {
+    const double *z = points.data() + 2 * i, *K = covariances.data() + 4 * i;
+    const Index n = static_cast<Index>(number.size()), track = track_of(z, K, place.data(), inform.data(), n, gate);
+    double weight[4];
+    inverse2(K, weight);
+    if (track < 0) {
+      place.insert(place.end(), z, z + 2);
+      inform.insert(inform.end(), weight, weight + 4);
+      number.push_back(1);
+    } else {
+      add_to(place.data() + 2 * track, inform.data() + 4 * track, z, weight);
+      ++number[track];
+    }
+  }
+  const Index n = static_cast<Index>(number.size());
+  Array stamps(n);
+  std::fill_n(stamps.mutable_data(), n, 0.0);
+  return py::make_tuple(Array(Shape{n, 2}, place.data()), Array(Shape{n, 2, 2}, inform.data()),
+                        Ints(n, number.data()), stamps);
+}
+
+// --- constellations ---------------------------------------------------------------------------------------
+
+struct ConePoints {  // mapping.constellation:Cones
+  explicit ConePoints(const py::tuple& columns)
+      : point(columns[0].cast<Array>()), covariance(columns[1].cast<Array>()), label(columns[2].cast<Ints>()) {
+    n = label.size();
+    expect(point.size() == 2 * n && covariance.size() == 4 * n);
+  }
+  Array point, covariance;
+  Ints label;
+  Index n;
+};
+
+struct LayLimits {  // mapping.constellation:LIMITS
+  explicit LayLimits(const py::tuple& limits)
+      : sigma(limits[0].cast<double>()), gate(limits[1].cast<double>()), cell(limits[2].cast<double>()),
+        turn(limits[3].cast<double>()), apart(limits[4].cast<double>()),
+        places(static_cast<Index>(limits[5].cast<double>())) {}
+  double sigma, gate, cell, turn, apart;
+  Index places;
+};
+
+struct LaidPose {
+  double pose[3], information[9], cost, share;
+};
+
+struct LayStart {
+  Index votes;
+  double pose[3];
+};
+
+// The poses with most votes: each pair of cones votes for a cell and the eight around it.
+std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known, const double* mean,
+                                 const double* reach, const LayLimits& limits) {
+  const Index half = static_cast<Index>(std::ceil(reach[0] / limits.cell)) + 1, width = 2 * half + 1;
+  const Index turns = static_cast<Index>(std::ceil(reach[1] / limits.turn));
+  std::vector<Index> votes(width * width), best;
+  std::vector<LayStart> starts;
+  for (Index turn = -turns; turn <= turns; ++turn) {
+    const double heading = mean[2] + turn * limits.turn, c = std::cos(heading), s = std::sin(heading);
+    std::fill(votes.begin(), votes.end(), 0);
+    for (Index i = 0; i < seen.n; ++i) {
+      const double x = seen.point.data()[2 * i], y = seen.point.data()[2 * i + 1];
+      const double to[2] = {c * x - s * y, s * x + c * y};
+      for (Index j = 0; j < known.n; ++j) {
+        if (seen.label.data()[i] != known.label.data()[j]) continue;
+        Index at[2];
+        for (int k = 0; k < 2; ++k) {
+          const double move = known.point.data()[2 * j + k] - to[k] - mean[k];
+          at[k] = static_cast<Index>(std::floor(clipped(move / limits.cell + 0.5, -1e9, 1e9))) + half;
+        }
+        if (at[0] <= 0 || at[0] >= 2 * half || at[1] <= 0 || at[1] >= 2 * half) continue;
+        for (Index a = at[0] - 1; a <= at[0] + 1; ++a)
+          for (Index b = at[1] - 1; b <= at[1] + 1; ++b) ++votes[a * width + b];
+      }
+    }
+    best.clear();
+    for (Index k = 0; k < width * width; ++k)
+      if (votes[k] > 0) best.push_back(k);
+    const auto more = [&](Index a, Index b) { return votes[a] != votes[b] ? votes[a] > votes[b] : a < b; };
+    const Index count = std::min(limits.places, static_cast<Index>(best.size()));
+    std::partial_sort(best.begin(), best.begin() + count, best.end(), more);
+    for (Index k = 0; k < count; ++k)
+      starts.push_back({votes[best[k]],
+                        {mean[0] + (best[k] / width - half) * limits.cell,
+                         mean[1] + (best[k] % width - half) * limits.cell, heading}});
+  }
+  std::stable_sort(starts.begin(), starts.end(), [](const LayStart& a, const LayStart& b) { return a.votes > b.votes; });
+  return starts;
+}
+
+constexpr double kLayGates[] = {4.0, 4.0, 2.0, 1.0, 1.0, 1.0};
+constexpr double kLayRegular[] = {1e-2, 1e-2, 1.0};
+
+// The pose after Gauss-Newton steps on the sum of capped squares, and what the cones say of it there.
+LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const double* start, const double* mean,
+                     const double* prior, const LayLimits& limits) {
+  LaidPose out;
+  std::copy_n(start, 3, out.pose);
+  const double floor = limits.sigma * limits.sigma;
+  for (int step = 0; step <= 6; ++step) {
+    const double limit = limits.gate * (step < 6 ? kLayGates[step] : 1.0);
+    const Turn turn(out.pose[2]);
+    double A[3][3] = {}, g[3] = {}, cost = 0.0, sharp = 0.0, on = 0.0;
+    for (Index i = 0; i < seen.n; ++i) {
+      const double *p = seen.point.data() + 2 * i, *K = seen.covariance.data() + 4 * i;
+      const double arm[2] = {turn.c * p[0] - turn.s * p[1], turn.s * p[0] + turn.c * p[1]};
+      const double cc = turn.c * turn.c, ss = turn.s * turn.s, cs = turn.c * turn.s;
+      const double both = 0.5 * (K[1] + K[2]);
+      const double xx = cc * K[0] - 2.0 * cs * both + ss * K[3], yy = ss * K[0] + 2.0 * cs * both + cc * K[3];
+      const double xy = cs * (K[0] - K[3]) + (cc - ss) * both;
+      double least = kInfinity, weight[4] = {}, off[2] = {};
+      for (Index j = 0; j < known.n; ++j) {
+        if (seen.label.data()[i] != known.label.data()[j]) continue;
+        const double* q = known.covariance.data() + 4 * j;
+        const double total[4] = {xx + q[0] + floor, xy + q[1], xy + q[2], yy + q[3] + floor};
+        const double dx = arm[0] + out.pose[0] - known.point.data()[2 * j];
+        const double dy = arm[1] + out.pose[1] - known.point.data()[2 * j + 1];
+        // the square is at least this, since no eigenvalue exceeds the trace
+        if (!(dx * dx + dy * dy < std::min(least, limit) * (total[0] + total[3]))) continue;
+        double inverse[4];
+        inverse2(total, inverse);
+        const double square = dx * (inverse[0] * dx + inverse[1] * dy) + dy * (inverse[2] * dx + inverse[3] * dy);
+        if (square < least) {
+          least = square, off[0] = dx, off[1] = dy;
+          std::copy_n(inverse, 4, weight);
+        }
+      }
+      const double own = 1.0 / (floor + 0.5 * (K[0] + K[3]));
+      sharp += own, cost += std::min(least, limits.gate);
+      if (!(least < limit)) continue;
+      on += own;
+      const double share = 1.0 - least / limit, w = step < 6 ? share * share : 1.0;
+      const double by[2][3] = {{1.0, 0.0, -arm[1]}, {0.0, 1.0, arm[0]}};
+      for (int a = 0; a < 3; ++a)
+        for (int r = 0; r < 2; ++r)
+          for (int k = 0; k < 2; ++k) {
+            const double value = w * by[r][a] * weight[2 * r + k];
+            g[a] += value * off[k];
+            for (int b = 0; b < 3; ++b) A[a][b] += value * by[k][b];
+          }
+    }
+    if (step < 6) {
+      for (int a = 0; a < 3; ++a) A[a][a] += kLayRegular[a];
+      solve3(A, g);
+      for (int a = 0; a < 3; ++a) out.pose[a] -= g[a];
+      continue;
+    }
+    std::copy_n(&A[0][0], 9, out.information);
+    const double pi = std::acos(-1.0);
+    double away[3], square = 0.0;
+    for (int k = 0; k < 3; ++k) away[k] = out.pose[k] - mean[k];
+    away[2] = std::remainder(away[2], 2.0 * pi);
+    for (int a = 0; a < 3; ++a)
+      for (int b = 0; b < 3; ++b) square += away[a] * prior[3 * a + b] * away[b];
+    out.cost = cost + std::min(square, limits.gate);
+    out.share = on / sharp;
+  }
+  return out;
+}
+
+py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, const Array& mean, const Array& prior,
+               const py::tuple& reach, const py::tuple& tuple) {
+  const ConePoints seen(seen_columns), known(known_columns);
+  const LayLimits limits(tuple);
+  expect(mean.size() == 3 && prior.size() == 9);
+  const double within[2] = {reach[0].cast<double>(), reach[1].cast<double>()};
+  std::vector<LayStart> tried;
+  std::vector<LaidPose> found;
+  for (const LayStart& start : lay_starts(seen, known, mean.data(), within, limits)) {
+    const bool is_near = std::any_of(tried.begin(), tried.end(), [&](const LayStart& other) {
+      return std::hypot(start.pose[0] - other.pose[0], start.pose[1] - other.pose[1]) < limits.apart &&
+             std::abs(start.pose[2] - other.pose[2]) < 1.5 * limits.turn;
+    });
+    if (is_near) continue;
+    tried.push_back(start);
+    found.push_back(lay_refined(seen, known, start.pose, mean.data(), prior.data(), limits));
+    if (static_cast<Index>(tried.size()) == 3 * limits.places) break;
+  }
+  if (found.empty())
+    return py::make_tuple(mean, Array(Shape{3, 3}, std::vector<double>(9, 0.0).data()),
+                          py::make_tuple(kInfinity, 0.0, 0.0));
+  const LaidPose& best = *std::min_element(found.begin(), found.end(),
+                                           [](const LaidPose& a, const LaidPose& b) { return a.cost < b.cost; });
+  double next = kInfinity;
+  for (const LaidPose& one : found)
+    if (std::hypot(one.pose[0] - best.pose[0], one.pose[1] - best.pose[1]) > limits.apart)
+      next = std::min(next, one.cost);
+  return py::make_tuple(Array(Shape{3}, best.pose), Array(Shape{3, 3}, best.information),
+                        py::make_tuple(best.cost, best.share, next - best.cost));
 }
 
 // --- odometry and path ------------------------------------------------------------------------------------
@@ -1847,6 +2064,8 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("in_view", &in_view);
   module.def("gated", &gated);
   module.def("merged", &merged);
+  module.def("merged_in_turn", &merged_in_turn);
+  module.def("laid", &laid);
   module.def("whitened_odometry", &whitened_odometry);
   module.def("along_and_across", &along_and_across);
   module.def("odometry_residuals", &odometry_residuals);

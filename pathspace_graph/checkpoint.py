@@ -27,28 +27,15 @@ class Recovery:
         self.failures = failures
         self._copy: dict[str, Any] | None = None
         self._calls: list[Call] = []
-        self._doubtful: int | None = None  # the first call that may be made in another way yet
 
     def before(self, estimator: object, *shared: object) -> None:
         """Make a copy of an estimator before a call where one is due; it shares itself and some objects."""
-        due = len(self._calls) >= self.EVERY and self._doubtful is None
-        if self._copy is None or due:
+        if self._copy is None or len(self._calls) >= self.EVERY:
             self._copy, self._calls = self._held(vars(estimator), estimator, shared), []
 
-    def called(self, again: Call, *, is_doubtful: bool = False) -> None:
-        """Note a call that has changed the estimator; `undo` can change those from a doubtful one on."""
-        if not is_doubtful:
-            self._doubtful = None
-        elif self._doubtful is None:
-            self._doubtful = len(self._calls)
+    def called(self, again: Call) -> None:
+        """Note a call that has changed the estimator."""
         self._calls.append(again)
-
-    def undo(self, estimator: object, *shared: object, instead: Callable[[Call], Call]) -> None:
-        """Take an estimator back to before its doubtful calls, and make these `instead`."""
-        first = len(self._calls) if self._doubtful is None else self._doubtful
-        self._calls = [*self._calls[:first], *map(instead, self._calls[first:])]
-        self._doubtful = None
-        self._go_back(estimator, *shared)
 
     def take_back(self, estimator: object, *shared: object) -> None:
         """Take an estimator back to what it was after the last call that was noted."""

@@ -144,6 +144,10 @@ def _misfit(
         foot = boundary.refine(control_points, points, begin)  # it may lie somewhat beyond
     projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
+    if boundary.periodic and not whole:  # it belongs to the nearest stretch, which another pass may be beside
+        nearest = boundary.find_anywhere(control_points, points)
+        distance = np.hypot(*(points - nearest.position).T) + settings.growth.merge_radius
+        possible &= ~nearest.interior | (np.abs(foot.distance) < distance)
     return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
 
 

@@ -37,7 +37,7 @@ from pathspace_graph.spline.bspline import BSpline
 from .association import add_drive
 from .optimizer import LOOSE_GATE, Convergence, Effort, Optimizer
 from .simplification import boundary_of, own_settings, scatter_of_cones, simplified
-from .start import Recurrence, start_odometry
+from .start import Recurrence, aligned_odometry, start_odometry
 from .system import BatchSystem, Biweight, Evaluation, curve_gauge
 
 USED_AGAIN: Final = 0.85  # least share of the detections used after the first lap, over that of the first lap
@@ -47,6 +47,7 @@ OVERLAP: Final = 15.0  # least length that has been driven again (m)
 SIGMA: Final = 0.3
 """Largest standard deviation by which later laps' detections hold their drive beside the curves (m)."""
 WIDER: Final = 2.5  # most ratio of a boundary point's distance from the drive to the drive's beside it
+MOST_BENT: Final = 4.0  # most distance of an optimum's poses from odometry and revisits (sigmas)
 MOSTLY: Final = 95.0  # percentile of the poses' distances: the drive may begin or end off the track
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)  # so that it is in time
 FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)
@@ -102,7 +103,8 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
         system, at, convergence = lap_optimum(lap)
         settings, detections = system.settings, system.detections
         found = evidence(at, detections, settings)
-        if isinstance(lap.start, Recurrence) and not is_true_closure(found, settings):
+        by_shape = isinstance(lap.start, Recurrence) and not lap.start.revisits
+        if by_shape and not is_true_closure(found, settings):
             return None
         few, change = simplified(at.state, detections, settings)
         information, mean = marginal_of(system, at, few, change, lap.first_kept)
@@ -118,7 +120,8 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
             scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
             cones=scatter.places,
             seconds=time.perf_counter() - begin,
-            objection=objection(found, few.splines, at.state.poses, settings),
+            objection=disagreement(system, at.state.poses)
+            or objection(found, few.splines, at.state.poses, settings),
         )
 
 
@@ -127,7 +130,8 @@ def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem
     settings, detections, start = own_settings(lap.settings), deepcopy(lap.detections), lap.start
     system = BatchSystem(detections, lap.chain, settings, Biweight(LOOSE_GATE))
     if isinstance(start, Recurrence):
-        state = start_odometry(lap.chain, lap.detections, settings, start)
+        system.revisits = start.revisits
+        state = start_odometry(lap.chain, detections, settings, start)
     else:
         state = State()
         for label, spline in start.splines.items():
@@ -262,6 +266,18 @@ def objection(
     if found.used < settings.batch.closure.used:
         return f"only {found.used:.0%} of the detections lie on its boundaries".replace("%", " %")
     return ""
+
+
+def disagreement(system: BatchSystem, poses: Array) -> str:
+    """Return that the poses (P, 3) of an optimum are not those of odometry and revisits; empty if they are.
+
+    Both are estimates of one drive, so their distance is some standard deviations of the less certain one. A
+    wrong optimum bends the drive to the map, by much more.
+    """
+    if not system.revisits:
+        return ""
+    sigmas = aligned_odometry(system.chain, system.revisits).disagreement(poses)
+    return f"the poses are {sigmas:.1f} sigmas from the odometry" if sigmas > MOST_BENT else ""
 
 
 def _longest_gap(u: Array, length: float) -> float:

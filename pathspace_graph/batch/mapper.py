@@ -36,7 +36,7 @@ from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, Vehicle
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE as POSE_LENGTHS
-from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.motion import known_noise, with_inflated_priors
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
@@ -45,10 +45,10 @@ from pathspace_graph.scale import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.spline.boundary import Boundary
 
-from .lap import evidence, is_true_closure
+from .lap import disagreement, evidence, is_true_closure, objection
 from .optimizer import LOOSE_GATE, Convergence, Optimizer
 from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplified
-from .start import CurveMapper, Recurrence, find_recurrence, start_odometry, start_online
+from .start import CurveMapper, Recurrence, find_recurrence, find_revisits, start_odometry, start_online
 from .system import BatchSystem, Biweight, CurveGauge, Evaluation
 
 ROOM: Final = 4.0  # distance from its foot points in which a factor searches them (m along the curve)
@@ -263,8 +263,12 @@ class BatchMapper:
         settings, chain = judged.settings, judged.chain
         watch.lap("integrate")
         start, online = start or self.settings.batch.start, None
-        optimizer = _optimizer(judged, on_round)
-        found = None if start == "online" else find_closed_optimum(optimizer)
+        optimizer, found = _optimizer(judged, on_round), None
+        if start != "online":
+            found = find_optimum_by_cones(optimizer, judged)
+        if found is None and start != "online":
+            optimizer = _optimizer(judged, on_round)
+            found = find_closed_optimum(optimizer)
         if found is None and start == "odometry":
             optimizer = _optimizer(judged, on_round)
             found = find_open_optimum(optimizer)
@@ -314,7 +318,7 @@ class BatchMapper:
 
 
 def _optimizer(judged: JudgedLog, on_round: Callable[[], None] | None) -> Optimizer:
-    """Return an optimizer with a system and detections of its own: a search begins with nothing of another."""
+    """Return an optimizer with a system and detections of its own, so no search begins with another's."""
     detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
     system = BatchSystem(detections, judged.chain, judged.settings, Biweight(LOOSE_GATE))
     return Optimizer(system, on_round=on_round)
@@ -348,6 +352,35 @@ def _vehicle(state: State, known: FactoredSystem) -> VehicleState:
     variables, last = state.variables, pose_key(len(state.poses) - 1)
     covariance = known.covariance(np.append(last, variables.calibration_keys))
     return VehicleState.split(state.poses[-1], variables.calibrations, covariance)
+
+
+def find_optimum_by_cones(optimizer: Optimizer, judged: JudgedLog) -> tuple[Evaluation, Convergence] | None:
+    """Return the optimum whose search begins with odometry and the cones that were met again.
+
+    None where none were met again, the search fails, or something speaks against the map.
+    """
+    system, chain, settings = optimizer.system, judged.chain, judged.settings
+    recurrence = find_revisits(chain, all_cones(judged), settings)
+    if not recurrence.recurs:
+        return None
+    system.revisits = recurrence.revisits
+    try:
+        at, convergence = optimizer.find(start_odometry(chain, system.detections, settings, recurrence))
+    except SolveError:
+        return None
+    found = evidence(at, system.detections, settings)
+    poses = at.state.poses
+    why = disagreement(system, poses) or objection(found, at.state.splines, poses, settings)
+    return None if why else (at, convergence)
+
+
+def all_cones(judged: JudgedLog) -> DetectionColumns:
+    """Return the detections of all cones of a log, corrected by the sensor's calibration as it is known."""
+    pairs = zip(judged.cycles, judged.orange, strict=True)
+    table = DetectionColumns.of([one.with_others(other) for one, other in pairs], twists=judged.chain.twists)
+    calibration = judged.settings.calibration
+    table.correct(np.array(calibration.means) if calibration.sensor else np.zeros(0))
+    return table
 
 
 def find_closed_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence] | None:

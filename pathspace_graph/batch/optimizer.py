@@ -69,9 +69,10 @@ class Optimizer:
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
         """Return the optimum on curves with about one knot for each cone, which meet the cones."""
         detections, settings, effort = self.system.detections, self.system.settings, self.effort
-        state = self.align_poses(state, POSE_STEPS, LOOSE_GATE)
+        first_gate = self.settings.gate if self.system.revisits else LOOSE_GATE
+        state = self.align_poses(state, POSE_STEPS, first_gate)
         state = reknot(state, detections, settings, dense=True)
-        at, _ = self.run(state, LOOSE_GATE, effort.rough_rounds, rough=True)
+        at, _ = self.run(state, first_gate, effort.rough_rounds, rough=True)
         for _ in range(effort.knot_passes):
             cones = cone_counts(at.state, detections, settings)
             state = reknot(at.state, detections, settings, dense=True)

@@ -33,9 +33,13 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
     """
     state = state.copy()
     for label, boundary in list(state.boundaries.items()):
-        points = cones_of_curve(state, detections, label, settings).points
+        cones = cones_of_curve(state, detections, label, settings)
+        points = cones.points
         if len(points) < MIN_CONES:
             continue
+        if not dense:  # the optimum's curve beside the cones, since some of them are strays
+            u = first_parameter(state, label) + cones.u
+            points = boundary.find(state.control_points(label), points, u - FOOT_ROOM, u + FOOT_ROOM).position
         share, least_share = settings.batch.size_share, MIN_SIZE_SHARE
         if dense:
             share, least_share = settings.batch.dense_share, 1.0

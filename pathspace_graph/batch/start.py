@@ -4,6 +4,7 @@ From odometry, the curvature of the path driven says how long a lap is. The laps
 dead reckoning, and the curves begin as those through the cones beside lap 1.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -22,7 +23,8 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, po
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.constellation import BEGINNING, NEARBY, Expected, find_return, revisit_of
+from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
 from pathspace_graph.mapping.registration import HEADING
 from pathspace_graph.mapping.state import State
@@ -45,6 +47,8 @@ REFERENCE_STEP: Final = 8.0  # distance of the reference poses that every lap pa
 LAP_SIGMAS: Final = np.array([1.5, 1.5, 0.15])  # of a lap's pose about a reference pose (m, m, rad)
 ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the laps together
 ALIGN_TOLERANCE: Final = 1e-2  # largest move of a step at which they are together (m, rad)
+INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
+LAP_SHARE: Final = 0.7  # least share of a lap between two passes
 MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
 
 
@@ -92,6 +96,7 @@ class Recurrence:
     lap: float = np.inf  # path length of a lap (m), infinite where the path doesn't recur
     turn: float = 0.0  # change of the heading in a lap, by the odometry (rad)
     correlation: float = 0.0  # how well the curvature agrees with itself a lap later, 1 where it is the same
+    revisits: tuple[Revisit, ...] = ()  # where the cones of an earlier pass were met again
 
     @property
     def recurs(self) -> bool:
@@ -166,8 +171,11 @@ def start_odometry(
     calibration, state = np.array(settings.calibrations), State()
     poses = chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
     recurrence = recurrence or find_recurrence(poses, settings)
-    if recurrence.recurs:
+    if recurrence.revisits:
+        poses, calibration[:CALIBRATION_SIZE] = align_revisits(chain, recurrence.revisits)
+    elif recurrence.recurs:
         poses, calibration[:CALIBRATION_SIZE] = align_laps(chain, recurrence)
+    detections.correct(calibration[CALIBRATION_SIZE:])
     for label in BOUNDARIES:
         _begin_boundary(state, label, poses, recurrence, detections, settings)
     add_drive(state, poses, calibration, settings.batch.association)
@@ -203,6 +211,89 @@ def align_laps(chain: LogOdometry, recurrence: Recurrence) -> tuple[Array, Array
         if np.abs(step).max() < ALIGN_TOLERANCE:
             break
     return variables.poses[:count], variables.calibration
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedOdometry:
+    """The optimum of odometry and revisits: what is known of a drive without any curve."""
+
+    poses: Array  # (P, 3) poses of all cycles
+    calibration: Array  # (2,) calibration of the odometry
+    covariances: Array  # (P, 3, 3) marginal covariance of each pose
+
+    def disagreement(self, poses: Array) -> float:
+        """Return the root mean square distance of poses (P, 3) from these, in standard deviations."""
+        off = poses - self.poses
+        square = np.einsum("ki,ki->k", off, np.linalg.solve(self.covariances, off[:, :, None])[:, :, 0])
+        return float(np.sqrt(square.mean() / POSE))
+
+
+def align_revisits(chain: LogOdometry, revisits: Sequence[Revisit]) -> tuple[Array, Array]:
+    """Return the poses (P, 3) and the calibration (2,) at the optimum of odometry and revisits."""
+    variables = _aligned(chain, revisits)
+    return variables.poses, variables.calibration
+
+
+def aligned_odometry(chain: LogOdometry, revisits: Sequence[Revisit]) -> AlignedOdometry:
+    """Return the optimum of odometry and revisits, with the marginal covariances of its poses."""
+    variables = _aligned(chain, revisits)
+    marginals = _system_of(chain, revisits, variables).pose_marginals
+    return AlignedOdometry(variables.poses, variables.calibration, marginals)
+
+
+def _aligned(chain: LogOdometry, revisits: Sequence[Revisit]) -> Variables:
+    variables = Variables()
+    variables.insert(np.array([CALIBRATION_KEY]), chain.calibration_mean)
+    poses = chain.dead_reckoned(chain.calibration_mean)
+    variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
+    for _ in range(ALIGN_STEPS):
+        step = _system_of(chain, revisits, variables).step(np.zeros(CALIBRATION_SIZE))
+        variables.values = variables.values + step
+        if np.abs(step).max() < ALIGN_TOLERANCE:
+            break
+    return variables
+
+
+def _system_of(chain: LogOdometry, revisits: Sequence[Revisit], variables: Variables) -> Elimination:
+    poses = variables.poses
+    rows = [*chain.rows(poses, variables.calibration), *(one.rows(poses) for one in revisits)]
+    return Elimination(linear_graph(rows, variables), variables.layout)
+
+
+def find_revisits(chain: LogOdometry, table: DetectionColumns, settings: MapperSettings) -> Recurrence:
+    """Return the recurrence of a whole drive by its cones: the first return to its beginning, and later ones.
+
+    Before the first return the poses are dead reckoned, so it has to be sure. Each revisit aligns the poses,
+    and the next is searched for `INTERVAL` metres later, nearby.
+    """
+
+    def seen_in(cycles: IntArray) -> DetectionColumns:
+        return table.where(np.flatnonzero(table.in_cycles(cycles)))
+
+    closing, poses = settings.closing, chain.dead_reckoned(chain.calibration_mean)
+    driven, revisits, due, lap = path_lengths(poses), list[Revisit](), closing.min_path, np.inf
+    for newest in range(len(poses)):
+        if driven[newest] < due:
+            continue
+        so_far = poses[: newest + 1]
+        length = float(path_lengths(so_far)[-1])
+        due = driven[newest] + (INTERVAL / 3.0 if revisits else closing.check_interval)
+        last, expected = min(length - closing.min_path, BEGINNING), Expected.after(length, closing)
+        if revisits:
+            last, expected = length - LAP_SHARE * lap, NEARBY
+        found = find_return(seen_in, so_far, last, expected, settings.growth)
+        if found is None:
+            continue
+        laid, earlier = found
+        if not (laid.is_likely if revisits else laid.is_sure):
+            continue
+        revisit = revisit_of(laid, so_far, earlier, newest)
+        if not revisits:
+            lap = float(driven[newest] - driven[earlier] - revisit.local[0])
+        revisits.append(revisit)
+        poses, _ = align_revisits(chain, revisits)
+        due = driven[newest] + INTERVAL
+    return Recurrence(driven, lap, revisits=tuple(revisits))
 
 
 def lap_correspondences(recurrence: Recurrence) -> tuple[IntArray, IntArray, Array]:

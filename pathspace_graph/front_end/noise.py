@@ -24,6 +24,7 @@ AGAIN: Final = 1.5  # growth of the driving time after which it is measured agai
 MOST_CYCLES: Final = 300  # newest cycles on which it is measured, which bounds its time
 MIN_SPEED: Final = 0.3  # speed from which on the vehicle drives (m/s)
 SCALE: Final = SENSOR.index("range_scale")
+SIGMA_HELD: Final = 0.001  # of the scale of the sensor that sets the size of the world (-)
 REFERENCE_RANGE: Final = 10.0  # range at whose noise ranges are compared with speeds (m)
 
 
@@ -119,8 +120,9 @@ class NoiseLearner:
             return settings
         sigmas = np.maximum(measured.sensor_sigma, sensor.sigmas)
         odometry, means = settings.odometry, measured.sensor.copy()
-        if contradicted[SCALE] and self.trusts_odometry(settings):
-            odometry = replace(odometry, hold_scale=True)
+        if self.trusts_odometry(settings):
+            sigma = min(odometry.sigma_scale, SIGMA_HELD)
+            odometry = replace(odometry, hold_scale=True, sigma_scale=sigma)
         else:
             if contradicted[SCALE]:
                 scale, sigma = float(means[SCALE]), max(float(sigmas[SCALE]), odometry.sigma_scale)

@@ -106,6 +106,13 @@ class Detections(Brief):
             return self
         return Detections(self.t, self.points_vehicle[chosen], self.covariances[chosen], self.labels[chosen])
 
+    def with_others(self, other: Detections) -> Detections:
+        """Return these detections followed by other ones of the same cycle."""
+        names = ("points_vehicle", "covariances", "labels")
+        return Detections(
+            self.t, *(np.concatenate([getattr(of, name) for of in (self, other)]) for name in names)
+        )
+
 
 @dataclass(frozen=True)
 class SensorInfo:

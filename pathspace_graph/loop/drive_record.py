@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from math import nan
 from multiprocessing import current_process
@@ -18,14 +18,17 @@ from joblib.externals import loky
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_trying, solve_lap
 from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
 from pathspace_graph.errors import SingularSystemError
-from pathspace_graph.factors.arrays import Array, read_only
+from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.se2 import compose, path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.front_end.noise import NoiseLearner
+from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.variables import POSE
 from pathspace_graph.io.log import Detections
-from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.constellation import BEGINNING, Expected, SeenIn, find_return, revisit_of
+from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
@@ -55,7 +58,6 @@ def bend(poses: Array, known: Mapping[int, Array]) -> Array:
 
 WORKER_IDLE: Final = 600  # time with nothing to do after which the process that solves laps ends (s)
 WATCH_SECONDS: Final = 1.0  # at which a worker checks whether the process that started it is still there
-LATE: Final = "the batch of the lap was late"  # why a batch was given up in the end
 SOLVED: Final = 3.0  # distance from the optimum of a solved batch (joint sigmas): its marginal has the rest
 
 
@@ -97,7 +99,7 @@ class DriveRecord:
     def measured_late(self, cycle: int, detections: Detections) -> None:
         """Add detections to those of an earlier cycle, as they would be seen from its pose."""
         if self.unsolvable is None:
-            self._seen[cycle] = _together(self._seen[cycle], detections)
+            self._seen[cycle] = self._seen[cycle].with_others(detections)
 
     def estimated(self, state: State) -> None:
         """Add the newest pose, and its parameter on each curve while these are open."""
@@ -121,7 +123,7 @@ class DriveRecord:
 
     def seen(self, cycle: int, sensor: Array) -> Detections:
         """Return all detections of a cycle, corrected by the calibration (5,) of the sensor, or (0,)."""
-        seen = _together(self._noise.for_map(self._seen[cycle]), self._orange[cycle])
+        seen = self._noise.for_map(self._seen[cycle]).with_others(self._orange[cycle])
         twists = np.tile(self._motions[cycle].odometry.twist, (len(seen.labels), 1))
         return replace(seen, points_vehicle=corrected(seen.points_vehicle, twists, sensor))
 
@@ -129,6 +131,38 @@ class DriveRecord:
         """Return the recurrence of the path driven, if odometry alone says that the lap is over."""
         found = find_recurrence(self._reckoned, self.settings)
         return found if is_worth_trying(found, self.settings) else None
+
+    def seen_in(self, sensor: Array) -> SeenIn:
+        """Return the detections of some cycles, corrected by the calibration (5,) of the sensor, or (0,)."""
+
+        def seen_in(cycles: IntArray) -> DetectionColumns:
+            chosen = cycles.tolist()
+            twists = np.array([self._motions[k].odometry.twist for k in chosen]).reshape(-1, POSE)
+            seen = [self._seen[k].with_others(self._orange[k]) for k in chosen]
+            table = DetectionColumns.of(seen, twists=twists)
+            known = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
+            table = replace(table, cycle=cycles[table.cycle], covariance=known.covariances)
+            table.correct(sensor)
+            return table
+
+        return seen_in
+
+    def return_to_beginning(self, calibration: Array, sensor: Array) -> Recurrence | None:
+        """Return the lap that has been driven, if the newest cones lie on those of the drive's beginning."""
+        poses, closing = unwrap(self.poses), self.settings.closing
+        length = float(path_lengths(poses)[-1])
+        last, expected = min(length - closing.min_path, BEGINNING), Expected.after(length, closing)
+        found = find_return(self.seen_in(sensor), poses, last, expected, self.settings.growth)
+        if found is None or not found[0].is_sure:
+            return None
+        return self.recurrence_by(revisit_of(found[0], poses, found[1], len(poses) - 1), calibration)
+
+    def recurrence_by(self, revisit: Revisit, calibration: Array) -> Recurrence:
+        """Return the recurrence of the drive whose later pose was measured in the frame of an earlier one."""
+        chain = chained(self.stamps, self._noise.motions_of_lap(self._motions), self.settings.odometry)
+        driven = path_lengths(chain.dead_reckoned(calibration))
+        lap = float(driven[revisit.later] - driven[revisit.earlier] - revisit.local[0])
+        return Recurrence(driven, lap, revisits=(revisit,))
 
     def recurrence_since(self, label: int, u: float) -> Recurrence:
         """Return the recurrence of the path driven since the vehicle was beside a place (m) of a boundary."""
@@ -148,11 +182,11 @@ class DriveRecord:
         if self._prepared and self.unsolvable is None:
             _submit(_nothing)
 
-    def closed_map(self, smoother: CurveSmoother) -> ClosedMap:
-        """Return the map that has just been closed, with the poses of all cycles in its frame."""
-        state = smoother.map.state
+    def closed(self, smoother: CurveSmoother) -> Array:
+        """Keep the poses (P, 3) of all cycles as they are after the loop has closed, and return them."""
         poses = unwrap(np.concatenate([self.poses[: smoother.first_cycle], smoother.variables.poses]))
-        return ClosedMap(state.splines, poses, state.variables.calibrations.copy())
+        self.replaced(poses, np.zeros((0, 3)))
+        return poses
 
     def lap(self, first_kept: int, start: ClosedMap | Recurrence, settings: MapperSettings) -> OpenLap:
         """Return the lap; the priors of its calibrations are those of the settings, which may be wide."""
@@ -163,13 +197,19 @@ class DriveRecord:
         return OpenLap(settings, chain, table, first_kept, start)
 
 
-def _together(a: Detections, b: Detections) -> Detections:
-    names = ("points_vehicle", "covariances", "labels")
-    return Detections(a.t, *(np.concatenate([getattr(a, name), getattr(b, name)]) for name in names))
-
-
 def _extended(known: Array, newest: Array) -> Array:
     return read_only(np.concatenate([known, newest[None]]))
+
+
+@dataclass(frozen=True)
+class Unsolved:
+    """Why there is no marginal of a lap."""
+
+    reason: str
+    is_final: bool = True  # whether another attempt, after more of the drive, would fail as well
+
+
+LATE: Final = Unsolved("the batch of the lap was late")
 
 
 class LapBatch:
@@ -199,22 +239,23 @@ class LapBatch:
         if not future.done() and not future.cancel():
             _end_worker()
 
-    def marginal(self, timeout: float) -> LapMarginal | str | None:
+    def marginal(self, timeout: float) -> LapMarginal | Unsolved | None:
         """Return the solution, or why there is none, or None if it is not there after a time (s)."""
         try:
             solved = self.send().result(timeout)
         except TimeoutError:
             return None
         except SingularSystemError as error:
-            return str(error)
+            return Unsolved(str(error), is_final=False)
         except BrokenProcessPool:
-            return "the process of the batch has died"
+            return Unsolved("the process of the batch has died")
         except Exception as error:  # a vehicle drives on, whatever has failed there
-            return " ".join(f"the batch of the lap has failed: {type(error).__name__}: {error}".split())
+            failed = f"the batch of the lap has failed: {type(error).__name__}: {error}"
+            return Unsolved(" ".join(failed.split()))
         if solved is None:
-            return "the detections are against the loop"
+            return Unsolved("the detections are against the loop", is_final=False)
         nearly = solved.convergence.converged or solved.convergence.gradient < SOLVED
-        return solved if nearly else "the batch of the lap has not converged"
+        return solved if nearly else Unsolved("the batch of the lap has not converged", is_final=False)
 
 
 def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:

@@ -153,10 +153,10 @@ class MapRepair:
         """Return whether the batch that is under way repairs a map, rather than closing it."""
         return bool(self._stretches)
 
-    def end(self, marginal: LapMarginal | str) -> str:
+    def end(self, marginal: LapMarginal | None) -> str:
         """End an attempt; return the notice of a map that explains the contradictions, or an empty one."""
         stretches, self._stretches = self._stretches, []
-        if isinstance(marginal, str):
+        if marginal is None:
             return ""
         now, explained = marginal.poses[len(marginal.poses) - len(self._lap) :], [0, 0]
         for stretch in stretches:

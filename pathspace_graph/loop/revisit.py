@@ -1,8 +1,8 @@
 """Places that are met again while the loop is open: by another way, or after a lap, by its shape.
 
-A lap closes where it began (`mapping.registration`). The second round of a skidpad does not, nor does a lane
-that leads into a circuit. There the cones of the last metres are laid on those seen in the earlier pass
-(`front_end.scan_matching`), which gives a factor between two poses (`graph.relative:Revisit`). The open map
+A lap closes where it began. The second round of a skidpad does not, nor does a lane that leads into a
+circuit. There the cones of the last metres are laid on those of the earlier pass
+(`mapping.constellation`), which gives a factor between two poses (`graph.relative:Revisit`). The open map
 is optimized with it as with a closed loop, but goes on to grow.
 
 After a long lap the vehicle may be anywhere along the first few hundred metres, and the detections of the
@@ -17,21 +17,18 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.batch.start import unwrap
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import (
     compose,
     inverse,
     left_of,
     path_lengths,
-    relative,
-    rotation,
     rotations,
-    to_map,
     to_vehicle,
     wrap_angle,
 )
-from pathspace_graph.front_end.scan_matching import ERRORS, REACHES, RecentDetections, match
 from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.mapping.constellation import NEARBY, lay_newest, revisit_of
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import (
@@ -59,12 +56,6 @@ RETURN: Final = 30.0  # least length of the path between both passes (m)
 RADIUS: Final = 4.0  # largest distance of both passes, as the map has them (m)
 DIVERGED: Final = 8.0  # distance that the ways to the place must have had, as seen from the place (m)
 WAY, WAY_STEP = 100.0, 4.0  # length of the ways that are compared, and the step at which they are (m)
-NEWEST: Final = 8.0  # length of the newest path whose detections are laid on earlier ones (m)
-ABOUT: Final = 12.0  # length of the earlier path, on each side of the place, that these are laid on (m)
-MIN_DETECTIONS: Final = 25
-MIN_SHARE: Final = 0.8  # least share of the detections that lie on earlier ones
-MOST_MISFIT: Final = 3.0  # largest mean square of their whitened distances
-MOST_DRIFT: Final = 1.2  # from where the map has the place (m): cones of a row are some 3 m apart
 
 
 class Revisits:
@@ -100,33 +91,15 @@ class Revisits:
 
     def _measured(self, poses: Array, place: int) -> Revisit | None:
         """Return the oldest pose of the window, as seen from the keyframe next to an earlier place."""
-        smoother, stations = self._smoother, path_lengths(poses)
-        newest = stations > stations[-1] - NEWEST
-        earlier, _ = self._scan(np.abs(stations - stations[place]) < ABOUT, poses)
-        seen, variances = self._scan(newest, poses)
-        if min(len(seen), len(earlier)) < MIN_DETECTIONS:
-            return None
-        known = RecentDetections()
-        known.add(0.0, earlier, np.zeros((len(earlier), 2, len(ERRORS))), np.zeros(3))
-        found = match(known, to_vehicle(seen, poses[-1:]), variances, poses[-1], REACHES)
-        share = found.matched / len(found.is_matched)
-        drift = float(np.hypot(*(found.pose - poses[-1])[:2]))
-        if not (found.is_certain and share > MIN_SHARE and found.misfit < MOST_MISFIT and drift < MOST_DRIFT):
+        smoother = self._smoother
+        seen_in = self._record.seen_in(smoother.variables.sensor)
+        laid = lay_newest(seen_in, poses, place, NEARBY, smoother.map.settings.growth)
+        if laid is None or not laid.is_likely:
             return None
         keyframes = np.array(smoother.keyframe_cycles)
-        first, later = int(keyframes[np.abs(keyframes - place).argmin()]), smoother.first_cycle
-        information = found.information / newest.sum()  # the errors of a cone stay while it is passed
-        moved = compose(found.pose, relative(poses[-1], poses[later]))
-        return measured_revisit((first, poses[first]), (later, moved), found.pose, information)
-
-    def _scan(self, of_cycles: BoolArray, poses: Array) -> tuple[Array, Array]:
-        """Return all detections (m, 2) of cycles (P,), map frame, and the variance (m,) of a coordinate."""
-        points, variances = [np.zeros((0, 2))], [np.zeros(0)]
-        for cycle in np.flatnonzero(of_cycles).tolist():
-            seen = self._record.seen(cycle, self._smoother.variables.sensor)
-            points.append(to_map(seen.points_vehicle, poses[cycle][None]))
-            variances.append(0.5 * np.trace(seen.covariances, axis1=1, axis2=2))
-        return np.concatenate(points), np.concatenate(variances)
+        return revisit_of(
+            laid, poses, int(keyframes[np.abs(keyframes - place).argmin()]), smoother.first_cycle
+        )
 
 
 def earlier_pass(poses: Array) -> int | None:
@@ -157,22 +130,6 @@ def have_parted(poses: Array, stations: Array, place: int) -> bool:
         points = np.column_stack([np.interp(at, stations, poses[:, k]) for k in range(2)])
         ways.append(to_vehicle(points, poses[cycle][None]))
     return bool((np.hypot(*(ways[0] - ways[1]).T) > DIVERGED).any())
-
-
-def measured_revisit(
-    earlier: tuple[int, Array], later: tuple[int, Array], centre: Array, information: Array
-) -> Revisit:
-    """Return the pose of a later cycle in the frame of an earlier one, each a cycle and its pose (3,).
-
-    The information (3, 3) is about a pose at `centre` (3,), in the map frame; the later pose moves with it.
-    """
-    (first, frame), (last, pose) = earlier, later
-    arm, change = pose[:2] - centre[:2], np.eye(3)
-    change[:2, 2] = -arm[1], arm[0]
-    change[:2] = rotation(frame[2]).T @ change[:2]
-    back = np.linalg.inv(change)
-    root = np.linalg.cholesky(back.T @ information @ back).T
-    return Revisit(first, last, relative(frame, pose), np.asarray(root))
 
 
 # --- the recognition of a place --------------------------------------------------------------------------

@@ -8,31 +8,35 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
-from pathspace_graph.batch.start import Recurrence
+from pathspace_graph.batch.start import Recurrence, unwrap
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.constellation import relative_pose
 from pathspace_graph.mapping.motion import inflate_priors
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import near_start
+from pathspace_graph.mapping.registration import BEGINNING, RefinedMotion, near_start
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.spline.boundary import boundaries_cross
 from pathspace_graph.spline.bspline import BSpline
 
 from .closing import go_on_from, hold_gauge
-from .drive_record import LATE, DriveRecord, LapBatch
+from .drive_record import LATE, DriveRecord, LapBatch, Unsolved
 from .map_repair import MapRepair
 from .relocalization import FOUND, KnownLoop, Search, evidence_of, start_anew
 from .revisit import Revisits, recognize
 
 OWN_PRIOR: Final = "the map goes on from the window's own prior"  # begins the notice where no batch came
+STAYS_OPEN: Final = "the loop stays open"  # begins the notice where a batch did not agree
 LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cycle before it was
 REST: Final = 10.0  # distance for which the loop is left as it is after a failure (m)
 RECOGNITION_INTERVAL: Final = 10.0  # least distance of two attempts to recognize the place (m along the path)
 RECURRENCE_INTERVAL: Final = 5.0  # the same for attempts to find a lap in the odometry alone
+RETURN_CYCLES: Final = 10  # least number of cycles of two attempts to find the beginning again by its cones
 LONG_PATH: Final = 1000.0
 """Path from which on both distances grow with it (m), as the cost of an attempt does."""
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
@@ -41,10 +45,6 @@ NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
 """Reason of the health there, and notice of the first cycle."""
 LEARNED: Final = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
-
-
-class LoopRefusedError(Exception):
-    """The batch of a lap speaks against its closing; `FixedLagMapper.update` takes the closing back."""
 
 
 class TrackLoop:
@@ -72,13 +72,9 @@ class TrackLoop:
         self._inflated = self.settings  # with the priors of the calibrations as they are now
         self._settled: float | None = None  # path driven (m) when the closed map was last replaced
         self._closing_tried = 0.0
+        self._return_tried, self._return_cycle, self._loop_rests = 0.0, 0, 0.0
         self._loop_tried, self._recognition_tried = 0.0, 0.0  # paths (m) at which they are tried next
         self._resumes = 0.0
-
-    @property
-    def is_hypothesis(self) -> bool:
-        """Return whether the loop has closed, and the batch of its lap has not confirmed that yet."""
-        return self.closed and self._lap_batch is not None and self._settled is None
 
     @property
     def is_searching(self) -> bool:
@@ -102,7 +98,9 @@ class TrackLoop:
         """Return whether it is time to register the newest detections with the beginning of an open loop."""
         settings, length = self.settings.closing, self._path.length
         newest = self._smoother.variables.poses[-1]
-        if self.closed or self._rests or not near_start(self._path, newest, settings):
+        if self.closed or self._rests or self._lap_batch is not None:
+            return False
+        if not near_start(self._path, newest, settings):
             return False
         if length - self._closing_tried < settings.check_interval:
             return False
@@ -164,13 +162,16 @@ class TrackLoop:
         """
         if closes:
             self._closes()
+            self.corrected_poses = self.record.closed(self._smoother)
             self._boundaries_cross = self._crosses()
-            return None, self._solve_lap()
+            return None, f"{OWN_PRIOR}: {self.record.unsolvable}"
         self.record.estimated(self._smoother.map.state)
         if self._rests:
             return None, ""
         if not self.closed and self._path.length > self.settings.closing.min_path:
             self.record.prepare()
+            if self._lap_batch is None:
+                self._try_return()
             if self._lap_batch is None:
                 self._try_loop()
         batch = self._lap_batch
@@ -208,7 +209,7 @@ class TrackLoop:
         """
         cycle, times = self._smoother.next_cycle - 1, self._smoother.times
         period = float(np.ptp(times[-2:]))
-        outcome: LapMarginal | str | None = LATE
+        outcome: LapMarginal | Unsolved | None = LATE
         if cycle <= batch.last:
             outcome = batch.marginal(max(min(period, LONGEST_WAIT) - spent, 0.0))
         else:
@@ -222,22 +223,25 @@ class TrackLoop:
         self._batch_ends.append(cycle)
         return self._take(outcome)
 
-    def _take(self, marginal: LapMarginal | str) -> tuple[Array | None, str]:
+    def _take(self, outcome: LapMarginal | Unsolved) -> tuple[Array | None, str]:
         repairs, smoother = self.map_repair.is_tried(), self._smoother
-        notice = self.map_repair.end(marginal) if repairs else ""
-        if isinstance(marginal, str):
-            return None, f"{OWN_PRIOR}: {marginal}" if self.closed and not repairs else ""
-        if repairs and (not notice or self._crosses(marginal.splines) > self._boundaries_cross):
-            return None, ""
-        if marginal.objection and not repairs:
+        solved = outcome if isinstance(outcome, LapMarginal) else None
+        notice = self.map_repair.end(solved) if repairs else ""
+        if isinstance(outcome, Unsolved):
             if self.closed:
-                raise LoopRefusedError(marginal.objection)
-            return None, f"the loop stays open: {marginal.objection}"
+                return None, ""
+            if outcome.is_final:
+                self.record.give_up(outcome.reason)
+            return None, f"{STAYS_OPEN}: {outcome.reason}"
+        if repairs and (not notice or self._crosses(outcome.splines) > self._boundaries_cross):
+            return None, ""
+        if outcome.objection and not repairs:
+            return None, f"{STAYS_OPEN}: {outcome.objection}"
         if not self.closed:
             self._closes()
-        self.corrected_poses, self.lap_seconds = marginal.poses, marginal.seconds
-        jump, self._settled = go_on_from(smoother, marginal), self._path.length
-        self.record.replaced(marginal.poses[: marginal.first_kept], smoother.variables.poses)
+        self.corrected_poses, self.lap_seconds = outcome.poses, outcome.seconds
+        jump, self._settled = go_on_from(smoother, outcome), self._path.length
+        self.record.replaced(outcome.poses[: outcome.first_kept], smoother.variables.poses)
         self._boundaries_cross = self._crosses()
         return jump, notice
 
@@ -263,20 +267,6 @@ class TrackLoop:
         self.closed = True
         self._smoother.settle()
 
-    def _solve_lap(self) -> str:
-        """Send the lap that has just closed to its batch; return a notice if it cannot be solved."""
-        smoother, record = self._smoother, self.record
-        closed = record.closed_map(smoother)
-        self.corrected_poses = closed.poses
-        record.replaced(closed.poses, np.zeros((0, 3)))
-        cones = len(smoother.map.state.map_keys) / self.settings.spline.size_share
-        if cones > self.settings.open_lap.max_cones:
-            record.give_up("the lap has too many cones for a batch")
-        if record.unsolvable is not None:
-            return f"{OWN_PRIOR}: {record.unsolvable}"
-        self._begin_batch(closed)
-        return ""
-
     def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
         """Send the lap to its batch, which begins at a map that has just been closed, or at odometry.
 
@@ -294,14 +284,51 @@ class TrackLoop:
         due = min(max([due, *recorded]), last + 1)
         self._lap_batch = LapBatch(lap, smoother.times[-1], due, last)
 
+    def _try_return(self) -> None:
+        """Send the lap to a batch where the newest cones lie on those of the beginning."""
+        smoother, length = self._smoother, self._path.length
+        due = length >= self._return_tried or smoother.next_cycle >= self._return_cycle
+        if not due or length < self._loop_rests or not self._is_solvable():
+            return
+        self._return_tried = length + self.settings.closing.check_interval
+        self._return_cycle = smoother.next_cycle + RETURN_CYCLES
+        variables = smoother.variables
+        found = self.record.return_to_beginning(variables.calibration, variables.sensor)
+        if found is not None:
+            self._close_by_batch(found)
+
+    def registered(self, found: RefinedMotion) -> None:
+        """Send the lap to a batch: the newest detections fit the beginning of the curves after a motion."""
+        smoother, record = self._smoother, self.record
+        poses = unwrap(np.concatenate([record.poses[: smoother.first_cycle], smoother.variables.poses]))
+        newest, beginning = poses[-1:].copy(), path_lengths(poses) < BEGINNING
+        found.motion.move(newest)
+        earlier = int(np.hypot(*(poses[beginning, :2] - newest[0, :2]).T).argmin())
+        information = np.asarray(np.linalg.inv(found.covariance), np.float64)
+        ends = (earlier, poses[earlier]), (len(poses) - 1, newest[0])
+        revisit = relative_pose(*ends, newest[0], information)
+        self._close_by_batch(record.recurrence_by(revisit, smoother.variables.calibration))
+
+    def _close_by_batch(self, recurrence: Recurrence) -> None:
+        """Send the lap to a batch, which closes the loop if it agrees; until then the map stays open."""
+        self._loop_rests = self._path.length + self.settings.open_lap.retry
+        self._begin_batch(recurrence)
+
+    def _is_solvable(self) -> bool:
+        """Return whether the lap can be solved as a batch; a lap of too many cones is given up."""
+        boundaries = self._smoother.map.state.boundaries.values()
+        if sum(len(boundary.cone_parameters) for boundary in boundaries) > self.settings.open_lap.max_cones:
+            self.record.give_up("the lap has too many cones for a batch")
+        return self.record.unsolvable is None
+
     def _try_loop(self) -> None:
         """Send the lap to a batch from odometry where it is over, but the registration closes no loop."""
         boundaries, length = self._smoother.map.state.boundaries, self._path.length
-        if length < self._loop_tried or set(boundaries) != set(BOUNDARIES):
+        if length < max(self._loop_tried, self._loop_rests) or set(boundaries) != set(BOUNDARIES):
             return
         apart = max(length / LONG_PATH, 1.0)
         self._loop_tried = length + RECURRENCE_INTERVAL * apart
-        if self.record.unsolvable is not None:
+        if not self._is_solvable():
             return
         recurrence = self.record.recurrence()
         if recurrence is None and length >= self._recognition_tried:
@@ -309,8 +336,7 @@ class TrackLoop:
             place = recognize(self._smoother)
             recurrence = None if place is None else self.record.recurrence_since(place.label, place.u)
         if recurrence is not None:
-            self._loop_tried = length + self.settings.open_lap.retry
-            self._begin_batch(recurrence)
+            self._close_by_batch(recurrence)
 
     # --- a vehicle that is lost --------------------------------------------------------------------------
 

@@ -1,7 +1,7 @@
 """Tables of detections: one row for each detected cone, with what an estimator has decided about it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Self
 
@@ -110,6 +110,11 @@ class DetectionColumns:
     def covariances_map(self, rows: IntArray | slice, variables: Variables) -> Array:
         """Return the covariances (m, 2, 2) in m^2 in the map frame, by the poses of their cycles."""
         return rotated(self.covariance[rows], variables.poses_at(self.cycle[rows])[:, 2])
+
+    def where(self, rows: IntArray) -> Self:
+        """Return the table of the given rows."""
+        chosen = {column: vars(self)[column][rows] for column in self._columns()}
+        return replace(self, **chosen)
 
     def keep_from(self, cycle: int) -> None:
         """Remove the detections of all cycles before `cycle`."""

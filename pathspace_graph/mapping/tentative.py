@@ -126,6 +126,28 @@ def _merged(
     )
 
 
+@compiled
+def _merged_in_turn(points: Array, covariances: Array, gate: tuple[float, float, float]) -> Tracks:
+    """Return the columns of tracks to which detections (m, 2) are added one after another."""
+    tracks: Tracks = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp), np.zeros(0))
+    for k in range(len(points)):
+        tracks = _merged(tracks, points[k : k + 1], covariances[k : k + 1], 0.0, gate)
+    return tracks
+
+
+def merged_in_turn(
+    points: Array, covariances: Array, settings: GrowthSettings
+) -> tuple[Array, Array, IntArray]:
+    """Return points (n, 2), information (n, 2, 2) and numbers (n,) of detections of cones.
+
+    Detections (m, 2) with covariances (m, 2, 2), of one label, are merged one after another as
+    `TentativeTracks.add` does.
+    """
+    gate = (settings.merge_radius, MERGE_MOST, MERGE_CHI)
+    places, information, counts, _ = _merged_in_turn(points, covariances, gate)
+    return places, information, counts
+
+
 def add_by_label(
     tracks: Mapping[int, TentativeTracks], labels: IntArray, points: Array, covariances: Array, t: float
 ) -> None:

@@ -20,7 +20,7 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.loop.closing import SIGMA_STEP, apply_correspondences, simplify
-from pathspace_graph.loop.track_loop import LoopRefusedError, TrackLoop
+from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.motion import known_noise, predict
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import is_lost, is_within_reach, passes_start, register
@@ -37,11 +37,6 @@ from .growth import Growth
 ROAD: Final = 10.0  # length of both boundaries beside a lost vehicle that make a road (m)
 
 PLACED: Final = 20.0  # path for which a vehicle stays so certain that only detections can close the loop (m)
-
-
-def careful(process: partial[CycleResult]) -> partial[CycleResult]:
-    """Return the call that processes the same cycle but leaves the loop as it is."""
-    return partial(process.func, *process.args, careful=True)
 
 
 @at_scale
@@ -113,17 +108,10 @@ class FixedLagMapper(MapperEstimate):
             cycle = replace(cycle, odometry=unused.followed_by(cycle.odometry))
         again = partial(self._process, cycle, factors)
         try:
-            try:
-                result = again()
-            except LoopRefusedError as refusal:
-                again = careful(again)
-                self.recovery.undo(self, self.front_end.gate, instead=careful)
-                result = again()
-                notice = f"the loop is open again: {refusal}"
-                result = replace(result, notice="; ".join(filter(None, (notice, result.notice))))
+            result = again()
         except Exception as error:  # a vehicle drives on, whatever has failed
             return cycle.counted(self._without(cycle, factors, error))
-        self.recovery.called(again, is_doubtful=self.loop.is_hypothesis)
+        self.recovery.called(again)
         self._unused = unused if cycle.late else None
         return cycle.counted(result)
 
@@ -277,6 +265,9 @@ class FixedLagMapper(MapperEstimate):
         found = register(track, times, covariance, self.path.beginning, settings)
         if found is None or not passes_start(track.state, self.path, found.motion):
             return False
+        if self.loop.record.unsolvable is None:
+            self.loop.registered(found)
+            return False  # the map stays open until the batch of the lap agrees
         apply_correspondences(smoother, found)
         self.loop.record.bent(smoother.solve_loop(settings.iterations, SIGMA_STEP), smoother)
         return True

@@ -12,7 +12,8 @@ from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, relative, rotation
 from pathspace_graph.io.log import Log
-from pathspace_graph.loop.revisit import Revisits, earlier_pass, measured_revisit
+from pathspace_graph.loop.revisit import Revisits, earlier_pass
+from pathspace_graph.mapping.constellation import relative_pose
 from pathspace_graph.run import CycleResult
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
@@ -68,7 +69,7 @@ def test_the_information_moves_with_the_pose() -> None:
     spread = rng.normal(size=(3, 3)) * np.array([[1e-2], [1e-2], [1e-3]])
     covariance = spread @ spread.T
     later = compose(centre, relative(centre, centre + arm))
-    revisit = measured_revisit((3, frame), (9, later), centre, np.linalg.inv(covariance))
+    revisit = relative_pose((3, frame), (9, later), centre, np.linalg.inv(covariance))
     np.testing.assert_allclose(revisit.local, relative(frame, later))
     samples = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
     moved = np.empty_like(samples)

@@ -1,0 +1,318 @@
+"""Constellations: the newest cones, merged and without identity, laid on earlier ones.
+
+All pairs of a new and an earlier cone of one label vote for the motion that lays one on the other. The places
+with most votes are refined on a sum of capped squares. The place that costs least is sure if nearly all cones
+lie on earlier ones and the next place costs much more: cones stand at regular distances, so a few of them fit
+in many places. A sure place is a relative pose of two cycles, the measurement of every return.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+from typing import Final, Self
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.kernels import compiled
+from pathspace_graph.factors.se2 import (
+    compose,
+    left_of,
+    path_lengths,
+    relative,
+    rotated,
+    rotation,
+    to_map,
+    to_vehicle,
+    wrap_angle,
+)
+from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.settings.online import ClosingSettings, GrowthSettings
+
+from .detections import DetectionColumns
+from .registration import HEADING
+from .tentative import merged_in_turn
+
+SIGMA: Final = 0.25  # of a cone's place besides its covariance: errors of the sensor that change slowly (m)
+GATE: Final = 9.0  # cap of a cone's square (sigmas^2); beyond it, the cone lies on no other
+GATES: Final = (4.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # factors of the cap in the steps of the refinement
+REGULAR: Final = (1e-2, 1e-2, 1.0)  # information added in a step, so that few cones still give one
+CELL: Final = 0.5  # of the votes (m)
+TURN: Final = 0.05  # step of the headings that are tried (rad)
+APART: Final = 1.0  # least distance of two different places (m)
+PLACES: Final = 10  # most places of each heading, and a third of the most that are refined
+RANGE: Final = 12.0  # farthest detections that are merged (m)
+NEWEST: Final = (10.0, 40.0)  # least and most of the newest path whose cones are laid on earlier ones (m)
+BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
+MIN_CONES: Final = 8
+MIN_SHARE: Final = 0.8  # least share of the cones that lie on earlier ones, by their information
+MISFIT: Final = 2.5  # most mean capped square of the cones: that of cones that agree is 2 at most
+ODDS: Final = 20.0  # least difference of cost to the next place: twice the logarithm of the odds
+ODDS_NEARBY: Final = 6.0  # the same where the place is known to a metre
+SIGHTINGS: Final = 3  # least number of detections of a cone
+BEGINNING: Final = 40.0  # length of the beginning of a drive that closes a lap (m)
+TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
+SIGMA_TURN: Final = 0.1  # its standard deviation (rad)
+SAME_ROAD: Final = 2.5  # largest distance of both passes across their road, by the cones (m)
+SAME_HEADING: Final = 0.5  # largest angle between both passes, by the cones (rad)
+LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES))
+
+
+Cones = tuple[Array, Array, IntArray]
+"""Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
+NO_CONES: Final[Cones] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
+
+
+@dataclass(frozen=True, eq=False)
+class Constellation:
+    """Cones in one frame."""
+
+    points: Array  # (n, 2) in m
+    covariances: Array  # (n, 2, 2) in m^2
+    labels: IntArray  # (n,)
+
+    @classmethod
+    def of(cls, table: DetectionColumns, poses: Array, settings: GrowthSettings) -> Self:
+        """Merge detections, the sharpest first, to cones in the map frame, by the poses (P, 3) of cycles."""
+        point = table.point
+        rows = np.flatnonzero((table.label != UNKNOWN) & (np.hypot(*point.T) < RANGE))
+        rows = rows[np.argsort(np.trace(table.covariance[rows], axis1=1, axis2=2), kind="stable")]
+        at = poses[table.cycle[rows]]
+        points, covariances = to_map(point[rows], at), rotated(table.covariance[rows], at[:, 2])
+        labels, found = table.label[rows], [NO_CONES]
+        for label in np.unique(labels).tolist():
+            own = labels == label
+            places, information, counts = merged_in_turn(points[own], covariances[own], settings)
+            seen = counts >= SIGHTINGS
+            covariance = np.asarray(np.linalg.inv(information[seen]), np.float64)
+            found.append((places[seen], covariance, np.full(len(covariance), label)))
+        return cls(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+    @property
+    def cones(self) -> Cones:
+        return self.points, self.covariances, self.labels
+
+    def seen_from(self, pose: Array) -> "Constellation":
+        """Return the cones in the frame of a pose (3,)."""
+        turned = rotated(self.covariances, np.full(len(self.labels), -pose[2]))
+        return Constellation(to_vehicle(self.points, pose[None]), turned, self.labels)
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """Pose that lays cones, which are in its frame, on earlier ones."""
+
+    pose: Array  # (3,) map frame
+    information: Array  # (3, 3) about it, from the cones that lie on others
+    cost: float  # sum of the capped squares of the cones and of the prior
+    count: int  # number of cones
+    share: float  # share of the cones that lie on others, by their information
+    odds: float  # cost of the next place less that of this one; infinite if there is none
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether nearly all cones agree, and no other place is nearly as good."""
+        return self.agrees and self.odds >= ODDS
+
+    @property
+    def is_likely(self) -> bool:
+        """Whether nearly all cones agree, and no other place is as good; enough for a place that is known."""
+        return self.agrees and self.odds >= ODDS_NEARBY
+
+    @property
+    def agrees(self) -> bool:
+        """Whether nearly all of enough cones lie on earlier ones."""
+        return self.count >= MIN_CONES and self.share >= MIN_SHARE and self.cost <= MISFIT * self.count
+
+
+def lay(
+    seen: Constellation, known: Constellation, mean: Array, information: Array, reach: tuple[float, float]
+) -> Laid | None:
+    """Lay cones on known ones, in the frames of a vehicle and of the map; None where they are too few.
+
+    The pose is searched within a `reach` (m, rad) of its `mean` (3,). The square of the difference from the
+    mean, by its `information` (3, 3), is capped as well, since odometry may have failed.
+    """
+    if min(len(seen.labels), len(known.labels)) < MIN_CONES:
+        return None
+    pose, about, (cost, share, odds) = _laid(seen.cones, known.cones, mean, information, reach, LIMITS)
+    return Laid(pose, about, cost, len(seen.labels), share, odds) if np.isfinite(cost) else None
+
+
+@compiled
+def _laid(
+    seen: Cones,
+    known: Cones,
+    mean: Array,
+    prior: Array,
+    reach: tuple[float, float],
+    limits: tuple[float, ...],
+) -> tuple[Array, Array, tuple[float, float, float]]:
+    """Return the pose (3,) of `lay`, the information (3, 3) about it, and its cost, share and odds."""
+    apart, places = limits[4], int(limits[5])
+    tried, found = list[Array](), []
+    for start in _starts(seen, known, mean, reach, limits):
+        off = [(np.hypot(*(start - other)[:2]), abs(start[2] - other[2])) for other in tried]
+        if any(distance < apart and turn < 1.5 * limits[3] for distance, turn in off):
+            continue
+        tried.append(start)
+        found.append(_refined(seen, known, start, mean, prior, limits))
+        if len(tried) == 3 * places:
+            break
+    if not found:
+        return mean, np.zeros((3, 3)), (inf, 0.0, 0.0)
+    pose, information, cost, share = min(found, key=lambda one: one[2])
+    others = [one[2] for one in found if np.hypot(*(one[0] - pose)[:2]) > apart]
+    return pose, information, (cost, share, min(others, default=inf) - cost)
+
+
+def _starts(
+    seen: Cones, known: Cones, mean: Array, reach: tuple[float, float], limits: tuple[float, ...]
+) -> list[Array]:
+    """Return poses (3,), most votes first: each pair of cones votes for a cell and the eight around it."""
+    _, _, size, step, _, places = limits
+    i, j = np.nonzero(seen[2][:, None] == known[2])
+    half, turns, starts = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step)), []
+    for turn in range(-turns, turns + 1):
+        heading = mean[2] + turn * step
+        c, s = np.cos(heading), np.sin(heading)
+        x, y = seen[0][i].T
+        move = np.column_stack([c * x - s * y, s * x + c * y])
+        cell = np.floor((known[0][j] - move - mean[:2]) / size + 0.5).astype(np.intp) + half
+        cell = cell[((cell > 0) & (cell < 2 * half)).all(axis=1)]
+        votes = np.zeros((2 * half + 1, 2 * half + 1), np.intp)
+        for a in (-1, 0, 1):
+            for b in (-1, 0, 1):
+                np.add.at(votes, (cell[:, 0] + a, cell[:, 1] + b), 1)
+        best = np.argsort(-votes, axis=None, kind="stable")[: int(places)]
+        for number in best[votes.ravel()[best] > 0].tolist():
+            a, b = divmod(number, 2 * half + 1)
+            place = mean[0] + (a - half) * size, mean[1] + (b - half) * size
+            starts.append((votes[a, b], np.array([*place, heading])))
+    return [start for _, start in sorted(starts, key=lambda one: -one[0])]
+
+
+def _refined(
+    seen: Cones, known: Cones, start: Array, mean: Array, prior: Array, limits: tuple[float, ...]
+) -> tuple[Array, Array, float, float]:
+    """Return the pose (3,) after Gauss-Newton steps, its information (3, 3), its cost and its share."""
+    sigma, gate, pose = limits[0], limits[1], start
+    for factor in (*GATES, None):
+        turn, limit = rotation(pose[2]), gate * (factor or 1.0)
+        arm = seen[0] @ turn.T
+        off = (arm + pose[:2])[:, None] - known[0]
+        weight = np.linalg.inv((turn @ seen[1] @ turn.T)[:, None] + known[1] + sigma**2 * np.eye(2))
+        square = np.einsum("mni,mnij,mnj->mn", off, weight, off)
+        square[seen[2][:, None] != known[2]] = np.inf
+        rows, j = np.arange(len(arm)), square.argmin(axis=1)
+        square, on = square[rows, j], square[rows, j] < limit
+        weight, off = weight[rows, j][on], off[rows, j][on]
+        by = np.zeros((on.sum(), 2, 3))
+        by[:, 0, 0] = by[:, 1, 1] = 1.0
+        by[:, :, 2] = left_of(arm[on])
+        if factor is None:
+            break
+        weight = weight * ((1.0 - square[on] / limit) ** 2)[:, None, None]
+        hessian = np.einsum("mia,mij,mjb->ab", by, weight, by) + np.diag(REGULAR)
+        pose = pose - np.linalg.solve(hessian, np.einsum("mia,mij,mj->a", by, weight, off))
+    away = pose - mean
+    away[2] = wrap_angle(away[2])
+    cost = np.minimum(square, gate).sum() + min(away @ prior @ away, gate)
+    sharp = 1.0 / (sigma**2 + 0.5 * np.trace(seen[1], axis1=1, axis2=2))
+    information = np.einsum("mia,mij,mjb->ab", by, weight, by)
+    return pose, information, float(cost), float(sharp[on].sum() / sharp.sum())
+
+
+# --- passes of a drive -----------------------------------------------------------------------------------
+
+SeenIn = Callable[[IntArray], DetectionColumns]
+"""The detections of ascending cycles (k,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """How far from where the poses have it the newest pose may be, beside an earlier pass."""
+
+    radius: float  # largest distance (m)
+    turn: float  # largest angle (rad)
+    information: Array  # (3, 3) about the newest pose, map frame
+
+    @classmethod
+    def within(cls, radius: float, turn: float, sigmas: tuple[float, float, float]) -> Self:
+        """Expect a pose within standard deviations (m, m, rad)."""
+        return cls(radius, turn, np.diag(np.array(sigmas) ** -2.0))
+
+    @classmethod
+    def after(cls, length: float, closing: ClosingSettings) -> Self:
+        """Expect a pose that has drifted for some length (m)."""
+        radius = closing.radius + closing.drift * length
+        return cls.within(radius, TURNED, (0.5 * radius, 0.5 * radius, SIGMA_TURN))
+
+
+NEARBY: Final = Expected.within(4.0, 0.15, (1.0, 1.0, 0.05))
+"""Where laps have been aligned already, or an open road has another one beside it."""
+
+
+def find_return(
+    seen_in: SeenIn, poses: Array, last: float, expected: Expected, settings: GrowthSettings
+) -> tuple[Laid, int] | None:
+    """Lay the newest cones on those of an earlier pass; return how, and the cycle beside which they are.
+
+    The poses (P, 3) are those of all cycles up to the newest. The earlier pass was over when the path had its
+    `last` length (m). None where there is none, the cones are too few, or they lie beside another road.
+    """
+    earlier, newest = path_lengths(poses) < last, poses[-1]
+    alike = earlier & (np.cos(poses[:, 2] - newest[2]) > np.cos(HEADING))
+    away = np.where(alike, np.hypot(*(poses[:, :2] - newest[:2]).T), np.inf)
+    place = int(away.argmin())
+    if not away[place] < expected.radius:
+        return None
+    laid = lay_newest(seen_in, poses, place, expected, settings)
+    if laid is None:
+        return None
+    beside = to_vehicle(laid.pose[None, :2], poses[earlier])
+    at = int(np.hypot(*beside.T).argmin())
+    same_road = abs(beside[at, 1]) < SAME_ROAD and np.cos(laid.pose[2] - poses[at, 2]) > np.cos(SAME_HEADING)
+    return (laid, at) if same_road else None
+
+
+def lay_newest(
+    seen_in: SeenIn, poses: Array, place: int, expected: Expected, settings: GrowthSettings
+) -> Laid | None:
+    """Lay the cones of the newest metres on those about an earlier place, by the poses (P, 3) of all cycles.
+
+    The newest metres are as many as may have been driven again since the first pose, within `NEWEST`.
+    """
+    stations = path_lengths(poses)
+    length = float(np.clip(stations[place], *NEWEST))
+    first = int(stations.searchsorted(stations[-1] - length, side="right"))
+    old = np.flatnonzero(np.abs(stations[:first] - stations[place]) < length + BEYOND)
+    known = Constellation.of(seen_in(old), poses, settings)
+    seen = Constellation.of(seen_in(np.arange(first, len(poses))), poses, settings).seen_from(poses[-1])
+    return lay(seen, known, poses[-1], expected.information, (expected.radius, expected.turn))
+
+
+def revisit_of(laid: Laid, poses: Array, earlier: int, later: int) -> Revisit:
+    """Return the pose of a `later` cycle in the frame of an `earlier` one, where the newest has been laid.
+
+    The poses (P, 3) are those of all cycles; from the later cycle to the newest the drive is rigid.
+    """
+    moved = compose(laid.pose, relative(poses[-1], poses[later]))
+    return relative_pose((earlier, poses[earlier]), (later, moved), laid.pose, laid.information)
+
+
+def relative_pose(
+    earlier: tuple[int, Array], later: tuple[int, Array], centre: Array, information: Array
+) -> Revisit:
+    """Return the pose of a later cycle in the frame of an earlier one, each a cycle and its pose (3,).
+
+    The information (3, 3) is about a pose at `centre` (3,), in the map frame; the later pose moves with it.
+    """
+    (first, frame), (last, pose) = earlier, later
+    arm, change = pose[:2] - centre[:2], np.eye(3)
+    change[:2, 2] = -arm[1], arm[0]
+    change[:2] = rotation(frame[2]).T @ change[:2]
+    back = np.linalg.inv(change)
+    root = np.linalg.cholesky(back.T @ information @ back).T
+    return Revisit(first, last, relative(frame, pose), np.asarray(root, np.float64))
