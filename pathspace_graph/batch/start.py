@@ -23,7 +23,13 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, po
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.constellation import BEGINNING, NEARBY, Expected, find_return, revisit_of
+from pathspace_graph.mapping.constellation import (
+    NEARBY,
+    SeenIn,
+    find_return,
+    return_to_beginning,
+    revisit_of,
+)
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
 from pathspace_graph.mapping.registration import HEADING
@@ -276,24 +282,29 @@ def find_revisits(chain: LogOdometry, table: DetectionColumns, settings: MapperS
         if driven[newest] < due:
             continue
         so_far = poses[: newest + 1]
-        length = float(path_lengths(so_far)[-1])
-        due = driven[newest] + (INTERVAL / 3.0 if revisits else closing.check_interval)
-        last, expected = min(length - closing.min_path, BEGINNING), Expected.after(length, closing)
         if revisits:
-            last, expected = length - LAP_SHARE * lap, NEARBY
-        found = find_return(seen_in, so_far, last, expected, settings.growth)
-        if found is None:
+            due = driven[newest] + INTERVAL / 3.0
+            revisit = _return_again(seen_in, so_far, lap, settings)
+        else:
+            due = driven[newest] + closing.check_interval
+            revisit = return_to_beginning(seen_in, so_far, settings)
+        if revisit is None:
             continue
-        laid, earlier = found
-        if not (laid.is_likely if revisits else laid.is_sure):
-            continue
-        revisit = revisit_of(laid, so_far, earlier, newest)
         if not revisits:
-            lap = float(driven[newest] - driven[earlier] - revisit.local[0])
+            lap = float(driven[newest] - driven[revisit.earlier] - revisit.local[0])
         revisits.append(revisit)
         poses, _ = align_revisits(chain, revisits)
         due = driven[newest] + INTERVAL
     return Recurrence(driven, lap, revisits=tuple(revisits))
+
+
+def _return_again(seen_in: SeenIn, poses: Array, lap: float, settings: MapperSettings) -> Revisit | None:
+    """Return the newest of poses (P, 3) in the frame of one a lap (m) before, once laps are aligned."""
+    last = float(path_lengths(poses)[-1]) - LAP_SHARE * lap
+    found = find_return(seen_in, poses, last, NEARBY, settings.growth)
+    if found is None or not found[0].is_likely:
+        return None
+    return revisit_of(found[0], poses, found[1], len(poses) - 1)
 
 
 def lap_correspondences(recurrence: Recurrence) -> tuple[IntArray, IntArray, Array]:

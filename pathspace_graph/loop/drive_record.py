@@ -27,7 +27,7 @@ from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.io.log import Detections
-from pathspace_graph.mapping.constellation import BEGINNING, Expected, SeenIn, find_return, revisit_of
+from pathspace_graph.mapping.constellation import SeenIn, return_to_beginning
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.smoother import CurveSmoother
@@ -149,13 +149,8 @@ class DriveRecord:
 
     def return_to_beginning(self, calibration: Array, sensor: Array) -> Recurrence | None:
         """Return the lap that has been driven, if the newest cones lie on those of the drive's beginning."""
-        poses, closing = unwrap(self.poses), self.settings.closing
-        length = float(path_lengths(poses)[-1])
-        last, expected = min(length - closing.min_path, BEGINNING), Expected.after(length, closing)
-        found = find_return(self.seen_in(sensor), poses, last, expected, self.settings.growth)
-        if found is None or not found[0].is_sure:
-            return None
-        return self.recurrence_by(revisit_of(found[0], poses, found[1], len(poses) - 1), calibration)
+        revisit = return_to_beginning(self.seen_in(sensor), unwrap(self.poses), self.settings)
+        return None if revisit is None else self.recurrence_by(revisit, calibration)
 
     def recurrence_by(self, revisit: Revisit, calibration: Array) -> Recurrence:
         """Return the recurrence of the drive whose later pose was measured in the frame of an earlier one."""

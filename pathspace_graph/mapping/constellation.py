@@ -28,10 +28,11 @@ from pathspace_graph.factors.se2 import (
 )
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import ClosingSettings, GrowthSettings
 
 from .detections import DetectionColumns
-from .registration import HEADING
+from .registration import HEADING, start_crossings
 from .tentative import merged_in_turn
 
 SIGMA: Final = 0.25  # of a cone's place besides its covariance: errors of the sensor that change slowly (m)
@@ -52,6 +53,7 @@ ODDS: Final = 20.0  # least difference of cost to the next place: twice the loga
 ODDS_NEARBY: Final = 6.0  # the same where the place is known to a metre
 SIGHTINGS: Final = 3  # least number of detections of a cone
 BEGINNING: Final = 40.0  # length of the beginning of a drive that closes a lap (m)
+NEWEST_LAP: Final = 60.0  # length of the newest path that crosses the start, if a lap is closed (m)
 TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
 SIGMA_TURN: Final = 0.1  # its standard deviation (rad)
 SAME_ROAD: Final = 2.5  # largest distance of both passes across their road, by the cones (m)
@@ -252,6 +254,24 @@ class Expected:
 
 NEARBY: Final = Expected.within(4.0, 0.15, (1.0, 1.0, 0.05))
 """Where laps have been aligned already, or an open road has another one beside it."""
+
+
+def return_to_beginning(seen_in: SeenIn, poses: Array, settings: MapperSettings) -> Revisit | None:
+    """Return the newest pose in the frame of one at the beginning of the drive, if the cones are sure of it.
+
+    The poses (P, 3) are those of all cycles. The newest path has to cross the line at which the drive began:
+    in each round of a skidpad the vehicle is on its beginning again, but has not closed a lap.
+    """
+    stations, closing = path_lengths(poses), settings.closing
+    length = float(stations[-1])
+    last, expected = min(length - closing.min_path, BEGINNING), Expected.after(length, closing)
+    found = find_return(seen_in, poses, last, expected, settings.growth)
+    if found is None or not found[0].is_sure:
+        return None
+    laid, earlier = found
+    newest = to_vehicle(poses[stations > length - NEWEST_LAP, :2], poses[-1:])
+    crosses, _ = start_crossings(to_map(newest, laid.pose[None]), poses[0])
+    return revisit_of(laid, poses, earlier, len(poses) - 1) if crosses.any() else None
 
 
 def find_return(

@@ -9,7 +9,7 @@ from typing import Final, Self
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import path_lengths, rotation, wrap_angle
+from pathspace_graph.factors.se2 import path_lengths, rotation, to_vehicle, wrap_angle
 from pathspace_graph.settings.online import ClosingSettings
 
 from .curve_map import CurveMap
@@ -155,16 +155,24 @@ def passes_start(state: State, path: DrivenPath, motion: Motion) -> bool:
     """
     start, turn = path.beginning[0, :2], rotation(path.beginning[0, 2])
     newest = motion.apply(path.points[path.stations > path.length - BEGINNING])
-    ahead, left = ((newest - start) @ turn).T
-    steps, forward = np.hypot(np.diff(ahead), np.diff(left)), np.diff(ahead)
-    crosses = (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & (np.abs(left[1:]) < START_LATERAL)
-    crosses &= forward > np.cos(START_HEADING) * steps
+    crosses, left = start_crossings(newest, path.beginning[0])
     for label, boundary in state.boundaries.items():
         u = np.arange(0.0, min(BEGINNING, boundary.confirmed_end), boundary.settings.search_step)
         curve = boundary.evaluate(state.control_points(label), u) - start
         _, beside = curve[np.hypot(*curve.T).argmin()] @ turn
-        crosses &= (left[1:] - beside) * beside < 0.0  # on the same side of it as the start
+        crosses &= (left - beside) * beside < 0.0  # on the same side of it as the start
     return bool(crosses.any())
+
+
+def start_crossings(path: Array, start: Array) -> tuple[BoolArray, Array]:
+    """Return which steps (n - 1,) of a path (n, 2) cross the line of a start (3,), and how far to its left.
+
+    They do so in its direction. The distances (n - 1,) are those of the ends of the steps (m).
+    """
+    ahead, left = to_vehicle(path, start[None]).T
+    steps, forward = np.hypot(np.diff(ahead), np.diff(left)), np.diff(ahead)
+    crosses = (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & (np.abs(left[1:]) < START_LATERAL)
+    return crosses & (forward > np.cos(START_HEADING) * steps), left[1:]
 
 
 def register(
