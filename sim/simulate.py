@@ -44,8 +44,8 @@ class SimulationSettings:
     """Factor of all lengths and speeds: 0.1 for a model car of 1:10, 3 for a road."""
 
     draw: bool = field(default=False, repr=False)
-    """Whether sensor, odometry, their faults and the vehicle are drawn by the seed, as `sim.cameras` says. The
-    log states nothing of their noise. Of those only `vehicle.overrun` can be set beside it."""
+    """Whether sensor, odometry, their faults and the vehicle are drawn by the seed (`sim.cameras:draw_car`).
+    The log states nothing of their noise. Of those only `vehicle.overrun` can be set beside it."""
 
     def __post_init__(self) -> None:
         if self.draw:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -315,7 +315,7 @@ def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
     return covariances_of(xx, c * s * (along - across), yy)
 
 
-def ray_covariances(points: Array, sigmas: Sequence[float]) -> Array:
+def ray_covariances(points: Array, sigmas: Iterable[float]) -> Array:
     """Return covariances (m, 2, 2) by (s_range, s_growth, s_bearing) of points (m, 2) at ranges r.
 
     `(s_range + s_growth r)^2` along the ray, `(r s_bearing)^2` across it.
