@@ -78,7 +78,7 @@ class DrawnCar:
 def draw_car(rng: Generator) -> DrawnCar:
     """Return a car of which everything is drawn, so that nothing can be tuned to one.
 
-    The distributions are wider than the few cars that are known. What one of them shows lies inside.
+    The distributions are wider than what the few known cars show.
     """
     vehicle = draw_vehicle(rng)
     return DrawnCar(
@@ -133,7 +133,7 @@ def draw_sensor_faults(rng: Generator) -> SensorFaults:
         # a plate that is mounted by eye is off by a degree; one recorded car's sensor is turned by 6.5
         yaw=yaw * float(rng.choice([-1.0, 1.0])),
         lateral=rng.normal(0.0, 0.03),
-        # the recorded car has 7 to 9 % and -0.19 m, which the odometry doesn't share
+        # the recorded car has about 8 % and -0.19 m, which the odometry doesn't share
         range_scale=rng.uniform(-0.08, 0.08),
         range_bias=rng.uniform(-0.2, 0.2),
         # boxes too small for a colour
@@ -162,7 +162,7 @@ def draw_odometry_faults(rng: Generator) -> OdometryFaults:
         # of a wheel's radius, and of a gyro that was averaged at rest for seconds
         speed_scale=rng.normal(0.0, 0.005),
         yaw_rate_bias=rng.normal(0.0, 0.0015),
-        # four of five recorded laps went on for 0.5 to 4 m, one by 1.3 m/s for 3 s
+        # recorded laps went on for 0.5 to 4 m, one of them at 1.3 m/s for 3 s
         false_travel=rng.uniform(0.3, 1.5) * (rng.random() < SOME),
         false_travel_time=rng.uniform(1.0, 4.0),
     )
@@ -176,7 +176,7 @@ def draw_vehicle(rng: Generator) -> VehicleSettings:
         # the log begins before the car does, and ends after it
         rest=rng.uniform(0.0, 3.0),
         stand=rng.uniform(5.0, 8.0),
-        # of the odometry: wheels of a bus 25 Hz, inertial units 100
+        # of the odometry: wheel speeds on a bus at 25 Hz, inertial units at 100
         rate=rng.uniform(25.0, 100.0),
     )
 

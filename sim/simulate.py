@@ -45,13 +45,15 @@ class SimulationSettings:
 
     draw: bool = field(default=False, repr=False)
     """Whether sensor, odometry, their faults and the vehicle are drawn by the seed (`sim.cameras:draw_car`).
-    The log states nothing of their noise. Of those only `vehicle.overrun` can be set beside it."""
+    The log states nothing of their noise. Of those only the vehicle's overrun can be set beside it."""
 
     def __post_init__(self) -> None:
         if self.draw:
             self._check_draw()
         if self.laps < 1:
             raise SettingsError(f"laps: expected at least 1, found {self.laps}")
+        if self.faults.odometry.false_travel and not self.vehicle.stand:
+            raise SettingsError("faults.odometry.false_travel: expected vehicle.stand above 0, found 0")
         if not 0.0 < self.scale < np.inf:
             raise SettingsError(f"scale: expected a positive number, found {self.scale}")
 

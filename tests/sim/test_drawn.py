@@ -102,6 +102,11 @@ def test_odometry_goes_on_at_its_speed_and_for_its_time_while_the_world_stands()
         np.testing.assert_array_equal(seen.points_vehicle, same.points_vehicle)
 
 
+def test_false_travel_needs_a_vehicle_that_stands() -> None:
+    with pytest.raises(SettingsError, match=r"false_travel: expected vehicle\.stand above 0, found 0"):
+        SimulationSettings(faults=Faults(odometry=OdometryFaults(false_travel=1.0)))
+
+
 # --- a drawn car -----------------------------------------------------------------------------------------
 
 
