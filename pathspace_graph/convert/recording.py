@@ -17,7 +17,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .messages import Points, points_of, stamp_of, twist_of
-from .settings import SIGMA_ODOMETRY, Frames, LabelRule, NoiseSettings, Window
+from .settings import Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
 # notes of what was done
@@ -85,7 +85,7 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
     return Log(
         odometry,
         _cycles(record, odometry, frames, noise, file),
-        np.array(SIGMA_ODOMETRY if stated is None else stated, dtype=float),
+        np.array(logs.SIGMA_ODOMETRY if stated is None else stated, dtype=float),
         source=record.source,
         odometry_stated=stated is not None,
         detections_stated=noise.states_detections or not record.notes[ASSUMED],

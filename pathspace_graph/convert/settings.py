@@ -20,7 +20,6 @@ Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
 NO_LABEL: Final = "none"  # name of a label field that says there are no labels
 DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
-SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}

@@ -15,7 +15,6 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA
 
 from . import parsing as limits
 from .brief import Brief, pictures
@@ -67,6 +66,7 @@ _TRUE_ERRORS: Final = {
     "rays": RAYS,
 }
 
+SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
 SIGMA_DETECTIONS: Final = (0.05, 0.012, np.pi / 200.0)  # (m, m/m, rad) where nothing is known
 MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
 MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
@@ -332,7 +332,7 @@ def without_stated_noise(log: Log) -> Log:
         replace(cycle, covariances=ray_covariances(cycle.points_vehicle, SIGMA_DETECTIONS))
         for cycle in log.cycles
     )
-    log = replace(log, cycles=cycles, odometry_sigma=np.array(ODOMETRY_SIGMA), sensor=SensorInfo())
+    log = replace(log, cycles=cycles, odometry_sigma=np.array(SIGMA_ODOMETRY), sensor=SensorInfo())
     return replace(log, odometry_stated=False, detections_stated=False)
 
 
