@@ -12,12 +12,15 @@ from numpy.typing import ArrayLike
 
 from .experiment.faults import outcomes
 from .experiment.frame import COMBINATION, RUN, RUN_OF, TIMES, contrasts, estimate, last_laps
-from .experiment.study import DEFAULT, Study
+from .experiment.study import Study
 from .metrics.metric import METRICS
 
 ESTIMATORS: Final = ("fixed-lag", "spline", "landmark-fixed-lag", "landmark-batch", "ckf", "landmark-ckf")
 ONLINE, BATCH, LANDMARKS = ESTIMATORS[:3]
 TITLES: Final = {"ate": "trajectory error [m]", "nees": "NEES of the map"}
+CAMERA: Final = (
+    *("rmse", "rmse_aligned", "missed", "closed", "nees", "turn_nees", "map_scale_nees", "reported_degraded"),
+)
 TITLES_CAMERA: Final = TITLES | {"turn_nees": "NEES of the turn", "reported_degraded": "degraded [%]"}
 """Headings in tables that are short of room."""
 FAULTS: Final = {  # columns of the table of faults: value and digits
@@ -132,13 +135,11 @@ def skidpad_table(frame: pd.DataFrame) -> View:
 
 
 def camera_table(frame: pd.DataFrame) -> View:
-    """Return the map of each estimator at stated and at measured noise, and the limit of its landmarks."""
-    keys, last = ("rmse", "missed", "nees", "turn_nees", "reported_degraded"), last_laps(frame)
-    runs = last.groupby(["estimator", "variant"], sort=False)
-    stated = {DEFAULT: "stated"}  # since a simulated log states its own noise
-    parts = {f"`{estimator}`, {stated.get(noise, noise)}": part for (estimator, noise), part in runs}
-    oracle = (_figure("l", last.drop_duplicates([*RUN])), *[Figure(None)] * (len(keys) - 1))  # one a drive
-    header, rows = _by_part("estimator, noise", parts, keys, TITLES_CAMERA)
+    """Return the map of each estimator on drawn cars, and the limit of its landmarks."""
+    last = last_laps(frame)
+    parts = {f"`{estimator}`": part for estimator, part in last.groupby("estimator", sort=False)}
+    oracle = (_figure("l", last.drop_duplicates([*RUN])), *[Figure(None)] * (len(CAMERA) - 1))  # one a drive
+    header, rows = _by_part("estimator", parts, CAMERA, TITLES_CAMERA)
     return header, (*rows, ("landmarks, given all", oracle))
 
 

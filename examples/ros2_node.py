@@ -18,9 +18,10 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph import LEFT, RIGHT, FixedLagMapper, Map, SplineBoundary
 from pathspace_graph.convert.recording import MessageStream
-from pathspace_graph.convert.settings import SIGMA_ODOMETRY, Frames
+from pathspace_graph.convert.settings import Frames
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import write_json
+from pathspace_graph.io.log import SIGMA_ODOMETRY
 from pathspace_graph.io.map import MAP_FILE, map_to_json
 from pathspace_graph.run import CycleResult
 

@@ -1,6 +1,6 @@
 """The faults of a real car that white noise does not have, off by default, and what they do to a drive."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -59,6 +59,8 @@ class OdometryFaults:
 
     yaw_rate_bias: float = 0.0
     """Bias of the yaw rate beside the drawn one (rad/s)."""
+    speed_scale: float = field(default=0.0, repr=False)
+    """Share by which the speeds are too large, beside the drawn scale (-)."""
     slip: float = 0.0
     """Share by which the speeds are too large while the wheels slip (-)."""
     slip_time: float = 1.0
@@ -73,12 +75,16 @@ class OdometryFaults:
     """Time without a measured twist, so that the last one before is held (s)."""
     gap_at: float = 0.5
     """Laps after which the gap begins."""
+    false_travel: float = field(default=0.0, repr=False)
+    """Speed (m/s) below which the odometry doesn't fall while the vehicle brakes to its last stand."""
+    false_travel_time: float = field(default=3.0, repr=False)
+    """Time for which it goes on so while the vehicle stands (s)."""
 
     def __post_init__(self) -> None:
-        at_least_0 = ("slip_time", "zero", "zero_at", "gap", "gap_at")
+        at_least_0 = ("slip_time", "zero", "zero_at", "gap", "gap_at", "false_travel", "false_travel_time")
         check_numbers(self, "faults.odometry", at_least_0, "a number of at least 0")
         check_numbers(self, "faults.odometry", ("slip_every",), "a positive number")
-        check_numbers(self, "faults.odometry", ("yaw_rate_bias", "slip"), "a number")
+        check_numbers(self, "faults.odometry", ("yaw_rate_bias", "speed_scale", "slip"), "a number")
 
 
 @dataclass(frozen=True)
@@ -140,23 +146,31 @@ def measure_odometry(
 ) -> tuple[Odometry, FloatArray]:
     """Return the measured twists, and the scale error (-) and the bias (rad/s) that they have (2,)."""
     dt = float(driven.t[:2][-1])
-    measured, calibration = measure_twists(_slipping(driven, faults), dt, noise, rng)
-    bias = np.array([0.0, 0.0, faults.yaw_rate_bias])
-    measured = measured + bias if faults.yaw_rate_bias else measured
+    wheels = _wheel_twists(driven, faults)
+    measured, calibration = measure_twists(wheels, dt, noise, rng)
+    constant = np.array([faults.speed_scale, faults.yaw_rate_bias])
+    if constant.any():
+        measured += wheels * [constant[0], constant[0], 0.0] + [0.0, 0.0, constant[1]]
     measured[_is_during(driven, faults.zero_at * lap, faults.zero)] = 0.0
     kept = ~_is_during(driven, faults.gap_at * lap, faults.gap)
     kept[0] = True  # the first stamp is the beginning of the log
-    return Odometry(driven.t[kept], measured[kept]), calibration + bias[1:]
+    return Odometry(driven.t[kept], measured[kept]), calibration + constant
 
 
-def _slipping(driven: Drive, faults: OdometryFaults) -> FloatArray:
-    """Return the twists (N, 3) of the wheels, which are those of the body except where they slip."""
-    if not faults.slip:
-        return driven.twists
-    since = driven.t % faults.slip_every
-    slips = (since < faults.slip_time) & (driven.t >= faults.slip_every)
-    factors = 1.0 + faults.slip * slips[:, None] * np.array([1.0, 1.0, 0.0])
-    return np.asarray(driven.twists * factors)
+def _wheel_twists(driven: Drive, faults: OdometryFaults) -> FloatArray:
+    """Return the twists (N, 3) of the body, except where the wheels slip or report false travel."""
+    twists = driven.twists.copy()
+    if faults.slip:
+        since = driven.t % faults.slip_every
+        slips = (since < faults.slip_time) & (driven.t >= faults.slip_every)
+        twists *= 1.0 + faults.slip * slips[:, None] * np.array([1.0, 1.0, 0.0])
+    if faults.false_travel:
+        stand = np.flatnonzero(driven.twists.any(axis=1))[-1] + 1
+        slow = np.flatnonzero(driven.twists[:stand, 0] > faults.false_travel)[-1:] + 1
+        dt = float(driven.t[1] - driven.t[0])
+        end = stand + round(faults.false_travel_time / dt)
+        twists[int(np.append(slow, stand)[0]) : end, 0] = faults.false_travel
+    return twists
 
 
 def colours(track: Track, wrong_way: bool) -> IntArray:

@@ -83,6 +83,10 @@ class SensorSettings:
     """Increasing ranges of the given systematic errors (m), which are linear between them."""
     range_bias_values: tuple[float, ...] = (0.02, 0.34)
     """Systematic errors at those ranges (m), typical of cameras."""
+    range_bend: float = field(default=0.0, repr=False)
+    """Bend k of the ranges (1/m): a range r reads `k (r - range_bend_from)^2` longer beyond that range."""
+    range_bend_from: float = field(default=9.0, repr=False)
+    """Range from which on ranges bend (m)."""
     slow_range: float = field(default=0.0, repr=False)
     """Share of a range's variance in the slow error of its cone (-)."""
     slow_bearing: float = field(default=0.0, repr=False)
@@ -103,6 +107,12 @@ class SensorSettings:
         check_numbers(self, "sensor", at_least_0, "a number of at least 0")
         if self.fov > 2 * np.pi or self.range_min >= self.range_max:
             raise SettingsError("sensor: expected fov <= 2 pi rad and range_min < range_max")
+        check_numbers(self, "sensor", ("range_bend",), "a number")
+        check_numbers(self, "sensor", ("range_bend_from",), "a number of at least 0")
+        if 1.0 + 2.0 * self.range_bend * max(self.range_max - self.range_bend_from, 0.0) <= 0.0:
+            raise SettingsError(
+                f"sensor.range_bend: expected farther cones to read farther, found {self.range_bend}"
+            )
         shares = ("detection_probability", "blind_fraction", "wrong_colour", "duplicates", "dropped_cycles")
         check_numbers(self, "sensor", (*shares, "slow_range", "slow_bearing"), "a number in [0, 1]")
         least, greatest = self.overlap
@@ -189,6 +199,8 @@ class ConeSensor:
         rows = np.stack([hit, hit & overlap & (again < settings.duplicates)])
         biased = settings.range_bias and len(settings.range_bias_at) > 0
         systematic = np.interp(ranges, settings.range_bias_at, settings.range_bias_values) if biased else 0.0
+        beyond = np.maximum(ranges - settings.range_bend_from, 0.0)
+        systematic = systematic + settings.range_bend * beyond**2
         ranges = (1.0 + scale) * ranges + bias + systematic
         errors = self._errors(np.stack([first, second]), cones)
         ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]

@@ -2,18 +2,29 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final
+from operator import attrgetter
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError, check_name
-from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth
+from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth, without_stated_noise
 from pathspace_graph.labels import NAMES, UNKNOWN
 from pathspace_graph.lengths import scaled
 
+from .cameras import CAMERA, CAMERA_FAULTS, INS, INS_RATE, DrawnCar, draw_car
 from .curves import FloatArray, IntArray
-from .faults import Faults, SensorFaults, colours, measure_odometry, put_down, time_at, turned_round
+from .faults import (
+    Faults,
+    OdometryFaults,
+    SensorFaults,
+    colours,
+    measure_odometry,
+    put_down,
+    time_at,
+    turned_round,
+)
 from .sensor import FALSE_POSITIVE, ConeSensor, OdometryNoise, SensorSettings
 from .track import Track, to_map_frame
 from .vehicle import Drive, VehicleSettings, displacements, drive
@@ -32,22 +43,54 @@ class SimulationSettings:
     scale: float = field(default=1.0, repr=False)
     """Factor of all lengths and speeds: 0.1 for a model car of 1:10, 3 for a road."""
 
+    draw: bool = field(default=False, repr=False)
+    """Whether sensor, odometry, their faults and the vehicle are drawn by the seed (`sim.cameras:draw_car`).
+    The log states nothing of their noise. Of those only the vehicle's overrun can be set beside it."""
+
     def __post_init__(self) -> None:
+        if self.draw:
+            self._check_draw()
         if self.laps < 1:
             raise SettingsError(f"laps: expected at least 1, found {self.laps}")
+        if self.faults.odometry.false_travel and not self.vehicle.stand:
+            raise SettingsError("faults.odometry.false_travel: expected vehicle.stand above 0, found 0")
         if not 0.0 < self.scale < np.inf:
             raise SettingsError(f"scale: expected a positive number, found {self.scale}")
+
+    def _check_draw(self) -> None:
+        """Raise SettingsError where a group that is drawn is neither the default nor a preset."""
+        overrun = self.vehicle.overrun
+        known = {
+            "sensor": (SensorSettings(), CAMERA),
+            "odometry": (OdometryNoise(), INS),
+            "vehicle": (VehicleSettings(overrun=overrun), VehicleSettings(overrun=overrun, rate=INS_RATE)),
+            "faults.sensor": (SensorFaults(), CAMERA_FAULTS),
+            "faults.odometry": (OdometryFaults(),),
+        }
+        for group, values in known.items():
+            if attrgetter(group)(self) not in values:
+                raise SettingsError(f"draw: expected no setting of {group} beside it, as it is drawn")
+
+    def with_car(self, car: DrawnCar) -> Self:
+        """Return the settings of the same drive with a drawn car."""
+        faults = replace(self.faults, sensor=car.sensor_faults, odometry=car.odometry_faults)
+        vehicle = replace(car.vehicle, overrun=self.vehicle.overrun)
+        changed = replace(self, draw=False, vehicle=vehicle, faults=faults)
+        return replace(changed, sensor=car.sensor, odometry=car.odometry)
 
 
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     """Return the log of a drive; a seed gives the same log to the byte.
 
-    Wander, odometry, sensor and lost colours have random streams of their own, so that a setting of one does
-    not shift the others. A cycle in which nothing is detected is not in the log.
+    Wander, odometry, sensor, lost colours and a drawn car have random streams of their own, so that a setting
+    of one does not shift the others. A cycle in which nothing is detected is not in the log.
     """
     if seed < 0:
         raise SettingsError(f"seed: expected at least 0, found {seed}")
-    wander_rng, odometry_rng, *sensor_rngs = np.random.default_rng(seed).spawn(4)
+    wander_rng, odometry_rng, *sensor_rngs, car_rng = np.random.default_rng(seed).spawn(5)
+    if settings.draw:
+        drawn = settings.with_car(draw_car(car_rng))
+        return _as_recorded(simulate(track, drawn, seed), drawn)
     faults = settings.faults
     track = to_map_frame(turned_round(track) if faults.vehicle.wrong_way else track)
     lap = track.centre_line.length
@@ -63,6 +106,7 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
         calibration=calibration,
         sensor=errors if errors.any() else None,
         noise=_noise(settings),
+        bend=_bend(settings.sensor),
     )
     log = Log(
         odometry=odometry,
@@ -75,6 +119,14 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     return scaled(log, settings.scale)
 
 
+def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
+    """Return a log of these settings that states nothing of its noise, which its truth has instead."""
+    sensor = settings.sensor
+    sigmas = [sensor.range_sigma * settings.scale, sensor.range_sigma_growth, sensor.bearing_sigma]
+    truth = log.truth and replace(log.truth, rays=np.array(sigmas))
+    return without_stated_noise(replace(log, truth=truth, source={**log.source, "draw": "True"}))
+
+
 def _noise(settings: SimulationSettings) -> FloatArray | None:
     """Return the noise (6,) in the order of `io.log:NOISE`, or None where all of it is white."""
     odometry, sensor = settings.odometry, settings.sensor
@@ -84,11 +136,16 @@ def _noise(settings: SimulationSettings) -> FloatArray | None:
     return np.array([*drift, sensor.slow_range, sensor.slow_bearing, sensor.slow_time])
 
 
+def _bend(sensor: SensorSettings) -> FloatArray | None:
+    """Return the bend of the ranges (2,) in the order of `io.log:BEND`, or None where they don't bend."""
+    return np.array([sensor.range_bend, sensor.range_bend_from]) if sensor.range_bend else None
+
+
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
     source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
     source |= {"scale": str(settings.scale)} if settings.scale != 1.0 else {}
-    for group in ("odometry", "sensor"):
-        part = getattr(settings, group)
+    for group in ("odometry", "sensor", "vehicle", "faults.sensor", "faults.odometry"):
+        part = attrgetter(group)(settings)
         changed = [entry.name for entry in fields(part) if not entry.repr]
         changed = [name for name in changed if getattr(part, name) != getattr(type(part)(), name)]
         source |= {f"{group}.{name}": str(getattr(part, name)) for name in changed}
@@ -133,58 +190,7 @@ def _poses_at(driven: Drive, stamps: FloatArray) -> FloatArray:
     return poses + displacements(poses[:, 2], driven.twists[index], stamps - driven.t[index])
 
 
-CAMERA: Final = SensorSettings(
-    rate=5.0,
-    range_max=40.0,
-    fov=float(np.deg2rad(130.0)),
-    range_sigma=0.03,
-    range_sigma_growth=0.05,
-    bearing_sigma=0.0125,
-    detection_probability=1.0,
-    detection_falloff=0.022,
-    blind_fraction=0.0,
-    wrong_colour=0.001,
-    false_positives=0.05,
-    slow_range=0.08,
-    slow_bearing=0.8,
-    slow_time=8.0,
-    duplicates=0.9,
-    overlap=(float(np.deg2rad(5.0)), float(np.deg2rad(17.0))),
-    dropped_cycles=0.005,
-)
-"""Three cameras of a Formula Student car, as its recordings of three laps show them.
-
-Their fields span bearings of +-65 degrees. A smoothed map gave the errors of some 900 passes of cones. Those
-along the ray grow to 0.5 m at 10 m and 1.2 m at 22 m, with hardly any correlation from cycle to cycle. Those
-across are 0.007 rad about their mean over a pass, but 0.011 to 0.015 rad between two cameras that see the
-same cone: most of the error stays with the cone. The correlation time gave these figures and those of lag 1
-to 5 again in a simulated log. Of the cones in the overlaps, at bearings of 5 to 17 degrees on both sides, 75
-to 100 % are seen twice. 0.5 % of the cycles are missing. A cone is detected with a probability of 0.97 below
-6 m, 0.8 at 14 m, 0.5 at 22 m and 0.15 at 37 m. Of the detections within 12 m, 0.1 % have the other
-boundary's colour and about 0.04 a cycle are of no cone.
-"""
-CAMERA_FAULTS: Final = SensorFaults(
-    latency=-0.12, yaw=-0.0175, range_scale=0.08, range_bias=-0.19, colourless=0.01
-)
-"""Constant errors of these cameras against the odometry, which differ a little from lap to lap.
-
-Fits on each lap gave stamps 0.108 to 0.131 s early, a yaw of 0.6 to 1.4 degrees to the right, and ranges
-0.19 m too short and 7 to 9 % too long.
-"""
-INS: Final = OdometryNoise(
-    white=(0.009, 0.003, 0.003), gyro_bias=0.0002, slow=(0.03, 0.03, 0.0005), slow_time=5.0
-)
-"""Inertial navigation of the same car.
-
-Third differences of the readings gave the white noise. The slow errors and the bias are such that a lap of
-240 m in 90 s ends 1 m and 0.02 rad off by dead reckoning: the three laps ended 0.8, 0.8 and 1.9 m, and 0.01
-to 0.03 rad off. The correlation time is assumed.
-"""
-INS_RATE: Final = 40.0  # rate of the INS (Hz)
-
 PLAIN: Final = "plain"  # name of the preset that changes nothing
-
-
 PRESETS: Final[dict[str, dict[str, dict[str, Any]]]] = {
     "sensor": {PLAIN: {}, "camera": {"sensor": CAMERA, "faults": Faults(sensor=CAMERA_FAULTS)}},
     "odometry": {PLAIN: {}, "ins": {"odometry": INS, "vehicle": VehicleSettings(rate=INS_RATE)}},

@@ -1,6 +1,6 @@
 """A vehicle that follows the middle of a track: true poses and the true twist of its body."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -45,13 +45,15 @@ class VehicleSettings:
     """Distance driven beyond the last lap's end (m); where it is negative, the road stays open."""
     rest: float = 0.0
     """Time at the start pose before the vehicle drives (s)."""
+    stand: float = field(default=0.0, repr=False)
+    """Time for which the vehicle stands at the end of the drive, after braking (s); it drives on if 0."""
     rate: float = 50.0
     """Rate of the odometry and of the true poses (Hz)."""
 
     def __post_init__(self) -> None:
         positive = ("speed_max", "acceleration_lateral", "acceleration", "deceleration")
         check_numbers(self, "vehicle", (*positive, "settle_distance", "rate"), "a positive number")
-        at_least_0 = ("speed_start", "rest", "wander", "half_width", "margin")
+        at_least_0 = ("speed_start", "rest", "stand", "wander", "half_width", "margin")
         check_numbers(self, "vehicle", at_least_0, "a number of at least 0")
         check_numbers(self, "vehicle", ("overrun",), "a number")
         shortest, longest = self.wander_wavelengths
@@ -73,7 +75,8 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
     derivative = path(s, 1)
     headings = np.unwrap(np.arctan2(derivative[:, 1], derivative[:, 0]))
     twists = _twists(np.column_stack([path(s), headings]), 1.0 / settings.rate)
-    twists = np.concatenate([np.zeros((round(settings.rest * settings.rate), 3)), twists])
+    rest, stand = (np.zeros((round(time * settings.rate), 3)) for time in (settings.rest, settings.stand))
+    twists = np.concatenate([rest, twists, stand])
     t = np.arange(len(twists)) / settings.rate
     return Drive(t, integrate(twists[:-1], 1.0 / settings.rate), twists)
 
@@ -158,6 +161,7 @@ def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
     cornering2 = settings.acceleration_lateral / np.maximum(bend, np.finfo(float).tiny)
     speed2 = np.minimum(cornering2, settings.speed_max**2)
     speed2[0] = min(speed2[0], settings.speed_start**2)
+    speed2[-1] = 0.0 if settings.stand else speed2[-1]
     gain, loss = 2 * settings.acceleration * np.diff(s), 2 * settings.deceleration * np.diff(s)
     for i in range(len(gain)):
         speed2[i + 1] = min(speed2[i + 1], speed2[i] + gain[i])

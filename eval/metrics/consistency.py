@@ -1,4 +1,4 @@
-"""Whether a covariance is honest: NEES of the map, errors at the true cones, and the turn about the start."""
+"""Whether a covariance is honest: NEES of the map, errors at the true cones, turn and scale."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -174,57 +174,77 @@ def with_marginals(track: Map) -> Map:
 
 
 @dataclass(frozen=True)
-class Turn:
-    """Rotation of a map about the start."""
+class Deviation:
+    """Number by which a map as a whole deviates from the truth, whose frame is fixed at the start."""
 
-    angle: float  # angle to the left (rad); NaN where nothing can be compared
-    sigma: float  # its standard deviation by the map's joint covariance (rad); NaN where the map has none
+    value: float  # NaN where nothing can be compared
+    sigma: float  # its standard deviation by the map's joint covariance; NaN where the map has none
 
     @property
     def nees(self) -> float:
-        """Return the squared angle by its claimed variance; its mean is 1 where the covariance is honest."""
-        return (self.angle / self.sigma) ** 2 if self.sigma > 0.0 else float("nan")
+        """Return the squared value by its claimed variance; its mean is 1 where the covariance is honest."""
+        return (self.value / self.sigma) ** 2 if self.sigma > 0.0 else float("nan")
 
 
-def turn_from_truth(track: Map, truth: Truth) -> Turn:
-    """Return the angle a that minimizes `sum (n . (R(a) p - S))^2` over the true cones p.
+def turn_from_truth(track: Map, truth: Truth) -> Deviation:
+    """Return the angle a (rad) that minimizes `sum (n . (R(a) p - S))^2` over the true cones p.
 
     S is the foot point of R(a) p on the map's own boundary, found anew in every round, and n is the normal
     there; a landmark has both axes for normals. Cones farther than 3 m from the map, and those beyond the
     ends of an open curve, don't count. The angle is linear in the map's points near the solution, so their
     joint covariance gives its variance.
     """
-    angle, (error, lever, gradient) = 0.0, _rows(track, truth, 0.0)
-    for _ in range(50):
-        moment = float(lever @ lever)
-        if moment == 0.0:
-            return Turn(float("nan"), float("nan"))
-        change = -float(lever @ error) / moment
-        angle += change
-        error, lever, gradient = _rows(track, truth, angle)
-        if abs(change) < 1e-9:
-            break
-    joint = track.joint_covariance
-    variance = float("nan") if joint is None else float(gradient @ joint @ gradient)
-    return Turn(angle, float(np.sqrt(variance)) / float(lever @ lever))
+    return _fitted(track, truth, 1)[0]
 
 
-def _rows(track: Map, truth: Truth, angle: float) -> tuple[Array, Array, Array]:
-    """Return the offsets from the map of cones p that are turned by an angle (rad), and two derivatives.
+def similarity_from_truth(track: Map, truth: Truth) -> tuple[Deviation, Deviation]:
+    """Return the turn a (rad) and the logarithm b of the map's scale by that of the truth.
 
-    The offsets are n . (p - S) (r,) in m, their derivatives by the angle n . J p (r,) in m/rad. The third is
-    the derivative (2m,) of `sum lever n . S` by the points of the map's boundaries.
+    They minimize `sum (n . (exp(b) R(a) p - S))^2` together, as `turn_from_truth` does.
     """
-    error, lever, gradient = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    turn, scale = _fitted(track, truth, 2)
+    return turn, scale
+
+
+def aligned(truth: Truth, turn: float, scale: float) -> Truth:
+    """Return the truth with its cones turned about the start (rad), and `exp(scale)` times as far from it."""
+    return replace(truth, cones=np.exp(scale) * truth.cones @ rotation(turn).T)
+
+
+def _fitted(track: Map, truth: Truth, count: int) -> list[Deviation]:
+    """Return the first `count` of turn and scale that lay the true cones on the map, by Gauss-Newton."""
+    motion, (error, lever, gradient) = np.zeros(2), _rows(track, truth)
+    for _ in range(50):
+        if len(error) == 0 or np.linalg.matrix_rank(lever[:, :count]) < count:
+            return [Deviation(float("nan"), float("nan"))] * count
+        change = np.linalg.lstsq(lever[:, :count], -error)[0]
+        motion[:count] += change
+        error, lever, gradient = _rows(track, aligned(truth, *motion))
+        if np.abs(change).max() < 1e-9:
+            break
+    J, joint = lever[:, :count], track.joint_covariance
+    by_points = np.linalg.solve(J.T @ J, gradient[:, :count].T)
+    variances = np.full(count, np.nan) if joint is None else np.diag(by_points @ joint @ by_points.T)
+    return [Deviation(*pair) for pair in zip(motion.tolist(), np.sqrt(variances).tolist(), strict=False)]
+
+
+def _rows(track: Map, truth: Truth) -> tuple[Array, Array, Array]:
+    """Return the offsets of true cones p from the map, and two derivatives.
+
+    The offsets are n . (p - S) (r,) in m, their derivatives by turn and scale n . [J p, p] (r, 2) in m. The
+    third is the derivative (2m, 2) of `sum lever n . S` by the points of the map's boundaries.
+    """
+    error, lever, gradient = [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2))]
     for label, boundary in sorted(track.boundaries.items()):
-        turned = cones_of(truth, label) @ rotation(angle).T
-        if len(turned) == 0 or boundary.size == 0:
-            gradient.append(np.zeros(2 * boundary.size))
+        cones = cones_of(truth, label)
+        if len(cones) == 0 or boundary.size == 0:
+            gradient.append(np.zeros((2 * boundary.size, 2)))
             continue
-        point, normal, position, basis = near_pairs(boundary, turned)
+        point, normal, position, basis = near_pairs(boundary, cones)
         error.append(np.einsum("rd,rd->r", normal, point - position))
-        lever.append(normal[:, 1] * point[:, 0] - normal[:, 0] * point[:, 1])
-        gradient.append((basis.T @ (lever[-1][:, None] * normal)).ravel())
+        by_turn = normal[:, 1] * point[:, 0] - normal[:, 0] * point[:, 1]
+        lever.append(np.column_stack([by_turn, np.einsum("rd,rd->r", normal, point)]))
+        gradient.append(np.einsum("rm,rc,rd->mdc", basis, lever[-1], normal).reshape(-1, 2))
     return np.concatenate(error), np.concatenate(lever), np.concatenate(gradient)
 
 

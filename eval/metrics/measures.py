@@ -18,9 +18,11 @@ from pathspace_graph.plausibility.diagnosis import by_prior
 from . import accuracy, trajectory
 from .accuracy import GhostSettings, true_lap_ends
 from .consistency import (
+    aligned,
     consistency_at_cones,
     joint_cone_error,
     map_nees,
+    similarity_from_truth,
     turn_from_truth,
     with_marginals,
 )
@@ -147,13 +149,22 @@ def _map_values(
     values |= accuracy.cone_errors(track, truth) | accuracy.curve_distance(track, truth)
     values |= accuracy.ghosts(track, truth, ghost_settings)
     values |= _consistency_values(track, truth) | _centre_values(track, truth)
-    turn = turn_from_truth(track, truth)
-    turns = {"turn": turn.angle, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
-    values |= {key: value for key, value in turns.items() if not np.isnan(value)}
+    values |= _whole_map_values(track, truth)
     if marginals:
         found = _consistency_values(with_marginals(track), truth)
         values |= {f"{key}_marginals": found[key] for key in ("nees", "inside", "normalized_error")}
     return values
+
+
+def _whole_map_values(track: Map, truth: Truth) -> dict[str, float]:
+    """Return turn and scale of the map with their claims, and its rmse (m) without both."""
+    turn, (turned, scale) = turn_from_truth(track, truth), similarity_from_truth(track, truth)
+    values = {"turn": turn.value, "turn_sigma": turn.sigma, "turn_nees": turn.nees}
+    values |= {"map_scale": scale.value, "map_scale_sigma": scale.sigma, "map_scale_nees": scale.nees}
+    if not np.isnan(scale.value):
+        found = accuracy.cone_errors(track, aligned(truth, turned.value, scale.value))
+        values["rmse_aligned"] = found["rmse"] / np.exp(scale.value)
+    return {key: value for key, value in values.items() if not np.isnan(value)}
 
 
 def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:

@@ -9,7 +9,7 @@ from pathspace_graph.baselines.landmark_batch import LandmarkSystem, solve_landm
 from pathspace_graph.baselines.landmark_map import LandmarkState
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import inverse, left_of, to_map
-from pathspace_graph.io.log import Detections, Log, Truth
+from pathspace_graph.io.log import Detections, Log, Truth, ray_covariances
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
@@ -37,13 +37,14 @@ def limit(log: Log, track: Map) -> dict[str, float]:
 def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:
     """Return the landmark batch with oracle association: each detection knows its true cone, the landmark.
 
-    It also knows the sensor's constant errors and the true noise, where the log has them.
+    It also knows the sensor's constant errors, the bend of its ranges and the true noise, where the log has
+    them.
     """
     truth = _truth(log)
     if truth.associations is None:
         raise ValueError("expected a simulated log, whose associations are known, found one without")
     settings = MapperSettings(calibration=CalibrationSettings(sensor=truth.sensor is None))
-    told, associations = without_sensor_errors(log, truth.associations)
+    told, associations = without_sensor_errors(with_true_covariances(log), truth.associations)
     return solve_landmarks(with_true_noise(told, associations), associations, settings)
 
 
@@ -51,12 +52,14 @@ def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArr
     """Return a log without its sensor's true constant errors, and the associations (R,) that are left.
 
     Cycles get the stamps at which they were seen; those before the first odometry are left out. A range r
-    that reads `(1 + scale) r + bias`, and a covariance beside it, are inverted to first order in the noise.
+    that reads `(1 + scale) r + bias + k max(r - begin, 0)^2`, and a covariance beside it, are inverted to
+    first order in the noise.
     """
     truth = _truth(log)
-    if truth.sensor is None:
+    if truth.sensor is None and truth.bend is None:
         return log, associations
-    yaw, lateral, latency, scale, bias = truth.sensor.tolist()
+    yaw, lateral, latency, scale, bias = np.zeros(5) if truth.sensor is None else truth.sensor
+    bend = np.zeros(2) if truth.bend is None else truth.bend
     c, s = np.cos(yaw), np.sin(yaw)
     to_vehicle = np.array([[c, -s], [s, c]])
     parts = np.split(associations, np.cumsum([len(cycle.labels) for cycle in log.cycles])[:-1])
@@ -66,13 +69,33 @@ def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArr
             continue
         measured = cycle.points_vehicle
         distance, radial = _rays(measured)
-        across = (distance - bias) / (1.0 + scale) / distance
-        change = to_vehicle @ (radial / (1.0 + scale) + across[:, None, None] * (np.eye(2) - radial))
+        ranges, slope = _true_ranges(distance - bias, float(scale), bend)
+        across = ranges / distance
+        change = to_vehicle @ (radial / slope[:, None, None] + across[:, None, None] * (np.eye(2) - radial))
         points = measured * across[:, None] @ to_vehicle.T + [0.0, lateral]
         covariances = change @ cycle.covariances @ change.transpose(0, 2, 1)
         cycles.append(Detections(cycle.t - latency, points, covariances, cycle.labels))
         left.append(part)
     return replace(log, cycles=tuple(cycles)), np.concatenate([np.zeros(0, dtype=int), *left])
+
+
+def _true_ranges(measured: Array, scale: float, bend: Array) -> tuple[Array, Array]:
+    """Return r (m,) of `(1 + scale) r + k max(r - begin, 0)^2`, and the derivative of that at r (m,)."""
+    k, begin = bend
+    excess = measured - (1.0 + scale) * begin
+    slope = np.sqrt(np.maximum((1.0 + scale) ** 2 + 4.0 * k * np.maximum(excess, 0.0), np.finfo(float).eps))
+    return begin + 2.0 * excess / (1.0 + scale + slope), slope
+
+
+def with_true_covariances(log: Log) -> Log:
+    """Return a log that states the true noise of single detections, where its truth has it."""
+    rays = _truth(log).rays
+    if rays is None:
+        return log
+    cycles = tuple(
+        replace(cycle, covariances=ray_covariances(cycle.points_vehicle, rays)) for cycle in log.cycles
+    )
+    return replace(log, cycles=cycles, odometry_stated=True, detections_stated=True)
 
 
 def with_true_noise(log: Log, associations: IntArray) -> Log:

@@ -17,14 +17,13 @@ from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .messages import Points, points_of, stamp_of, twist_of
-from .settings import SIGMA_ODOMETRY, Frames, LabelRule, NoiseSettings, Window
+from .settings import Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
 SHARED_STAMP: Final = "messages with detections have the stamp of another one, and are one cycle with it"
-MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,7 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
     return Log(
         odometry,
         _cycles(record, odometry, frames, noise, file),
-        np.array(SIGMA_ODOMETRY if stated is None else stated, dtype=float),
+        np.array(logs.SIGMA_ODOMETRY if stated is None else stated, dtype=float),
         source=record.source,
         odometry_stated=stated is not None,
         detections_stated=noise.states_detections or not record.notes[ASSUMED],
@@ -177,7 +176,8 @@ def in_vehicle_frame(
     points, covariances = found.points * side, found.covariances * np.outer(side, side)
     known = positive_definite(covariances) & (not noise.replace_covariances)
     notes[ASSUMED] += int((~known).sum())
-    covariances = np.where(known[:, None, None], covariances, default_covariances(points, noise))
+    assumed = logs.ray_covariances(points, noise.sigmas)
+    covariances = np.where(known[:, None, None], covariances, assumed)
     mounting = frames.mounting or (0.0, 0.0, 0.0)
     turn = rotation(mounting[2])
     turned = turn @ covariances @ turn.T
@@ -193,15 +193,6 @@ def positive_definite(covariances: Array) -> BoolArray:
         good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
         good &= np.maximum(xx, yy) < MAX_RANGE**2
     return np.asarray(good)
-
-
-def default_covariances(points: Array, noise: NoiseSettings) -> Array:
-    """Return covariances (m, 2, 2): `(s_range + s_growth r)^2` along the ray, `(r s_bearing)^2` across it."""
-    ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
-    begin, growth, bearing = noise.sigmas
-    along = (begin + growth * ranges) ** 2
-    across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * bearing) ** 2
-    return logs.polar_covariances(bearings, along, across)
 
 
 MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle, the newest ones

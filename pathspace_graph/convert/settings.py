@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.io.log import SIGMA_DETECTIONS
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
 
 Side = Literal["left", "right"]  # side of the x axis to which the y axis points
@@ -19,8 +20,6 @@ Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
 NO_LABEL: Final = "none"  # name of a label field that says there are no labels
 DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
-SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
-SIGMA_DETECTIONS: Final = (0.05, 0.012, pi / 200.0)  # (m, m/m, rad) where nothing is known
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}

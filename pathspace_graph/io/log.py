@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
@@ -56,8 +56,19 @@ FILES: Final = (LOG_FILE, *COLUMNS)
 CALIBRATION: Final = ("scale", "bias")
 SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
-_TRUE_ERRORS: Final = {"calibration": CALIBRATION, "sensor": SENSOR, "noise": NOISE}
+BEND: Final = ("range_bend", "range_bend_from")
+RAYS: Final = ("sigma_range", "sigma_range_growth", "sigma_bearing")
+_TRUE_ERRORS: Final = {
+    "calibration": CALIBRATION,
+    "sensor": SENSOR,
+    "noise": NOISE,
+    "bend": BEND,
+    "rays": RAYS,
+}
 
+SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
+SIGMA_DETECTIONS: Final = (0.05, 0.012, np.pi / 200.0)  # (m, m/m, rad) where nothing is known
+MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
 MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
 MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to double precision below
 
@@ -132,7 +143,10 @@ class SensorInfo:
 class Truth(Brief):
     """What a simulator or a survey knows, for evaluation only; what is not known has no rows."""
 
-    LENGTHS: ClassVar = {"poses": POSE, "cones": 1, "sensor": (0, 1, 0, 0, 1), "noise": (1, 1, 0, 0, 0, 0)}
+    LENGTHS: ClassVar = {
+        **{"poses": POSE, "cones": 1, "sensor": (0, 1, 0, 0, 1), "noise": (1, 1, 0, 0, 0, 0)},
+        **{"bend": (-1, 1), "rays": (1, 0, 0)},
+    }
 
     pose_t: Array
     """Stamps of the true poses (N,) in s."""
@@ -153,6 +167,11 @@ class Truth(Brief):
     """Noise that is not white (6,): the sigmas of white noise of a twist that drifts as much (m/s, m/s,
     rad/s), the shares of a range's and a bearing's variance that stay with a cone (-), and the correlation
     time of those (s)."""
+    bend: Array | None = None
+    """Bend k of the ranges (1/m) and its begin b (m) (2,): a range r reads `k (r - b)^2` longer beyond b."""
+    rays: Array | None = None
+    """Sigmas of single detections (3,) where the log doesn't state them: of the range at 0 (m), its growth
+    (m/m), and of the bearing (rad)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -301,6 +320,27 @@ def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
     c, s = np.cos(bearings), np.sin(bearings)
     xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
     return covariances_of(xx, c * s * (along - across), yy)
+
+
+def ray_covariances(points: Array, sigmas: Iterable[float]) -> Array:
+    """Return covariances (m, 2, 2) by (s_range, s_growth, s_bearing) of points (m, 2) at ranges r.
+
+    `(s_range + s_growth r)^2` along the ray, `(r s_bearing)^2` across it.
+    """
+    ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
+    begin, growth, bearing = sigmas
+    across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * bearing) ** 2
+    return polar_covariances(bearings, (begin + growth * ranges) ** 2, across)
+
+
+def without_stated_noise(log: Log) -> Log:
+    """Return a log as it is made of a record that says nothing of its noise, nor of the sensor."""
+    cycles = tuple(
+        replace(cycle, covariances=ray_covariances(cycle.points_vehicle, SIGMA_DETECTIONS))
+        for cycle in log.cycles
+    )
+    log = replace(log, cycles=cycles, odometry_sigma=np.array(SIGMA_ODOMETRY), sensor=SensorInfo())
+    return replace(log, odometry_stated=False, detections_stated=False)
 
 
 def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:

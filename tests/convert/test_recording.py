@@ -10,7 +10,6 @@ import pytest
 from pathspace_graph.convert.messages import Points
 from pathspace_graph.convert.recording import (
     Recording,
-    default_covariances,
     positive_definite,
     to_log,
     twists_between,
@@ -19,6 +18,7 @@ from pathspace_graph.convert.recording import (
 from pathspace_graph.convert.settings import Frames, NoiseSettings
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import compose, se2_exp
+from pathspace_graph.io.log import ray_covariances
 
 FILE = Path("drive")
 
@@ -58,13 +58,13 @@ def test_the_sensor_is_flipped_before_it_is_mounted() -> None:
 
 def test_a_covariance_that_is_missing_is_made_at_the_sensor() -> None:
     noise = NoiseSettings(sigma_range=0.1, sigma_range_growth=0.02, sigma_bearing=0.03)
-    covariance = default_covariances(np.array([[0.0, 5.0]]), noise)[0]
+    covariance = ray_covariances(np.array([[0.0, 5.0]]), noise.sigmas)[0]
     np.testing.assert_allclose(covariance, [[(5 * 0.03) ** 2, 0.0], [0.0, 0.2**2]], atol=1e-15)
     mounted = to_log(record(one(0.0, 5.0)), Frames((3.0, 0.0, 0.3)), noise, FILE)
     ray = np.array([-np.sin(0.3), np.cos(0.3)])
     expected = 0.2**2 * np.outer(ray, ray) + (5 * 0.03) ** 2 * (np.eye(2) - np.outer(ray, ray))
     np.testing.assert_allclose(mounted.cycles[0].covariances[0], expected, atol=1e-15)
-    assert positive_definite(default_covariances(np.zeros((1, 2)), noise)).all()
+    assert positive_definite(ray_covariances(np.zeros((1, 2)), noise.sigmas)).all()
 
 
 @pytest.mark.parametrize(

@@ -126,18 +126,14 @@ def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
     assert rows[0][1][0].value == pytest.approx(np.sqrt((1.0 + 4.0) / 2.0))
 
 
-def test_the_table_of_the_camera_has_each_noise_and_the_landmarks_that_are_told_all() -> None:
+def test_the_table_of_the_camera_has_each_estimator_and_the_landmarks_that_are_told_all() -> None:
     parts = [
-        frame(estimator, 2, rmse).assign(variant=variant, nees=1.5, l=0.2, reported_degraded=0.25)
-        for estimator, variant, rmse in (("fixed-lag", "default", 0.6), ("spline", "measured", 0.4))
+        frame(estimator, 2, rmse).assign(nees=1.5, l=0.2, reported_degraded=0.25, map_scale_nees=0.8)
+        for estimator, rmse in (("fixed-lag", 0.6), ("spline", 0.4))
     ]
     header, rows = camera_table(pd.concat(parts, ignore_index=True))
-    assert header[:2] == ("estimator, noise", "rmse [m]")
-    assert [label for label, _ in rows] == [
-        "`fixed-lag`, stated",
-        "`spline`, measured",
-        "landmarks, given all",
-    ]
+    assert header[:3] == ("estimator", "rmse [m]", "rmse without turn and scale [m]")
+    assert [label for label, _ in rows] == ["`fixed-lag`", "`spline`", "landmarks, given all"]
     assert [figures[0].value for _, figures in rows] == pytest.approx([0.3, 0.2, 0.2])
     assert rows[0][1][-1].value == pytest.approx(25.0) and rows[2][1][-1].value is None
     assert all(len(figures) == len(header) - 1 for _, figures in rows)

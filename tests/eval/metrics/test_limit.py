@@ -15,6 +15,7 @@ from pathspace_graph.eval.metrics.reference import (
     landmark_rmse,
     limit,
     solve_oracle_landmarks,
+    with_true_covariances,
     with_true_noise,
     without_sensor_errors,
 )
@@ -239,10 +240,12 @@ def test_told_the_errors_of_the_sensor_the_batch_errs_by_its_noise_only(latency:
     assert error / freedom == pytest.approx(1.0, abs=4 * np.sqrt(2 / freedom))
 
 
-def test_detections_without_noise_are_exact_without_the_errors_of_the_sensor() -> None:
+@pytest.mark.parametrize("bend", [0.0, 0.004, -0.004])
+def test_detections_without_noise_are_exact_without_the_errors_of_the_sensor(bend: float) -> None:
     """Each told detection, from the true pose at its told stamp, lies on its cone."""
     faults = SensorFaults(latency=-0.12, yaw=-0.0175, lateral=0.1, range_scale=0.08, range_bias=-0.19)
     sensor = SensorSettings(range_sigma=1e-9, range_sigma_growth=0.0, bearing_sigma=1e-9, false_positives=0.0)
+    sensor = replace(sensor, range_bend=bend, range_bend_from=6.0)
     vehicle = VehicleSettings(rate=100.0)
     settings = SimulationSettings(laps=1, sensor=sensor, vehicle=vehicle, faults=Faults(sensor=faults))
     log = simulate(bean_track(), settings, 0)
@@ -255,6 +258,42 @@ def test_detections_without_noise_are_exact_without_the_errors_of_the_sensor() -
         assert log.truth.pose_t[k] == pytest.approx(cycle.t, abs=1e-9)
         points = to_map(cycle.points_vehicle, np.tile(log.truth.poses[k], (len(seen), 1)))
         np.testing.assert_allclose(points, log.truth.cones[seen], atol=1e-6)
+
+
+def test_a_covariance_shrinks_by_the_slope_of_ranges_that_bend() -> None:
+    """A range of 20 m reads 1.08 * 20 - 0.19 + 0.004 * 11^2 m, and grows by 1.08 + 0.008 * 11 a metre."""
+    point, covariance = np.array([[21.894, 0.0]]), np.diag([0.25, 0.04])
+    cycle = Detections(0.0, point, covariance[None], np.array([LEFT]))
+    sensor, bend = np.array([0.0, 0.0, 0.0, 0.08, -0.19]), np.array([0.004, 9.0])
+    truth = Truth(np.zeros(0), np.zeros((0, 3)), np.zeros((1, 2)), np.array([LEFT]), sensor=sensor, bend=bend)
+    log = Log(Odometry(np.zeros(1), np.zeros((1, 3))), (cycle,), SIGMA, truth=truth)
+    told, _ = without_sensor_errors(log, np.zeros(1, dtype=int))
+    np.testing.assert_allclose(told.cycles[0].points_vehicle, [[20.0, 0.0]], atol=1e-12)
+    expected = np.diag([0.25 / 1.168**2, 0.04 * (20.0 / 21.894) ** 2])
+    np.testing.assert_allclose(told.cycles[0].covariances[0], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("untold", ["bend", "sensor"])
+def test_told_all_of_drawn_cars_the_batch_is_better_than_told_less(untold: str) -> None:
+    told, less = [], []
+    for seed in range(4):
+        log = simulate(bean_track(), SimulationSettings(laps=1, draw=True), seed)
+        assert log.truth is not None
+        told.append(landmark_rmse(solve_oracle_landmarks(log)[1], log.truth))
+        other = replace(log, truth=replace(log.truth, **{untold: None}))
+        less.append(landmark_rmse(solve_oracle_landmarks(other)[1], log.truth))
+    assert np.mean(told) < 0.9 * np.mean(less)
+
+
+def test_told_the_noise_a_drawn_log_has_the_covariances_of_the_sensor() -> None:
+    settings = SimulationSettings(laps=1, draw=True)
+    log = with_true_covariances(simulate(bean_track(), settings, 1))
+    assert log.truth is not None and log.truth.rays is not None
+    begin, growth, bearing = log.truth.rays
+    cycle = log.cycles[3]
+    ranges = np.linalg.norm(cycle.points_vehicle, axis=1)
+    expected = (begin + growth * ranges) ** 2 + (bearing * np.maximum(ranges, 1.0)) ** 2
+    np.testing.assert_allclose(np.trace(cycle.covariances, axis1=1, axis2=2), expected)
 
 
 def test_two_sightings_of_a_cone_are_worth_less_by_their_correlation() -> None:
