@@ -111,6 +111,7 @@ class Laid:
     count: int  # number of cones
     share: float  # share of the cones that lie on others, by their information
     odds: float  # cost of the next place less that of this one; infinite if there is none
+    away: float  # square of the pose's distance from where it was expected (sigmas^2)
 
     @property
     def is_sure(self) -> bool:
@@ -119,8 +120,8 @@ class Laid:
 
     @property
     def is_likely(self) -> bool:
-        """Whether nearly all cones agree, and no other place is as good; enough for a place that is known."""
-        return self.agrees and self.odds >= ODDS_NEARBY
+        """Whether nearly all cones agree about where they were expected, and no other place is as good."""
+        return self.agrees and self.odds >= ODDS_NEARBY and self.away < GATE
 
     @property
     def agrees(self) -> bool:
@@ -139,7 +140,11 @@ def lay(
     if min(len(seen.labels), len(known.labels)) < MIN_CONES:
         return None
     pose, about, (cost, share, odds) = _laid(seen.cones, known.cones, mean, information, reach, LIMITS)
-    return Laid(pose, about, cost, len(seen.labels), share, odds) if np.isfinite(cost) else None
+    if not np.isfinite(cost):
+        return None
+    off = pose - mean
+    off[2] = wrap_angle(off[2:])[0]
+    return Laid(pose, about, cost, len(seen.labels), share, odds, float(off @ information @ off))
 
 
 @compiled
