@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.checkpoint import copied
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.se2 import compose, inverse, move_points, to_vehicle
 from pathspace_graph.graph.gaussian import factorize, marginalize
@@ -16,7 +17,16 @@ from pathspace_graph.graph.variables import Layout, pose_keys
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.relocalization import FOUND, MEMORY, KnownLoop, Search, evidence_of, lay_out_loop
+from pathspace_graph.loop.relocalization import (
+    FOUND,
+    MEMORY,
+    KnownLoop,
+    Search,
+    evidence_of,
+    lay_out_loop,
+    start_anew,
+)
+from pathspace_graph.mapping.registration import Matches, Motion, RefinedMotion
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
@@ -171,6 +181,19 @@ def test_the_motion_that_took_the_vehicle_away_is_undone() -> None:
     moved = move_points(away, truth[:, :2])
     np.testing.assert_allclose(found.motion.apply(moved), truth[:, :2], atol=0.5)
     np.testing.assert_allclose(found.motion.vector[2], inverse(away)[2], atol=0.05)
+
+
+def test_the_prior_of_a_place_that_was_found_has_three_times_the_sigmas_of_its_registration() -> None:
+    """Its detections are used once more, in the window: without them, only the prior is left."""
+    smoother = copied(clean()[1].smoother, {})
+    covariance = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.002], [0.0, 0.002, 0.01]])
+    nothing = Matches(np.zeros(0, np.intp), *[np.zeros(0)] * 4, np.zeros((3, 3)), np.zeros(3))  # type: ignore[arg-type]
+    motion = Motion(smoother.map.state.poses[-1, :2].copy(), np.array([0.1, -0.05, 0.01]))
+    jump = start_anew(smoother, smoother.next_cycle - 5, RefinedMotion(motion, nothing, covariance))
+    assert np.hypot(*jump[:2]) < 0.3
+    smoother.map.detections.release(np.arange(len(smoother.map.detections)))
+    newest = pose_keys(np.array([smoother.next_cycle - 1]))
+    np.testing.assert_allclose(smoother.covariance(newest), 9.0 * covariance, atol=1e-6)
 
 
 def test_no_place_is_found_with_too_few_detections() -> None:
