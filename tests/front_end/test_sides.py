@@ -112,6 +112,17 @@ def test_sides_are_told_without_colours(share: float, wrong_way: bool) -> None:
     assert (found[known] != true[known]).mean() < 0.02
 
 
+def test_colours_count_again_once_most_of_the_newest_detections_have_one() -> None:
+    """Each cycle's share fades by 0.98: after 18 cycles with colours 0.695 of them have none, below 0.7."""
+    judge, points, said = SideJudge(SidesSettings()), PLACES[:6], list[bool]()
+    sides = np.where(points[:, 1] > 0.0, LEFT, RIGHT)
+    for k in range(420):
+        labels = np.full(6, UNKNOWN) if k < 400 else sides
+        judge.update(np.zeros(3), np.zeros((1, 3)), detections(0.1 * k, points, labels))
+        said.append(judge.colourless)
+    assert said[0] and said.index(False) == 400 + 17
+
+
 def test_where_colours_are_common_an_unknown_one_stays_unknown() -> None:
     """The large cones of a start line have no colour, and stand beside the boundary."""
     log = drive(Faults(sensor=SensorFaults(colourless=0.4)))

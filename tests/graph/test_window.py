@@ -177,6 +177,19 @@ def test_small_motions_add_up_until_the_tolerance_is_passed() -> None:
         assert new_owners(window.measured, before) == expected
 
 
+def test_the_cycle_whose_odometry_came_last_gets_a_row_on_it_though_nothing_moves() -> None:
+    window, rng = make_window(), np.random.default_rng(1)
+    before = mark(window)
+    window.extend(
+        3, integrate_twists(np.full(3, 0.1), rng.normal(size=(3, POSE)), np.array([0.2, 0.1, 0.05]))
+    )
+    window.variables.insert(control_keys(0, np.array([6])), rng.normal(size=2))
+    window.variables.insert(pose_keys(np.array([4])), rng.normal(size=POSE))
+    assert window.relinearize(np.arange(5), ACTIVE)
+    assert new_owners(window.measured, before) == [3, 4]
+    assert holding(window.measured, pose_key(4)) == [3, 4]
+
+
 def test_the_calibration_never_makes_a_factor_stale() -> None:
     """Every row is linear in it."""
     window = make_window()

@@ -173,6 +173,17 @@ def test_a_lost_vehicle_is_registered_from_the_best_place_of_the_beginning() -> 
     np.testing.assert_allclose(found.motion.apply(scene.poses[:, :2]), scene.truth[:, :2], atol=0.3)
 
 
+def test_a_lost_vehicle_is_not_registered_farther_away_than_it_can_be() -> None:
+    """It has drifted by 25 m, and its prior is 1.5 times as wide as what it says of itself.
+
+    99.9 % of such drifts are within 4.04 standard deviations: here it is 2.1 or 7.6 of them.
+    """
+    scene = window()
+    scene.drift(motion(22.0, -12.0, 0.1, scene.truth[-1, :2]))
+    assert scene.register(np.diag([8.0, 8.0, 0.2]) ** 2) is not None
+    assert scene.register(np.diag([2.2, 2.2, 0.2]) ** 2) is None
+
+
 # --- refusals --------------------------------------------------------------------------------------------
 
 

@@ -259,6 +259,19 @@ def test_both_of_two_normals_that_meet_are_shortened_and_only_on_that_side(side:
     assert {short[2], *kept} == {6.0, 7.0}
 
 
+@pytest.mark.parametrize(("apart", "left"), [(10, [0.95 * 125.0**0.5, 0.95 * 5.0]), (11, [20.0, 20.0])])
+def test_normals_up_to_ten_points_apart_must_not_meet(apart: int, left: list[float]) -> None:
+    """The first one meets the last one 5 m to its left, above the ends of all between."""
+    points = np.column_stack([np.arange(apart + 1.0), np.zeros(apart + 1)])
+    normal = np.tile([0.0, 1.0], (apart + 1, 1))
+    normal[0] = np.array([apart, 5.0]) / np.hypot(apart, 5.0)
+    width = np.full(apart + 1, 0.1)
+    width[[0, -1]] = 20.0
+    shortened, _ = uncrossed(points, normal, [width, width], False)
+    np.testing.assert_allclose(shortened[[0, -1]], left)
+    np.testing.assert_array_equal(shortened[1:-1], 0.1)
+
+
 @pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional vectors")
 def test_planners_of_tum_find_no_crossing_normals() -> None:
     helpers = pytest.importorskip("trajectory_planning_helpers")
