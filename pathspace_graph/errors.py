@@ -33,7 +33,7 @@ class ReadingError(PathspaceError):
         self.t = t  # stamp of the cycle (s), where it has one
         when = "" if t is None else f"cycle at {t:.12g} s: "
         where = field if row is None else f"{field}, row {row}"
-        value = f"{found:g}" if isinstance(found, float) else str(found)
+        value = f"{found:.12g}" if isinstance(found, float) else str(found)
         super().__init__(f"{when}{where}: expected {expected}, found {value}")
 
     def at(self, t: float) -> Self:

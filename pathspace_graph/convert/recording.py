@@ -23,7 +23,7 @@ MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: message
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
-SHARED_STAMP: Final = "messages with detections have the stamp of another one, and are one cycle with it"
+SHARED: Final = "messages with detections are at most 1 ms after another one, and are one cycle with it"
 MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
 
 
@@ -132,6 +132,7 @@ def _cycles(
     notes["messages with detections were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
     begin, end = float(odometry.t[0]), float(odometry.t[-1]) + logs.MAX_HOLD
     found: dict[float, list[Points]] = {}
+    cycle = -np.inf
     for index in np.argsort(t, kind="stable"):
         points = usable(record.scans[index], notes)
         if not len(points.labels):
@@ -140,11 +141,13 @@ def _cycles(
         if not begin <= t[index] <= end:
             notes[OUTSIDE] += 1
             continue
-        scans = found.setdefault(float(t[index]), [])
+        if not logs.is_one_cycle(t[index], cycle):
+            cycle = float(t[index])
+        scans = found.setdefault(cycle, [])
         if any(map(points.equals, scans)):
             notes["messages with detections were repetitions, and were left out"] += 1
             continue
-        notes[SHARED_STAMP] += bool(scans)
+        notes[SHARED] += bool(scans)
         scans.append(points)
     if not found and notes[OUTSIDE]:
         span = f"{begin:.9g} s to {end - logs.MAX_HOLD:.9g} s"

@@ -58,6 +58,8 @@ SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
 _TRUE_ERRORS: Final = {"calibration": CALIBRATION, "sensor": SENSOR, "noise": NOISE}
 
+MIN_INTERVAL: Final = 1e-3  # s between perception cycles; below, the odometry is too certain for doubles
+ROUND_OFF: Final = 1e-6  # s, of the difference of two stamps: doubles resolve those since 1970 to 2.4e-7 s
 MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
 MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to double precision below
 
@@ -279,10 +281,21 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
 
 
 def cycles_of(t: Array, points: Array, covariances: Array, labels: IntArray) -> tuple[Detections, ...]:
-    """Return the perception cycles of detections (m,): neighbours with the same stamp (s) are one cycle."""
-    starts = np.flatnonzero(np.diff(t, prepend=-np.inf))
+    """Return the perception cycles of detections (m,) at stamps (s), see `is_one_cycle`."""
+    starts: list[int] = []
+    for row, stamp in enumerate(t.tolist()):
+        if not starts or not is_one_cycle(stamp, t[starts[-1]]):
+            starts.append(row)
     spans = [slice(a, b) for a, b in pairwise([*starts, len(t)])]
     return tuple(Detections(float(t[s.start]), points[s], covariances[s], labels[s]) for s in spans)
+
+
+def is_one_cycle(t: float, begin: float) -> bool:
+    """Return whether detections at t (s) belong to the cycle that begins at a stamp (s), and has that stamp.
+
+    Several cameras, and stamps that were rounded to milliseconds, differ by `MIN_INTERVAL` or less.
+    """
+    return abs(t - begin) <= MIN_INTERVAL + ROUND_OFF
 
 
 def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:

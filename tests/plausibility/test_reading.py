@@ -67,6 +67,18 @@ def test_a_refusal_without_a_likely_cause_is_as_it_was(tmp_path: Path) -> None:
     assert refused_hints(folder) == []
 
 
+def test_a_refusal_of_a_stamp_does_not_blame_the_labels(tmp_path: Path) -> None:
+    """All cones are left here, which would be told were the log not refused for a gap of a minute."""
+    log = MISTAKES["all labels left"](short_drive())
+    assert [hint.cause for hint in hints(log)] == ["labels"]
+    cycles = tuple(replace(cycle, t=cycle.t + 60.0 * (cycle.t > 5.0)) for cycle in log.cycles)
+    t = log.odometry.t + 60.0 * (log.odometry.t > 5.0)
+    folder = written(replace(log, cycles=cycles, odometry=replace(log.odometry, t=t)), tmp_path / "log")
+    with pytest.raises(InputError, match="at most 30 s after") as error:
+        read_plausible_log(folder, LimitSettings())
+    assert "label" not in str(error.value)
+
+
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
 def test_a_log_in_memory_with_what_no_file_may_have_is_judged_as_its_files_are(
     wrong: float, tmp_path: Path
