@@ -98,8 +98,8 @@ class Convert:
         check_target(out, LOG_FILE)
         rule = LabelRule(self.labels, self.label_field)
         with progress("converting"):
-            record = windowed(self._read(source, rule), self.window)
             file = source or Path(self.kind)
+            record = windowed(self._read(source, rule), self.window, file)
             log = with_measured_noise(to_log(record, self.frames, self.noise, file))
             write_checked(log, out, file)
         report(record.notes, rule, log, out)

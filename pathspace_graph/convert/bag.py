@@ -15,7 +15,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.parsing import read_text
 
 from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_of, twist_of, yaw_rate_of
-from .recording import Recording, twists_between
+from .recording import Recording, check_clock, twists_between
 from .settings import LabelRule
 
 INSTALL: Final = "pip install 'pathspace-graph[ros]'"  # command that installs the package that reads bags
@@ -155,6 +155,8 @@ def _twists(
     measured = [motion.twist for motion in odometry.values if motion.twist is not None]
     poses = np.array([motion.pose for motion in odometry.values if motion.pose is not None])
     whole = len(poses) == len(odometry.values)
+    if options.from_poses or not measured or imu is not None:  # these are in order of time here
+        check_clock(odometry.t, "odometry", path)
     if options.from_poses or not measured:
         if not whole:
             raise InputError(path, f"--from-poses: expected messages with a pose, found {odometry.name}")
@@ -170,6 +172,7 @@ def _twists(
             found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
             raise InputError(path, f"{odometry.name}: expected twists, {found}")
     if imu is not None:
+        check_clock(imu.t, "the IMU", path)
         return with_yaw_rate(t, twists, imu.t, np.array(imu.values))
     if np.isnan(twists[:, 2]).all():
         expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"

@@ -20,6 +20,8 @@ from .messages import Points, points_of, stamp_of, twist_of
 from .settings import SIGMA_ODOMETRY, Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
+MAX_DISORDER: Final = 2.0  # largest fall of stamps (s) from one message to the next of one clock
+PAUSE: Final = 1.0  # time (s) that is counted where a clock was reset
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
@@ -53,29 +55,82 @@ def twists_between(t: Array, poses: Array) -> Array:
     return twists_of(moves) / np.diff(t)[:, None]
 
 
-def windowed(record: Recording, window: Window) -> Recording:
+def clock_falls(t: Array) -> Array:
+    """Return by how much each stamp (n,) in s falls where the clock was reset; elsewhere 0.
+
+    Two messages before it and two from it on agree, unlike those of a stray stamp. Messages out of order fall
+    by less than `MAX_DISORDER`.
+    """
+    falls, known = np.zeros(len(t)), np.flatnonzero(np.isfinite(t))
+    of_known = t[known]
+    lowest_before = np.minimum(of_known[:-3], of_known[1:-2])
+    highest_after = np.maximum(of_known[2:-1], of_known[3:])
+    is_reset = lowest_before - highest_after > MAX_DISORDER
+    falls[known[2:-1]] = np.where(is_reset, of_known[1:-2] - of_known[2:-1], 0.0)
+    return falls
+
+
+def elapsed(t: Array) -> Array:
+    """Return stamps (n,) in s as those of a clock that is `PAUSE` later, not earlier, where this one falls."""
+    falls = clock_falls(t)
+    return np.asarray(t + np.cumsum(falls + PAUSE * (falls > 0.0)))
+
+
+def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None, begin: float = 0.0) -> None:
+    """Raise an InputError where stamps (n,) in s fall back between messages that are `chosen`, with a way out.
+
+    The options `--start` and `--end` count from `begin` (s) on, as `elapsed` does.
+    """
+    counted = np.flatnonzero(np.ones(len(t), bool) if chosen is None else chosen)
+    falls = clock_falls(t[counted])
+    if not falls.any():
+        return
+    inside = int(np.argmax(falls > 0.0))
+    before, at = counted[inside - 1], counted[inside]
+    cut = elapsed(t)[before] - begin + 0.5 * PAUSE
+    way_out = (
+        f"--end {cut:.1f} takes what is before, --start {cut:.1f} what is after it, and --received the times at "
+        "which the messages of a bag were received"
+    )
+    raise InputError(
+        file,
+        f"expected {what} by one clock, found that the stamps fall back by {t[before] - t[at]:.3g} s at message "
+        f"{at + 1}, from {t[before]:.12g} s to {t[at]:.12g} s: was the clock reset? {way_out}",
+    )
+
+
+def windowed(record: Recording, window: Window, file: Path) -> Recording:
     """Return the part of a record that counts; a later beginning, where the map begins, has no truth."""
-    if window == Window():
-        return record
-    scans, most, notes = record.scans, window.range_max, record.notes
-    if most is not None:
-        with np.errstate(over="ignore"):
-            near = [np.hypot(*scan.points.T) <= most for scan in scans]
-        left_out = sum(int((~one).sum()) for one in near)
-        notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
-        scans = [scan.where(one) for scan, one in zip(scans, near, strict=True)]
-    scan_t, begin = record.scan_t + window.time_offset, float(np.nanmin(record.t, initial=np.inf))
+    record, notes = _near(record, window.range_max), record.notes
+    scan_t = record.scan_t + window.time_offset
+    clocks = elapsed(record.t), elapsed(scan_t)
+    begin = float(np.nanmin(clocks[0], initial=np.inf))
     is_cut = window.start > 0.0 or window.end < np.inf  # else stamps that are not finite stay to be counted
     kept, seen = (
         (t >= begin + window.start) & (t <= begin + window.end) if is_cut else np.ones(len(t), bool)
-        for t in (record.t, scan_t)
+        for t in clocks
     )
+    check_clock(record.t, "odometry", file, kept, begin)
+    check_clock(scan_t, "detections", file, seen, begin)
     notes["odometry samples outside --start and --end were left out"] += int((~kept).sum())
     notes["messages with detections outside --start and --end were left out"] += int((~seen).sum())
-    scans = [scan for scan, one in zip(scans, seen.tolist(), strict=True) if one]
-    truth = None if record.truth is None or window.start else replace(record.truth, associations=None)
+    scans = [scan for scan, one in zip(record.scans, seen.tolist(), strict=True) if one]
+    truth = record.truth
+    if truth is not None and window != Window():
+        truth = None if window.start else replace(truth, associations=None)
     t, twists = record.t[kept], record.twists[kept]
     return replace(record, t=t, twists=twists, scan_t=scan_t[seen], scans=scans, truth=truth)
+
+
+def _near(record: Recording, most: float | None) -> Recording:
+    """Return a record without detections that are farther than `most` from the sensor (m), if any is given."""
+    if most is None:
+        return record
+    with np.errstate(over="ignore"):
+        near = [np.hypot(*scan.points.T) <= most for scan in record.scans]
+    left_out = sum(int((~one).sum()) for one in near)
+    record.notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
+    return replace(record, scans=[scan.where(one) for scan, one in zip(record.scans, near, strict=True)])
 
 
 def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) -> Log:

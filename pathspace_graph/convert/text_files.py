@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import pi
 from pathlib import Path
 from typing import Any, Final
@@ -148,11 +149,10 @@ def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
         covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
     if file.has("label"):
         labels = rule.of_all(np.array(file.table.columns[file.column("label")]))
-    cycles: dict[float, list[int]] = {}
-    for row, stamp in enumerate(t.tolist()):
-        cycles.setdefault(stamp, []).append(row)
+    starts = np.flatnonzero(np.diff(t, prepend=np.nan))
     detections = Points.of(points, labels, covariances)
-    return np.array([*cycles]), [detections.where(np.array(rows)) for rows in cycles.values()]
+    spans = [slice(*span) for span in pairwise([*starts.tolist(), len(t)])]
+    return t[starts], [detections.where(span) for span in spans]
 
 
 def _points(file: _File) -> Array:

@@ -409,6 +409,25 @@ def test_clocks_that_differ_are_told_and_mended_by_the_time_of_receipt(
     assert len(convert(bag, tmp_path / "log", "--received").cycles) == 1
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("more", [(), ("--from-poses",), ("--imu", "/imu")])
+def test_a_bag_that_was_played_in_a_loop_is_refused_until_the_times_of_receipt_are_taken(
+    kind: Kind, more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make(messages: Messages) -> list[Written]:
+        written: list[Written] = []
+        for k in range(60):
+            t, stamp = 0.1 * k, 0.1 * (k % 30)
+            written.append((t, "/odom", messages.odometry(stamp, TWIST, (t, 0.0, 0.0))))
+            written += [(t, "/imu", messages.imu(stamp, 0.1)), one_cone(messages, stamp, written=t)]
+        return written
+
+    bag = write_bag(tmp_path, kind, make)
+    said = refused(bag, tmp_path / "log", capsys, *TOPICS, *more)
+    assert "the stamps fall back by 2.9 s at message 31" in said
+    assert len(convert(bag, tmp_path / "log", "--received", *more).odometry.t) in (59, 60)
+
+
 def test_a_sensor_of_another_frame_is_told_until_its_mounting_is_stated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
