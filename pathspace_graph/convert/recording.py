@@ -71,13 +71,13 @@ def clock_falls(t: Array) -> Array:
 
 
 def elapsed(t: Array) -> Array:
-    """Return stamps (n,) in s as those of a clock that is `PAUSE` later, not earlier, where this one falls."""
+    """Return stamps (n,) in s of a clock that goes on by `PAUSE` where this one falls."""
     falls = clock_falls(t)
     return np.asarray(t + np.cumsum(falls + PAUSE * (falls > 0.0)))
 
 
 def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None, begin: float = 0.0) -> None:
-    """Raise an InputError where stamps (n,) in s fall back between messages that are `chosen`, with a way out.
+    """Raise an InputError where stamps (n,) in s fall back between `chosen` messages, with a way out.
 
     The options `--start` and `--end` count from `begin` (s) on, as `elapsed` does.
     """
@@ -88,15 +88,11 @@ def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None
     inside = int(np.argmax(falls > 0.0))
     before, at = counted[inside - 1], counted[inside]
     cut = elapsed(t)[before] - begin + 0.5 * PAUSE
-    way_out = (
-        f"--end {cut:.1f} takes what is before, --start {cut:.1f} what is after it, and --received the times at "
-        "which the messages of a bag were received"
-    )
-    raise InputError(
-        file,
-        f"expected {what} by one clock, found that the stamps fall back by {t[before] - t[at]:.3g} s at message "
-        f"{at + 1}, from {t[before]:.12g} s to {t[at]:.12g} s: was the clock reset? {way_out}",
-    )
+    fall = f"the stamps fall back by {t[before] - t[at]:.3g} s at message {at + 1}"
+    found = f"found that {fall}, from {t[before]:.12g} s to {t[at]:.12g} s: was the clock reset?"
+    parts = f"--end {cut:.1f} takes what is before, --start {cut:.1f} what is after it"
+    way_out = f"{parts}, and --received the times at which the messages of a bag were received"
+    raise InputError(file, f"expected {what} by one clock, {found} {way_out}")
 
 
 def windowed(record: Recording, window: Window, file: Path) -> Recording:
@@ -123,7 +119,7 @@ def windowed(record: Recording, window: Window, file: Path) -> Recording:
 
 
 def _near(record: Recording, most: float | None) -> Recording:
-    """Return a record without detections that are farther than `most` from the sensor (m), if any is given."""
+    """Return a record without detections farther than `most` from the sensor (m), if it is given."""
     if most is None:
         return record
     with np.errstate(over="ignore"):
@@ -166,14 +162,29 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     notes["odometry samples were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
     t, twists = t[order], twists[order]
     last = np.append(np.diff(t) > 0, True)  # of samples with one stamp the last one counts
+    _check_lost(t, twists, last, file)
     notes["odometry samples had the stamp of another one, and were left out"] += int((~last).sum())
     return Odometry(t[last], twists[last] * frames.flip)
 
 
+def _why(notes: Counter[str], what: str = "detections") -> list[str]:
+    return [f"{number} {text}" for text, number in notes.items() if number and what in text]
+
+
+def _check_lost(t: Array, twists: Array, last: BoolArray, file: Path) -> None:
+    """Raise an InputError where most samples would be lost, as they differ but share stamps (n,) in s."""
+    lost = ~last[:-1] & (twists[1:] != twists[:-1]).any(axis=1)
+    if 2 * lost.sum() > len(t):
+        found = f"found the stamp of another one in {lost.sum()} of {len(t)}"
+        whole = ": are these whole seconds (--columns t=SECONDS+NANOSECONDS)?" * bool(
+            (t == np.floor(t)).all()
+        )
+        raise InputError(file, f"expected odometry samples with stamps of their own, {found}{whole}")
+
+
 def _check_stamps(t: Array, what: str, file: Path, notes: Counter[str]) -> None:
     if len(t) == 0:
-        why = [f"{number} {text}" for text, number in notes.items() if number and what in text]
-        raise InputError(file, "; ".join([f"expected {what} with stamps, found none", *why]))
+        raise InputError(file, "; ".join([f"expected {what} with stamps, found none", *_why(notes, what)]))
     worst = float(np.abs(t).max())
     if worst > MAX_STAMP:
         raise InputError(file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}")
@@ -210,7 +221,8 @@ def _cycles(
         expected = f"expected detections in the time of the odometry, {span}"
         raise InputError(file, f"{expected}, found them {stamps}")
     if not found:
-        raise InputError(file, f"expected detections that can be used, found {len(t)} messages without any")
+        expected = f"expected detections that can be used, found {len(t)} messages without any"
+        raise InputError(file, "; ".join([expected, *_why(notes)]))
     joined = {stamp: Points(*map(np.concatenate, zip(*scans, strict=True))) for stamp, scans in found.items()}
     return tuple(in_vehicle_frame(stamp, points, frames, noise, notes) for stamp, points in joined.items())
 

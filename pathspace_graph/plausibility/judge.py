@@ -314,7 +314,9 @@ def camera(pairs: Pairs) -> list[Hint]:
 
 NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
 # causes for which a log can be refused: the size of its numbers. Labels and frames never are
-REFUSABLE: Final = frozenset({"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"})
+REFUSABLE: Final = frozenset(
+    {"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"}
+)
 SHOWN_WORDS: Final = 3  # most foreign labels that are shown
 
 
@@ -324,7 +326,9 @@ def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[H
         log = read_usable_log(folder, limits)
     except InputError as error:
         of_data = error.file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
-        causes = because([hint for hint in refused_hints(folder) if hint.cause in REFUSABLE]) if of_data else ""
+        causes = (
+            because([hint for hint in refused_hints(folder) if hint.cause in REFUSABLE]) if of_data else ""
+        )
         if not causes:
             raise
         raise InputError(error.file, f"{error.message}; {causes}", error.row) from error

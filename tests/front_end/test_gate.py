@@ -442,8 +442,10 @@ EPOCH = 1_700_000_000.0
 
 @pytest.mark.parametrize(
     ("seconds", "resolution", "of_each"),
-    [(0.0, 0.0, 1), (2e-4, 0.0, 1), (5e-4, 0.0, 1), (5e-4, 1e-3, 1), (1e-3, 0.0, 1), (1e-3, 1e-3, 1)]
-    + [(1.1e-3, 0.0, 2), (2e-3, 1e-3, 2), (3e-3, 0.0, 2)],
+    [
+        *((0.0, 0.0, 1), (2e-4, 0.0, 1), (5e-4, 0.0, 1), (5e-4, 1e-3, 1), (1e-3, 0.0, 1), (1e-3, 1e-3, 1)),
+        *((1.1e-3, 0.0, 2), (2e-3, 1e-3, 2), (3e-3, 0.0, 2)),
+    ],
 )
 def test_messages_of_two_cameras_are_one_cycle_or_each_is_used_at_its_time(
     seconds: float, resolution: float, of_each: int, tmp_path: Path
