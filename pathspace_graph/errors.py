@@ -73,11 +73,11 @@ def solving(what: str) -> Iterator[None]:
 
 
 def check_name(name: Any, known: Iterable[str], expected: str) -> None:
-    """Raise a SettingsError that names the nearest known name, unless `name` is known."""
+    """Raise a SettingsError that names the nearest known name if one is near, unless `name` is known."""
     known = list(known)
     if name in known:
         return
-    near = get_close_matches(str(name), known, n=1, cutoff=0.0)
+    near = get_close_matches(str(name), known, n=1)
     hint = f", the nearest is '{near[0]}'" if near else ""
     raise SettingsError(f"{expected}, found '{name}'{hint}")
 

@@ -16,7 +16,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.parsing import read_text
 
 from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_of, twist_of, yaw_rate_of
-from .recording import Recording, check_clock, twists_between
+from .recording import Recording, check_clock, rate, twists_between
 from .settings import LabelRule
 
 INSTALL: Final = "pip install 'pathspace-graph[ros]'"  # command that installs the package that reads bags
@@ -224,7 +224,7 @@ def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Ba
         reader = (rosbag1 if is_ros1(path) else rosbag2).Reader(path)
         reader.open()
     except Exception as error:
-        mended = way_to_mend(path)
+        mended = "" if "support" in str(error) else way_to_mend(path)  # a newer bag is no damaged one
         if mended:
             raise InputError(path, f"{DAMAGED} ({error}): {mended}") from None
         expected = "expected a ROS bag: a file .bag, .mcap or .db3, or a folder with metadata.yaml"
@@ -297,7 +297,7 @@ class Bag:
     def _error(self, message: str) -> InputError:
         seconds = 1e-9 * (self.reader.end_time - self.reader.start_time)
         topics = [
-            f"{name} ({topic.msgtype}, {topic.msgcount} messages, {topic.msgcount / seconds:.3g} Hz)"
+            f"{name} ({topic.msgtype}, {topic.msgcount} messages, {rate(topic.msgcount, seconds)})"
             for name, topic in sorted(self.reader.topics.items())
             if topic.msgcount
         ]

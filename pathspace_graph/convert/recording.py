@@ -21,6 +21,7 @@ from .settings import SIGMA_ODOMETRY, Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
 MAX_DISORDER: Final = 2.0  # largest fall of stamps (s) from one message to the next of one clock
+SHORTEST: Final = 1e-6  # time (s) in which nothing has a rate; a bag of one message has 1 ns
 PAUSE: Final = 1.0  # time (s) that is counted where a clock was reset
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
@@ -53,6 +54,11 @@ def twists_between(t: Array, poses: Array) -> Array:
     """Return the constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
     moves = np.array([relative(one, other) for one, other in pairwise(poses)])
     return twists_of(moves) / np.diff(t)[:, None]
+
+
+def rate(count: int, seconds: float) -> str:
+    """Return in words how often something came in a time (s), which may be none."""
+    return f"{count / seconds:.3g} Hz" if count > 1 and seconds > SHORTEST else "an unknown rate"
 
 
 def clock_falls(t: Array) -> Array:
@@ -97,7 +103,7 @@ def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None
 
 def windowed(record: Recording, window: Window, file: Path) -> Recording:
     """Return the part of a record that counts; a later beginning, where the map begins, has no truth."""
-    record, notes = _near(record, window.range_max), record.notes
+    notes, record = record.notes, _near(record, window.range_max, record.notes)
     scan_t = record.scan_t + window.time_offset
     clocks = elapsed(record.t), elapsed(scan_t)
     begin = float(np.nanmin(clocks[0], initial=np.inf))
@@ -118,14 +124,14 @@ def windowed(record: Recording, window: Window, file: Path) -> Recording:
     return replace(record, t=t, twists=twists, scan_t=scan_t[seen], scans=scans, truth=truth)
 
 
-def _near(record: Recording, most: float | None) -> Recording:
+def _near(record: Recording, most: float | None, notes: Counter[str]) -> Recording:
     """Return a record without detections farther than `most` from the sensor (m), if it is given."""
     if most is None:
         return record
     with np.errstate(over="ignore"):
         near = [np.hypot(*scan.points.T) <= most for scan in record.scans]
     left_out = sum(int((~one).sum()) for one in near)
-    record.notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
+    notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
     return replace(record, scans=[scan.where(one) for scan, one in zip(record.scans, near, strict=True)])
 
 

@@ -20,7 +20,6 @@ from . import parsing as limits
 from .brief import Brief, pictures
 from .files import atomic_folder
 from .header import POSITIVE, Header, noise_sections, to_toml, toml_text
-from .manifest import verified
 from .parsing import Column, Table, read_table, write_table
 
 if TYPE_CHECKING:
@@ -199,11 +198,6 @@ def read_log(folder: Path | str) -> Log:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
-    with verified(folder, *FILES):
-        return _read_log(folder)
-
-
-def _read_log(folder: Path) -> Log:
     header = Header(folder / LOG_FILE)
     odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
     sensor = [name for name in vars(SensorInfo()) if name in header.section("sensor")]
@@ -242,7 +236,7 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
         for name, values in _columns(log).items():
             write_table(target / name, COLUMNS[name], *values)
         if check:
-            _read_log(target)
+            read_log(target)
 
 
 def _read_odometry(table: Table) -> Odometry:

@@ -451,6 +451,14 @@ def test_a_file_that_is_compressed_or_was_not_finished_is_refused_with_a_command
         assert command.format(folder=tmp_path) in said
 
 
+def test_a_bag_of_one_moment_is_told_without_a_rate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path, "mcap", lambda messages: [(0.0, "/odom", messages.odometry(0.0, TWIST))])
+    said = refused(bag, tmp_path / "log", capsys, *TOPICS)
+    assert "/odom (nav_msgs/msg/Odometry, 1 messages, an unknown rate)" in said
+
+
 def test_a_bag_that_was_indexed_again_is_read_under_its_name(drive: Log, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, "rosbag1", of_log(drive, Messages.cloud_of))
     log = convert(bag.rename(tmp_path / "drive.bag.active"), tmp_path / "log")

@@ -330,3 +330,21 @@ def test_a_bad_line_is_named(line: str, tmp_path: Path, capsys: pytest.CaptureFi
     told = capsys.readouterr().err
     assert "drive.jsonl" in told and "6" in told and told.count("\n") == 1
     assert not (tmp_path / "log").exists()
+
+
+def test_a_line_with_one_cycle_has_no_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "drive.jsonl"
+    file.write_text('{"t": 1, "twist": [1, 0, 0], "detections": [{"x": 4, "y": 1}]}\n')
+    assert main(["convert", str(file), "--from", "jsonl", "--out", str(tmp_path / "log")]) == 0
+    said = capsys.readouterr().out
+    assert "odometry at an unknown rate, up to 1 m/s" in said
+    assert "Hz" not in said
+
+
+def test_a_line_with_a_bearing_alone_names_the_range(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "drive.jsonl"
+    file.write_text('{"t": 1, "twist": [1, 0, 0], "detections": [{"bearing": 0.1}]}\n')
+    assert main(["convert", str(file), "--from", "jsonl", "--out", str(tmp_path / "log")]) == 2
+    assert "(KeyError: 'range')" in capsys.readouterr().err

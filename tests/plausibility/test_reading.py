@@ -12,7 +12,7 @@ import pytest
 from pathspace_graph import hints
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.log import Log, write_log
+from pathspace_graph.io.log import Log, Odometry, write_log
 from pathspace_graph.plausibility.judge import read_plausible_log, refused_hints
 from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.mistakes import MISTAKES
@@ -100,7 +100,9 @@ def test_a_hint_is_told_and_the_log_is_mapped(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = MISTAKES["positions in centimetres"](short_drive())
-    short = Log(log.odometry, log.cycles[:60], log.odometry_sigma)
+    t, twist = log.odometry.t, log.odometry.twist
+    shown = t <= log.cycles[60].t
+    short = Log(Odometry(t[shown], twist[shown]), log.cycles[:60], log.odometry_sigma)
     folder, out = written(short, tmp_path / "log"), tmp_path / "map"
     assert main([command, str(folder), "--out", str(out)]) in (0, 3)
     lines = capsys.readouterr().err.splitlines()
