@@ -253,6 +253,16 @@ def test_a_process_that_was_given_up_does_not_block_the_next_batch() -> None:
     assert drive_record._submit(sum, [1, 2]).result(120.0) == 3
 
 
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="Windows")
+def test_an_interrupt_does_not_reach_the_process_of_the_batch_and_reaches_this_one() -> None:
+    """Ctrl-C goes to all processes of a terminal; one that is still importing would print where it was."""
+    if drive_record._worker.cache_info().currsize:
+        drive_record._end_worker()
+    blocked = drive_record._submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(120.0)
+    assert signal.SIGINT in blocked
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
 def test_a_loop_that_closes_while_a_batch_from_odometry_is_under_way_gives_that_batch_up(
     sent: list[Slow], stem: Stem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
