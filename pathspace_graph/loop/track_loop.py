@@ -98,7 +98,7 @@ class TrackLoop:
         """Return whether it is time to register the newest detections with the beginning of an open loop."""
         settings, length = self.settings.closing, self._path.length
         newest = self._smoother.variables.poses[-1]
-        if self.closed or self._rests or self._lap_batch is not None:
+        if self.closed or self._rests or self._lap_batch is not None or length < self._loop_rests:
             return False
         if not near_start(self._path, newest, settings):
             return False
@@ -232,6 +232,7 @@ class TrackLoop:
                 return None, ""
             if outcome.is_final:
                 self.record.give_up(outcome.reason)
+                self._loop_rests = 0.0  # a registration may close the loop at once
             return None, f"{STAYS_OPEN}: {outcome.reason}"
         if repairs and (not notice or self._crosses(outcome.splines) > self._boundaries_cross):
             return None, ""
@@ -270,10 +271,8 @@ class TrackLoop:
     def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
         """Send the lap to its batch, which begins at a map that has just been closed, or at odometry.
 
-        In a replay the batch ends in the recorded cycle. One under way is given up: there is one process.
+        In a replay the batch ends in the recorded cycle.
         """
-        if self._lap_batch is not None:
-            self._lap_batch.give_up()
         open_lap, smoother = self.settings.open_lap, self._smoother
         first, cycle = smoother.first_cycle, smoother.next_cycle - 1
         wait = max(min(open_lap.cycles, cycle - first), int(open_lap.cycles_share * cycle))
