@@ -240,9 +240,10 @@ class TrackLoop:
             return None, f"{STAYS_OPEN}: {outcome.objection}"
         if not self.closed:
             self._closes()
-        self.corrected_poses, self.lap_seconds = outcome.poses, outcome.seconds
+        self.lap_seconds = outcome.seconds
         jump, self._settled = go_on_from(smoother, outcome), self._path.length
         self.record.replaced(outcome.poses[: outcome.first_kept], smoother.variables.poses)
+        self.corrected_poses = self.record.poses
         self._boundaries_cross = self._crosses()
         return jump, notice
 
