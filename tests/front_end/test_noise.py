@@ -150,14 +150,31 @@ ERRORS = np.array([0.05, -0.3, 0.1, 0.08, 0.2])
 def test_where_the_odometry_is_trusted_the_ranges_take_the_whole_ratio() -> None:
     settings = replace(SETTINGS, calibration=CalibrationSettings(trust="odometry"))
     found = learner(noise(ERRORS)).calibrated(settings)
-    assert found.odometry == replace(settings.odometry, hold_scale=True)
+    assert found.odometry == replace(settings.odometry, hold_scale=True, sigma_scale=0.001)
     doubted = found.odometry.widened()
-    assert doubted.sigma_scale == settings.odometry.sigma_scale  # never both free
+    assert doubted.sigma_scale == 0.001  # never both free
     assert doubted.sigma_bias > settings.odometry.sigma_bias
     np.testing.assert_array_equal(found.calibration.means, ERRORS)
     np.testing.assert_array_equal(found.calibration.sigmas, np.maximum(SIGMA, settings.calibration.sigmas))
     assert found.calibration.doubt == inf
     assert replace(found, odometry=settings.odometry, calibration=settings.calibration) == settings
+
+
+def test_the_trusted_scale_is_held_whatever_error_contradicts_its_prior() -> None:
+    """Ranges that err far out alone look right near by: the scale of the speeds would take their errors."""
+    yaw_only = np.array([0.2, 0.0, 0.0, 0.0, 0.0])
+    settings = replace(SETTINGS, calibration=CalibrationSettings(trust="odometry"))
+    found = learner(noise(yaw_only)).calibrated(settings)
+    assert found.odometry == replace(settings.odometry, hold_scale=True, sigma_scale=0.001)
+    np.testing.assert_array_equal(found.calibration.means, yaw_only)
+    surer = replace(settings, odometry=OdometrySettings(sigma_scale=0.0004))
+    assert learner(noise(yaw_only)).calibrated(surer).odometry.sigma_scale == 0.0004
+    by_ranges = learner(noise(yaw_only)).calibrated(
+        replace(SETTINGS, calibration=CalibrationSettings(trust="ranges"))
+    )
+    assert by_ranges.odometry == SETTINGS.odometry
+    assert by_ranges.calibration.range_scale == 0.0
+    assert by_ranges.calibration.sigma_range_scale == SETTINGS.calibration.sigma_range_scale
 
 
 def test_where_the_ranges_are_trusted_the_speeds_take_the_whole_ratio() -> None:
