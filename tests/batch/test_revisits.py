@@ -111,7 +111,9 @@ def test_the_true_drive_is_about_a_sigma_away() -> None:
     assert 0.7 < np.mean(squares) < 1.4
 
 
-@pytest.mark.parametrize(("sigmas", "why"), [(0.95, ""), (1.05, "the poses are {:.1f} sigmas from the odometry")])
+@pytest.mark.parametrize(
+    ("sigmas", "why"), [(0.95, ""), (1.05, "the poses are {:.1f} sigmas from the odometry")]
+)
 def test_an_optimum_that_bends_the_drive_is_refused(sigmas: float, why: str) -> None:
     """Each pose is off by so many standard deviations in each direction."""
     chain, truth = course()

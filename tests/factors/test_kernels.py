@@ -152,7 +152,13 @@ def constellations(rng: np.random.Generator) -> tuple[Any, ...]:
     seen = to_vehicle(points + pose[0, :2], pose) + 0.1 * rng.normal(size=(COUNT, 2))
     known = points + pose[0, :2], 0.01 * covariances(rng), labels
     about = pose[0] + (0.7, -0.4, 0.1), 0.1 * information(rng, 3)
-    return (seen, 0.01 * covariances(rng), labels), known, *about, (4.0, 0.3), (0.25, 9.0, 0.5, 0.05, 1.0, 10.0)
+    return (
+        (seen, 0.01 * covariances(rng), labels),
+        known,
+        *about,
+        (4.0, 0.3),
+        (0.25, 9.0, 0.5, 0.05, 1.0, 10.0),
+    )
 
 
 def seen_curves(rng: np.random.Generator, periodic: bool) -> tuple[Any, ...]:

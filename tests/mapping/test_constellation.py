@@ -19,8 +19,8 @@ from pathspace_graph.mapping.constellation import (
     ODDS,
     ODDS_NEARBY,
     RANGE,
-    SIGMA,
     SIGHTINGS,
+    SIGMA,
     Constellation,
     Laid,
     SeenIn,
@@ -74,7 +74,7 @@ def beside(known: Constellation, chosen: slice | IntArray, pose: Array = POSE) -
 def test_a_few_cones_tell_the_pose_from_which_they_were_seen() -> None:
     """The information is that of each cone's distance, by the variances of both and of slow errors."""
     known = scattered()
-    laid = lay(beside(known, slice(10)), known, POSE + (1.2, -0.9, 0.2), NOTHING, REACH)
+    laid = lay(beside(known, slice(10)), known, POSE + np.array([1.2, -0.9, 0.2]), NOTHING, REACH)
     assert laid is not None and laid.is_sure
     np.testing.assert_allclose(laid.pose, POSE, atol=1e-6)
     assert laid.cost == pytest.approx(0.0, abs=1e-9)
@@ -94,7 +94,7 @@ def test_a_cone_lies_on_one_of_its_own_colour_only() -> None:
 
 def test_what_is_expected_counts_up_to_its_cap() -> None:
     """The pose is a metre and a tenth of a radian off, which are one sigma each, or any number of them."""
-    known, mean = scattered(), POSE + (1.0, 0.0, 0.1)
+    known, mean = scattered(), POSE + np.array([1.0, 0.0, 0.1])
     for sigmas, cost in (((1.0, 1.0, 0.1), 2.0), ((0.01, 0.01, 0.001), 9.0)):
         laid = lay(beside(known, slice(None)), known, mean, np.diag(np.array(sigmas) ** -2.0), REACH)
         assert laid is not None
@@ -104,7 +104,7 @@ def test_what_is_expected_counts_up_to_its_cap() -> None:
 
 def test_the_heading_may_have_turned_around() -> None:
     known = scattered()
-    mean = POSE + (0.4, 0.4, 2.0 * np.pi)
+    mean = POSE + np.array([0.4, 0.4, 2.0 * np.pi])
     laid = lay(beside(known, slice(None)), known, mean, np.diag([1.0, 1.0, 100.0]), REACH)
     assert laid is not None and laid.cost == pytest.approx(0.32, abs=1e-6)
 
@@ -292,7 +292,8 @@ def test_an_open_road_meets_no_cones_again() -> None:
 def test_another_road_beside_is_no_return(lane: float, is_same: bool) -> None:
     """The second pass is so far (m) to the left of the first, whose sensor has seen its cones as well."""
     first = along((40.0, 0.0))
-    true = np.concatenate([first, along((6.0, 0.0)) + (80.0, 40.0, 0.0), first[10:60] + (0.0, lane, 0.0)])
+    elsewhere, beside_it = np.array([80.0, 40.0, 0.0]), np.array([0.0, lane, 0.0])
+    true = np.concatenate([first, along((6.0, 0.0)) + elsewhere, first[10:60] + beside_it])
     found = find_return(sensor(true), true, float(path_lengths(first)[-1]), NEARBY, GROWTH)
     assert (found is not None) is is_same
     if found is not None:
