@@ -204,9 +204,12 @@ def test_references_in_docstrings_exist() -> None:
 
 
 @every_page
-def test_python_blocks_compile(page: Path) -> None:
-    for block in blocks(page, "python"):
-        compile(block, str(page), "exec")
+def test_python_blocks_import_what_exists(page: Path) -> None:
+    nodes = [node for block in blocks(page, "python") for node in ast.walk(ast.parse(block))]
+    froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+    named = [(str(node.module), alias.name) for node in froms for alias in node.names]
+    own = [(module, name) for module, name in named if module.partition(".")[0] == PACKAGE]
+    assert [(module, name) for module, name in own if not hasattr(import_module(module), name)] == []
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE as POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
-from pathspace_graph.mapping.motion import known_noise, with_inflated_priors
+from pathspace_graph.mapping.motion import known_noise, size_of_vehicle, with_inflated_priors, with_size
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict
@@ -219,7 +219,11 @@ class BatchResult(BatchRun):
         """Return the marginal covariance (n, 3, 3) of each pose (x, y, theta), map frame, computed once."""
         with threadpool_limits(limits=1):
             weights = self.scale ** np.array(POSE_LENGTHS, float)
-            return np.outer(weights, weights) * self.system.eliminated(self.optimum).pose_marginals
+            marginals = self.system.eliminated(self.optimum).pose_marginals
+            lengths = self.optimum.state.poses * [1.0, 1.0, 0.0]
+            size = self.system.settings.odometry.sigma_size
+            marginals = marginals + size**2 * lengths[:, :, None] * lengths[:, None, :]
+            return np.outer(weights, weights) * marginals
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return the whole problem at the optimum by `nonlinear_graph`; its lengths are over the scale."""
@@ -285,7 +289,9 @@ class BatchMapper:
         system = optimizer.system
         at, convergence, known = _with_wider_priors(optimizer, *found)
         watch.lap("optimum")
-        joint, vehicle = known.covariance(at.state.map_keys), _vehicle(at.state, known)
+        size = system.settings.odometry.sigma_size
+        joint = with_size(known.covariance(at.state.map_keys), at.state.map_points.ravel(), size)
+        vehicle = _vehicle(at.state, known, size)
         watch.lap("covariance")
         detections = deepcopy(system.detections)  # the result's problem keeps its own associations
         state, change = simplified(at.state, detections, settings)
@@ -347,10 +353,12 @@ def _known(system: BatchSystem, at: Evaluation) -> FactoredSystem:
     return FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
 
 
-def _vehicle(state: State, known: FactoredSystem) -> VehicleState:
+def _vehicle(state: State, known: FactoredSystem, sigma_size: float) -> VehicleState:
     """Return the last pose and the calibration, with their joint covariance."""
     variables, last = state.variables, pose_key(len(state.poses) - 1)
     covariance = known.covariance(np.append(last, variables.calibration_keys))
+    values = size_of_vehicle(state.poses[-1], len(variables.calibrations))
+    covariance = with_size(covariance, values, sigma_size)
     return VehicleState.split(state.poses[-1], variables.calibrations, covariance)
 
 

@@ -279,7 +279,8 @@ def find_revisits(chain: LogOdometry, table: DetectionColumns, settings: MapperS
     closing, poses = settings.closing, chain.dead_reckoned(chain.calibration_mean)
     driven, revisits, due, lap = path_lengths(poses), list[Revisit](), closing.min_path, np.inf
     for newest in range(len(poses)):
-        if driven[newest] < due:
+        is_last = newest == len(poses) - 1 and driven[newest] > closing.min_path
+        if driven[newest] < due and not is_last:
             continue
         so_far = poses[: newest + 1]
         if revisits:

@@ -24,8 +24,8 @@ AGAIN: Final = 1.5  # growth of the driving time after which it is measured agai
 MOST_CYCLES: Final = 300  # newest cycles on which it is measured, which bounds its time
 MIN_SPEED: Final = 0.3  # speed from which on the vehicle drives (m/s)
 SCALE: Final = SENSOR.index("range_scale")
-SIGMA_HELD: Final = 0.001  # of the scale of the sensor that sets the size of the world (-)
-REFERENCE_RANGE: Final = 10.0  # range at whose noise ranges are compared with speeds (m)
+SIGMA_FREE: Final = 0.1  # of the scale of the ranges where the odometry sets the size of the world (-)
+REFERENCE_RANGE: Final = 10.0  # range at which the scatter of ranges tells how well their scale is known (m)
 
 
 class NoiseLearner:
@@ -121,8 +121,8 @@ class NoiseLearner:
         sigmas = np.maximum(measured.sensor_sigma, sensor.sigmas)
         odometry, means = settings.odometry, measured.sensor.copy()
         if self.trusts_odometry(settings):
-            sigma = min(odometry.sigma_scale, SIGMA_HELD)
-            odometry = replace(odometry, hold_scale=True, sigma_scale=sigma)
+            odometry = replace(odometry, hold_scale=True)
+            sigmas[SCALE] = SIGMA_FREE
         else:
             if contradicted[SCALE]:
                 scale, sigma = float(means[SCALE]), max(float(sigmas[SCALE]), odometry.sigma_scale)
@@ -154,17 +154,16 @@ class NoiseLearner:
         return RunNoise(odometry, detections, measured, size)
 
     def trusts_odometry(self, settings: MapperSettings) -> bool:
-        """Return whether the odometry sets the size of the map, by default where it is the smoother one.
+        """Return whether the odometry sets the size of the map, by default where its scale is better known.
 
-        Over a second it errs by the white noise of its readings, the ranges by that of their detections.
+        A sensor's systematic errors are as large as its scatter, or larger: so the scale of ranges is known
+        as well as a range is.
         """
         measured, trust = self.measured, settings.calibration.trust
         if trust is not None or measured is None or measured.along is None:
             return trust == "odometry"
-        walk = measured.odometry[0] * np.sqrt(measured.interval)
         sigma = float(measured.along.sigmas(np.array([REFERENCE_RANGE]))[0])
-        stays = measured.along.inflation(measured.count, measured.period)
-        return bool(walk < sigma * np.sqrt(stays * measured.period / measured.per_cycle))
+        return sigma > REFERENCE_RANGE * settings.odometry.sigma_scale
 
 
 def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:

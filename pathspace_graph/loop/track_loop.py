@@ -77,6 +77,11 @@ class TrackLoop:
         self._resumes = 0.0
 
     @property
+    def sigma_size(self) -> float:
+        """Return the standard deviation of the size of the world, where it is no variable (-)."""
+        return self._inflated.odometry.sigma_size
+
+    @property
     def is_searching(self) -> bool:
         """Return whether the vehicle is lost on a closed map, and is looked for."""
         return self._search is not None

@@ -43,10 +43,10 @@ CELL: Final = 0.5  # of the votes (m)
 TURN: Final = 0.05  # step of the headings that are tried (rad)
 APART: Final = 1.0  # least distance of two different places (m)
 PLACES: Final = 10  # most places of each heading, and a third of the most that are refined
-RANGE: Final = 12.0  # farthest detections that are merged (m)
+RANGE: Final = 16.0  # farthest detections that are merged (m)
 NEWEST: Final = (10.0, 40.0)  # least and most of the newest path whose cones are laid on earlier ones (m)
 BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
-MIN_CONES: Final = 8
+MIN_CONES: Final = 6  # least number of cones that tell a place
 MIN_SHARE: Final = 0.8  # least share of the cones that lie on earlier ones, by their information
 MISFIT: Final = 2.5  # most mean capped square of the cones: that of cones that agree is 2 at most
 ODDS: Final = 20.0  # least difference of cost to the next place: twice the logarithm of the odds
@@ -111,6 +111,7 @@ class Laid:
     count: int  # number of cones
     share: float  # share of the cones that lie on others, by their information
     odds: float  # cost of the next place less that of this one; infinite if there is none
+    away: float  # square of the pose's distance from where it was expected (sigmas^2)
 
     @property
     def is_sure(self) -> bool:
@@ -119,8 +120,8 @@ class Laid:
 
     @property
     def is_likely(self) -> bool:
-        """Whether nearly all cones agree, and no other place is as good; enough for a place that is known."""
-        return self.agrees and self.odds >= ODDS_NEARBY
+        """Whether nearly all cones agree about where they were expected, and no other place is as good."""
+        return self.agrees and self.odds >= ODDS_NEARBY and self.away < GATE
 
     @property
     def agrees(self) -> bool:
@@ -139,7 +140,11 @@ def lay(
     if min(len(seen.labels), len(known.labels)) < MIN_CONES:
         return None
     pose, about, (cost, share, odds) = _laid(seen.cones, known.cones, mean, information, reach, LIMITS)
-    return Laid(pose, about, cost, len(seen.labels), share, odds) if np.isfinite(cost) else None
+    if not np.isfinite(cost):
+        return None
+    off = pose - mean
+    off[2] = wrap_angle(off[2:])[0]
+    return Laid(pose, about, cost, len(seen.labels), share, odds, float(off @ information @ off))
 
 
 @compiled

@@ -146,13 +146,29 @@ def inflate_priors(
     return settings
 
 
-def vehicle_state(smoother: FixedLagSmoother[MapRows]) -> VehicleState:
+def with_size(covariance: Array, values: Array, sigma: float) -> Array:
+    """Return a covariance (n, n) with that of the size of the world added: `sigma^2 v v'`.
+
+    The values v (n,) are lengths from where the drive began (m), and zero for headings. Where a scale is held
+    no measurement tells the size, so it changes all lengths alike.
+    """
+    return covariance + sigma**2 * np.outer(values, values)
+
+
+def size_of_vehicle(pose: Array, count: int) -> Array:
+    """Return the values of `with_size` (n,) of [pose | calibrations], of which the first is a scale."""
+    return np.concatenate([pose[:2], [0.0, -1.0], np.zeros(count - 1)])
+
+
+def vehicle_state(smoother: FixedLagSmoother[MapRows], sigma_size: float = 0.0) -> VehicleState:
     """Return the newest pose and the calibration of a smoother, with their joint covariance."""
     variables, keys = smoother.variables, [pose_key(smoother.next_cycle - 1), CALIBRATION_KEY]
     if len(variables.sensor):
         keys.append(SENSOR_KEY)
     covariance = smoother.covariance(np.array(keys, np.intp))
-    return VehicleState.split(variables.poses[-1], variables.calibrations, covariance)
+    pose = variables.poses[-1]
+    covariance = with_size(covariance, size_of_vehicle(pose, len(variables.calibrations)), sigma_size)
+    return VehicleState.split(pose, variables.calibrations, covariance)
 
 
 def smoother_settings(settings: MapperSettings) -> SmootherSettings:

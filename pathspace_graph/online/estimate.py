@@ -21,7 +21,7 @@ from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import LapBatches, VehicleState
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.motion import vehicle_state
+from pathspace_graph.mapping.motion import vehicle_state, with_size
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones
@@ -67,6 +67,8 @@ class MapperEstimate:
             return Map(self.closed, {})
         newest = pose_keys(np.array([self.smoother.next_cycle - 1]))
         joint = self.smoother.covariance(np.concatenate([track.state.map_keys, newest]))
+        lengths = np.concatenate([track.state.map_points.ravel(), self.poses[-1, :2], [0.0]])
+        joint = with_size(joint, lengths, self.loop.sigma_size)
         if self.closed:
             sizes, shape = [len(one.known) for one in outlooks.values()], self.settings.spline.sigma_shape
             sigmas = [track.scatter.get(b, np.full(n, shape)) for b, n in zip(outlooks, sizes, strict=True)]
@@ -142,7 +144,7 @@ class MapperEstimate:
     def vehicle_state(self) -> VehicleState:
         """Return the newest pose and the calibration, with their joint covariance."""
         with self.looked_at():
-            return vehicle_state(self.smoother)
+            return vehicle_state(self.smoother, self.loop.sigma_size)
 
     def _outlooks(self) -> dict[int, Outlook]:
         self.smoother.refresh()

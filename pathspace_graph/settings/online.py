@@ -152,6 +152,7 @@ class SidesSettings(Positive):
 # --- priors of constant errors, which become wide where a drive contradicts them -------------------------
 
 WIDE_ODOMETRY: Final = 10.0  # standard deviations of the odometry's wide priors by those of a calibrated one
+HELD: Final = 0.02  # standard deviation of a scale that is held, by its own
 WIDE_SENSOR: Final = 20.0  # standard deviations of the sensor's wide priors by those of a calibrated one
 
 
@@ -192,7 +193,18 @@ class OdometrySettings(_Priors):
     doubt: float = 4.0
     """Contradiction from which both priors become wide, standard deviations; `inf` to hold them always."""
     hold_scale: bool = False
-    """Whether the prior of the scale never becomes wide, since the speeds set the size of the map."""
+    """Whether the scale is held, since the speeds set the size of the map: a free one would shrink it until
+    its residuals are smaller. Its standard deviation is that of the size, in every covariance."""
+
+    @property
+    def sigmas(self) -> tuple[float, ...]:
+        """Return standard deviations of the priors; a scale that is held is as good as known."""
+        return self.sigma_scale * (HELD if self.hold_scale else 1.0), self.sigma_bias
+
+    @property
+    def sigma_size(self) -> float:
+        """Return the standard deviation of the size of the world, where it is no variable (-)."""
+        return self.sigma_scale if self.hold_scale else 0.0
 
     def widened(self) -> Self:
         """Return the settings of wide priors, which are not doubted again."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -11,10 +12,10 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import ClosureEvidence, evidence, is_true_closure, is_worth_trying, objection
 from pathspace_graph.batch.mapper import BatchMapper, find_closed_optimum
-from pathspace_graph.batch.optimizer import LOOSE_GATE, Optimizer
+from pathspace_graph.batch.optimizer import LOOSE_GATE, Convergence, Optimizer
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import Recurrence, find_recurrence, start_odometry
-from pathspace_graph.batch.system import BatchSystem, Biweight
+from pathspace_graph.batch.system import BatchSystem, Biweight, Evaluation
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
@@ -78,19 +79,37 @@ def driven(laps: float) -> Log:
     return noisy(course_log(laps), seed=3)
 
 
+@cache
+def closed() -> tuple[BatchSystem, Evaluation, Convergence]:
+    """Returns the problem of a closed course, and its optimum."""
+    optimizer = optimizer_of(driven(1.4))
+    found = find_closed_optimum(optimizer)
+    assert found is not None
+    return optimizer.system, *found
+
+
 def test_a_course_that_is_driven_again_is_closed() -> None:
     """The longest gap is that of a few cones, and the overlap is what was driven of the second lap."""
-    optimizer = optimizer_of(driven(1.4))
-    found_optimum = find_closed_optimum(optimizer)
-    assert found_optimum is not None
-    at, convergence = found_optimum
-    found = evidence(at, optimizer.system.detections, SETTINGS)
+    system, at, convergence = closed()
+    found = evidence(at, system.detections, SETTINGS)
     assert convergence.converged
     assert is_true_closure(found, SETTINGS)
     assert found.used > 0.95
     assert found.used_again > 0.95
     assert 0.7 < found.misfit < 1.3
     np.testing.assert_allclose(found.overlap, 0.4 * COURSE, atol=5.0)
+
+
+@pytest.mark.parametrize("around", [0.0, 45.0])
+def test_a_hole_across_the_seam_of_a_curve_is_as_long_as_one_elsewhere(around: float) -> None:
+    """No detection is used within 15 m of a place of the left boundary: 30 m, and up to two cones."""
+    system, state = deepcopy(closed()[0]), closed()[1].state
+    detections, length = system.detections, state.boundaries[LEFT].length
+    away = np.abs(np.mod(detections.u - around + 0.5 * length, length) - 0.5 * length)
+    detections.release(np.flatnonzero((detections.boundary == LEFT) & (away < 15.0)))
+    found = evidence(system.evaluate(state), detections, SETTINGS)
+    assert found.gap == pytest.approx(33.0, abs=3.0)
+    assert not is_true_closure(replace(BELIEVED, gap=found.gap), SETTINGS)
 
 
 def test_a_loop_that_is_closed_short_of_the_lap_is_not_believed() -> None:

@@ -63,7 +63,7 @@ def test_each_later_lap_of_a_drive_is_met_again_every_few_metres() -> None:
     lap = float(driven[revisits[0].later] - driven[revisits[0].earlier])
     assert found.lap == pytest.approx(lap, rel=0.02)
     later = driven[[one.later for one in revisits]]
-    assert (np.diff(later) >= INTERVAL - 1.0).all()
+    assert (np.diff(later[:-1]) >= INTERVAL - 1.0).all()  # at the end of the drive there may be one more
     assert len(revisits) > 0.6 * (driven[-1] - lap) / INTERVAL
     off = np.array([one.local - relative(truth[one.earlier], truth[one.later]) for one in revisits])
     off[:, 2] = wrap_angle(off[:, 2])

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pathspace_graph.cli import main
 from pathspace_graph.convert.bag import with_yaw_rate
@@ -434,8 +435,19 @@ def test_a_sensor_of_another_frame_is_told_until_its_mounting_is_stated(
     assert "found them in odom, the frame of its pose" in line
 
 
-def transform(messages: Messages, parent: str, child: str, x: float, y: float, yaw: float) -> Any:
-    turned = messages.make("geometry_msgs/msg/Quaternion", z=np.sin(yaw / 2), w=np.cos(yaw / 2))
+def transform(
+    messages: Messages,
+    parent: str,
+    child: str,
+    x: float,
+    y: float,
+    yaw: float,
+    pitch: float = 0.0,
+    roll: float = 0.0,
+) -> Any:
+    """Returns a child's pose in its parent; yaw, pitch and roll (rad) are turned by in this order."""
+    quaternion = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_quat().tolist()
+    turned = messages.make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", quaternion, strict=True)))
     moved = messages.make(
         "geometry_msgs/msg/Transform", translation=messages.vector(x=x, y=y), rotation=turned
     )
@@ -464,6 +476,41 @@ def test_the_transforms_of_a_bag_say_where_the_sensor_is(
     np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.5 - 1.5, 0.2 + 5.0]], atol=1e-9)
     log = convert(bag, tmp_path / "stated", "--mounting", "0", "0", "0")
     np.testing.assert_allclose(log.cycles[0].points_vehicle, [[5.0, 1.5]])
+
+
+@pytest.mark.parametrize(
+    ("yaw", "pitch", "roll", "is_level"),
+    [
+        (30.0, 5.0, -5.0, True),
+        (0.0, 11.0, 0.0, True),
+        (0.0, 12.0, 0.0, False),
+        (30.0, 0.0, -12.0, False),
+        (90.0, 9.0, 9.0, False),  # 12.7 degrees together
+        (-90.0, 0.0, -90.0, False),  # a camera's frame: z ahead, x to the right
+        (0.0, 0.0, 180.0, False),  # upside down
+    ],
+)
+def test_only_a_level_sensor_is_placed_by_the_transforms_of_a_bag(
+    yaw: float, pitch: float, roll: float, is_level: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two coordinates say nothing of a height, so that others are told until their mounting is stated."""
+
+    def make(messages: Messages) -> list[Written]:
+        angles = np.deg2rad([yaw, pitch, roll]).tolist()
+        static = messages.make(
+            "tf2_msgs/msg/TFMessage",
+            transforms=[transform(messages, "base_link", "camera", 1.0, 0.0, *angles)],
+        )
+        twists = [(t, "/odom", messages.odometry(t, TWIST)) for t in (0.0, 0.1, 0.2)]
+        return [(0.0, "/tf_static", static), *twists, one_cone(messages, 0.1, frame="camera")]
+
+    log = convert(write_bag(tmp_path, "mcap", make), tmp_path / "log")
+    said = capsys.readouterr().out
+    assert ("/tf_static puts at 1 0" in said) is is_level
+    assert ("in frame camera, the odometry is of base_link: --mounting" in said) is not is_level
+    turn = np.deg2rad(yaw) * is_level
+    expected = [is_level + 5.0 * np.cos(turn) - 1.5 * np.sin(turn), 5.0 * np.sin(turn) + 1.5 * np.cos(turn)]
+    np.testing.assert_allclose(log.cycles[0].points_vehicle, [expected], atol=0.1)
 
 
 def test_stamps_and_times_of_receipt_that_differ_are_told(

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.eval.hints import CAUSES, GOOD, causes_of, judged, main, outcome, summary
-from pathspace_graph.io.overrides import override
+from pathspace_graph.io.overrides import leaves, override
 from pathspace_graph.sim.mistakes import MISTAKES
 from pathspace_graph.sim.simulate import SimulationSettings
 
@@ -24,7 +24,8 @@ def test_every_mistake_has_its_causes_by_the_longest_beginning() -> None:
 
 def test_every_good_log_has_known_settings() -> None:
     for name, good in GOOD.items():
-        override(SimulationSettings(), good.overrides, name)
+        changed = leaves(override(SimulationSettings(), good.overrides, name))
+        assert {key: changed[key] for key in good.overrides} == good.overrides, name
 
 
 def test_a_wrong_cause_does_not_count() -> None:

@@ -109,6 +109,13 @@ def test_a_second_of_wrong_readings_is_told_and_replaced(log: Log, change: Calla
     assert lost > 3.0 * kept
 
 
+def test_a_yaw_rate_is_not_believed_beside_speeds_that_are_contradicted_if_it_is_wrong_too(log: Log) -> None:
+    """It is 0.5 rad/s too high for a second."""
+    motions = checked(faulty(log, lambda twist: twist * [1.5, 1.5, 1.0] + [0.0, 0.0, 0.5]))
+    assert sum(motion.doubted for motion in motions) >= 6
+    assert np.abs(errors(log, motions).cumsum(axis=0))[:, 2].max() < 0.1
+
+
 def test_the_scale_of_the_speeds_is_not_learned_from_a_slip(log: Log) -> None:
     motions = checked(faulty(log, lambda twist: twist * [1.5, 1.5, 1.0]))
     for motion in motions:
@@ -201,6 +208,69 @@ def test_an_excess_of_four_is_that_of_covariances_four_times_as_large(
         np.testing.assert_allclose(found.delta, expected.delta, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-5, atol=1e-10)
     np.testing.assert_allclose(check.errors.covariance, other.errors.covariance, rtol=1e-5, atol=1e-10)
+
+
+def with_slip(seed: int, begins: float) -> tuple[list[MeasuredMotion], Array]:
+    """Returns the motions of a noisy drive that slips from a share of cycle 20 on, and true ones (k,), m."""
+    rng, place, motions = np.random.default_rng(seed), 0.0, []
+    cones = np.array([[x, side] for x in np.arange(0.0, 40.0, 3.0) for side in (-2.0, 2.5)])
+    cones += rng.uniform(-0.8, 0.8, cones.shape)
+    check = MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings())
+    steps = 0.5 + 0.1 * np.sin(np.arange(24) / 2.0)
+    for k, step in enumerate(steps):
+        place += step
+        seen = cones - [place, 0.0]
+        seen = seen[(seen[:, 0] > 0.0) & (seen[:, 0] < 12.0)]
+        seen += rng.normal(0.0, 0.1, seen.shape)
+        twists = np.column_stack([np.full(10, 10.0 * step), np.zeros((10, 2))])
+        twists[k + np.arange(10) / 10.0 >= 20.0 + begins, 0] *= 2.5
+        twists += rng.normal(0.0, [0.1, 0.1, 0.01], twists.shape)
+        odometry = Odometry(0.1 * k + 0.01 * np.arange(10), twists)
+        motions.append(check.update(odometry, _cycle(0.1 * (k + 1), seen)))
+    return motions, steps
+
+
+def test_a_slip_that_begins_between_two_cycles_is_in_the_covariance_of_what_takes_its_place() -> None:
+    """Cycle 20 slips in its last three tenths, which is too little to be seen; cycle 21 does throughout.
+
+    The error of both together has the variance that they claim: the mean of 12 squares is below 1.75, the
+    95th percentile of a twelfth of chi-square. It is 2.9 where the first one isn't thought of.
+    """
+    squares = []
+    for seed in range(12):
+        motions, true = with_slip(seed, begins=0.7)
+        both = motions[20:22]
+        assert both[1].doubted and not motions[19].doubted
+        error = sum(float(motion.odometry.delta[0]) for motion in both) - true[20:22].sum()
+        squares.append(error**2 / sum(float(motion.odometry.covariance[0, 0]) for motion in both))
+    assert np.mean(squares) < 1.75
+
+
+def is_doubted_again(first: float, later: int) -> bool:
+    """Whether readings 25 % too high are contradicted so many cycles after half a second at `first` times."""
+    rng, place, doubted = np.random.default_rng(0), 0.0, []
+    cones = np.array([[x, side] for x in np.arange(0.0, 100.0, 3.0) for side in (-2.0, 2.5)])
+    cones += rng.uniform(-0.8, 0.8, cones.shape)
+    check = MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings())
+    for k in range(17 + later):
+        step = 0.5 + 0.1 * np.sin(k / 2.0)
+        place += step
+        seen = cones - [place, 0.0]
+        seen = seen[(seen[:, 0] > 0.0) & (seen[:, 0] < 12.0)]
+        factor = first if 10 <= k < 15 else 1.25 if k >= 15 + later else 1.0
+        twists = np.column_stack([10.0 * step * factor + 1e-6 * np.arange(10), np.zeros((10, 2))])
+        motion = check.update(Odometry(0.1 * k + 0.01 * np.arange(10), twists), _cycle(0.1 * (k + 1), seen))
+        doubted.append(motion.doubted)
+    return any(doubted[15 + later :])
+
+
+@pytest.mark.parametrize(
+    ("first", "later", "doubted"), [(2.5, 20, True), (2.5, 100, True), (2.5, 130, False), (1.0, 20, False)]
+)
+def test_an_odometry_that_was_contradicted_is_doubted_earlier_for_12_s(
+    first: float, later: int, doubted: bool
+) -> None:
+    assert is_doubted_again(first, later) is doubted
 
 
 def _cycle(t: float, points: Array) -> Detections:

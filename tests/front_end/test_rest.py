@@ -54,6 +54,8 @@ def test_the_bias_is_measured_and_the_vehicle_does_not_move(log: Log) -> None:
     standing = [m for m, c in zip(motions, log.cycles, strict=True) if 1.2 < c.t < REST - 0.01]
     for motion in standing:
         np.testing.assert_array_equal(motion.odometry.delta, 0.0)
+    stamps = np.array([c.t for m, c in zip(motions, log.cycles, strict=True) if m.bias])
+    assert len(stamps) == REST and (np.diff(stamps) > 0.99).all()  # each is of a second's readings
     late = [m for m, c in zip(motions, log.cycles, strict=True) if c.t > REST + 1.0]
     assert not any(motion.bias for motion in late)
     assert all(motion.odometry.delta[0] > 0.1 for motion in late)

@@ -9,7 +9,7 @@ import pytest
 
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log
-from pathspace_graph.front_end.sides import FORGET_AFTER, NearCones, SideJudge
+from pathspace_graph.front_end.sides import FORGET_AFTER, ConeRow, NearCones, SideJudge, follow_rows
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.run import split_odometry
@@ -112,11 +112,39 @@ def test_sides_are_told_without_colours(share: float, wrong_way: bool) -> None:
     assert (found[known] != true[known]).mean() < 0.02
 
 
+def test_colours_count_again_once_most_of_the_newest_detections_have_one() -> None:
+    """Each cycle's share fades by 0.98: after 18 cycles with colours 0.695 of them have none, below 0.7."""
+    judge, points, said = SideJudge(SidesSettings()), PLACES[:6], list[bool]()
+    sides = np.where(points[:, 1] > 0.0, LEFT, RIGHT)
+    for k in range(420):
+        labels = np.full(6, UNKNOWN) if k < 400 else sides
+        judge.update(np.zeros(3), np.zeros((1, 3)), detections(0.1 * k, points, labels))
+        said.append(judge.colourless)
+    assert said[0] and said.index(False) == 400 + 17
+
+
 def test_where_colours_are_common_an_unknown_one_stays_unknown() -> None:
     """The large cones of a start line have no colour, and stand beside the boundary."""
     log = drive(Faults(sensor=SensorFaults(colourless=0.4)))
     for given, judged in zip(log.cycles, judge_log(log, log.noise, MapperSettings()).cycles, strict=True):
         np.testing.assert_array_equal(given.labels, judged.labels)
+
+
+@pytest.mark.parametrize(
+    ("own", "other", "follows"), [(9, 1, True), (2, 3, True), (0, 1, True), (2, 4, False), (0, 2, False)]
+)
+def test_one_wrong_colour_among_ten_excludes_no_cone_from_its_row(
+    own: int, other: int, follows: bool
+) -> None:
+    """The third cone of the left row; its votes may be one more for the right than for the left."""
+    points = np.array([[0.0, 1.5], [4.0, 1.5], [8.0, 1.5]])
+    votes = np.array([[3, 0], [3, 0], [own, other]], np.intp)
+    rows = {
+        LEFT: ConeRow([0], points[0], 0.0),
+        RIGHT: ConeRow([], np.array([0.0, -1.5]), 0.0),
+    }
+    follow_rows(rows, points, votes, np.array([1, 2]))
+    assert rows[LEFT].cones == ([0, 1, 2] if follows else [0, 1])
 
 
 def test_near_cones_are_means_of_their_detections() -> None:

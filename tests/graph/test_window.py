@@ -10,9 +10,18 @@ import pytest
 
 from pathspace_graph.factors.arrays import IntArray
 from pathspace_graph.factors.odometry import integrate_twists
+from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
 from pathspace_graph.graph.gaussian import graph_of, normal_equations
 from pathspace_graph.graph.rows import KeptRows, Rows, newton_system
-from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, control_keys, pose_key, pose_keys
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    POSE,
+    SENSOR_KEY,
+    Layout,
+    control_keys,
+    pose_key,
+    pose_keys,
+)
 from pathspace_graph.graph.window import WindowFactors
 
 from ..scenes.graph import dense_rows
@@ -50,11 +59,13 @@ class Track(LinearTrack):
         self.changed_cycles = []
 
 
-def make_window(seed: int = 0) -> WindowFactors[Track]:
+def make_window(seed: int = 0, kind: type[Track] = Track) -> WindowFactors[Track]:
     """Returns a window of four poses and six map points, all of whose factors are linearized."""
     rng = np.random.default_rng(seed)
-    track = Track(seed)
+    track = kind(seed)
     track.variables.insert(np.array([CALIBRATION_KEY]), rng.normal(size=2))
+    if kind is SensorTrack:
+        track.variables.insert(np.array([SENSOR_KEY]), np.zeros(SENSOR_SIZE))
     track.variables.insert(control_keys(0, np.arange(6)), rng.normal(size=12))
     track.variables.insert(pose_keys(CYCLES), rng.normal(size=POSE * len(CYCLES)))
     window = WindowFactors(track, (TOLERANCE_POINT, TOLERANCE_HEADING))
@@ -166,6 +177,19 @@ def test_small_motions_add_up_until_the_tolerance_is_passed() -> None:
         assert new_owners(window.measured, before) == expected
 
 
+def test_the_cycle_whose_odometry_came_last_gets_a_row_on_it_though_nothing_moves() -> None:
+    window, rng = make_window(), np.random.default_rng(1)
+    before = mark(window)
+    window.extend(
+        3, integrate_twists(np.full(3, 0.1), rng.normal(size=(3, POSE)), np.array([0.2, 0.1, 0.05]))
+    )
+    window.variables.insert(control_keys(0, np.array([6])), rng.normal(size=2))
+    window.variables.insert(pose_keys(np.array([4])), rng.normal(size=POSE))
+    assert window.relinearize(np.arange(5), ACTIVE)
+    assert new_owners(window.measured, before) == [3, 4]
+    assert holding(window.measured, pose_key(4)) == [3, 4]
+
+
 def test_the_calibration_never_makes_a_factor_stale() -> None:
     """Every row is linear in it."""
     window = make_window()
@@ -176,6 +200,26 @@ def test_the_calibration_never_makes_a_factor_stale() -> None:
     assert new_owners(window.measured, before) == []
     window.map.weight = 1.0
     assert_linearized_at_the_values(window)
+
+
+class SensorTrack(Track):
+    """A track that a sensor sees whose calibration is estimated: each cycle has a row on it."""
+
+    def rows(self, cycles: IntArray) -> list[Rows]:
+        keys = np.column_stack([np.full(len(cycles), SENSOR_KEY), pose_keys(cycles)])
+        of_sensor = Rows(keys, np.ones((len(keys), SENSOR_SIZE + POSE)), np.zeros(len(keys)), cycles)
+        return [*super().rows(cycles), *self._weighed([of_sensor])]
+
+
+@pytest.mark.parametrize(("moved", "stale"), [(0.9, []), (1.1, CYCLES.tolist())])
+def test_a_turn_of_the_sensor_makes_rows_stale_that_moves_a_point_10_m_away_by_the_tolerance(
+    moved: float, stale: list[int]
+) -> None:
+    window = make_window(kind=SensorTrack)
+    before = mark(window)
+    move(window, SENSOR_KEY, SENSOR.index("yaw"), moved * TOLERANCE_POINT / 10.0)
+    assert window.relinearize(CYCLES, ACTIVE)
+    assert new_owners(window.measured, before) == stale
 
 
 def test_an_exact_window_relinearizes_after_any_motion() -> None:

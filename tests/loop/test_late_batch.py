@@ -163,25 +163,27 @@ def test_where_the_stamps_jump_a_cycle_does_not_wait_for_all_that_time(sent: lis
 
 @pytest.mark.parametrize("late", [0, 7, NEVER])
 def test_the_recorded_cycle_replays_the_drive_to_the_bit(
-    late: int, sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+    late: int, sent: list[Slow], stem: Stem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """That is so too where the drive has ended before its late batch has."""
-    assert_replayed(log(), late, 1, sent, monkeypatch)
+    vehicle = stem.mapper()
+    drive(vehicle, sent, late, log(), stem.results)
+    assert_replayed(log(), vehicle, 1, sent, monkeypatch)
 
 
 def test_a_map_is_mended_by_a_late_batch_and_replayed_to_the_bit(
     sent: list[Slow], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drive = unseen(laps_log(pear_track()), [LEFT], 6.0, 11.0)
-    results = assert_replayed(drive, 9, 2, sent, monkeypatch)
+    log, vehicle = unseen(laps_log(pear_track()), [LEFT], 6.0, 11.0), with_settings()
+    results = drive(vehicle, sent, 9, log)
+    assert_replayed(log, vehicle, 2, sent, monkeypatch)
     assert [result.notice.startswith(REPAIRED) for result in results if result.notice] == [True]
 
 
 def assert_replayed(
-    log: Log, late: int, batches: int, sent: list[Slow], monkeypatch: pytest.MonkeyPatch
-) -> list[CycleResult]:
-    vehicle = with_settings()
-    results = drive(vehicle, sent, late, log)
+    log: Log, vehicle: FixedLagMapper, batches: int, sent: list[Slow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another mapper, with the cycles in which the batches ended, maps the log from its beginning."""
     ends = vehicle.batches().ends
     assert len(ends) == len(sent) == batches
     monkeypatch.undo()
@@ -189,7 +191,6 @@ def assert_replayed(
     result = run_online(log, again)
     assert result.batches is not None and result.batches.ends == ends
     assert_same(again, vehicle)
-    return results
 
 
 def assert_same(mapper: FixedLagMapper, expected: FixedLagMapper) -> None:

@@ -18,18 +18,20 @@ from pathspace_graph.loop.map_repair import REPAIRED, ContradictedStretch, carri
 from pathspace_graph.loop.relocalization import KnownLoop
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.run import CycleResult, run_online
+from pathspace_graph.run import run_online
 from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.spline.boundary import sampled
 
-from ..scenes.drives import map_log, true_poses
+from ..scenes.drives import Mapped, map_beginning, map_log, true_poses
 from ..scenes.holes import cluttered, unseen
 from ..scenes.kidnapped import laps_log, pear_track
 
 Array = NDArray[np.float64]
 
+LAP = 200
+"""Cycles before the vehicle comes to the hole again, after the swap."""
 HOLE = (6.0, 11.0)
 """The boundary is not seen between these stamps (s), in the middle of the first lap."""
 
@@ -42,8 +44,13 @@ def clean() -> Log:
 
 
 @cache
-def repaired() -> tuple[FixedLagMapper, list[CycleResult]]:
-    return map_log(unseen(clean(), [LEFT], *HOLE))
+def holed() -> Log:
+    return unseen(clean(), [LEFT], *HOLE)
+
+
+@cache
+def repaired() -> Mapped:
+    return map_log(holed(), *map_beginning(holed(), LAP))
 
 
 def rmse(mapper: FixedLagMapper) -> float:
@@ -112,7 +119,7 @@ def test_a_map_that_does_not_explain_the_contradictions_is_refused(
 ) -> None:
     """It is asked for more of them than there are."""
     monkeypatch.setattr(map_repair, "EXPLAINED", 2.0)
-    mapper, results = map_log(unseen(clean(), [LEFT], *HOLE), FixedLagMapper())
+    mapper, results = map_log(holed(), *map_beginning(holed(), LAP))
     jumps = [result.t for result in results if result.jump is not None]
     assert len(jumps) == 1  # the swap of the open lap
     assert mapper.closed and not any(result.notice for result in results)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
+from itertools import islice
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.checkpoint import copied
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.se2 import compose, inverse, move_points, to_vehicle
 from pathspace_graph.graph.gaussian import factorize, marginalize
@@ -16,13 +17,22 @@ from pathspace_graph.graph.variables import Layout, pose_keys
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.relocalization import FOUND, MEMORY, KnownLoop, Search, evidence_of, lay_out_loop
+from pathspace_graph.loop.relocalization import (
+    FOUND,
+    MEMORY,
+    KnownLoop,
+    Search,
+    evidence_of,
+    lay_out_loop,
+    start_anew,
+)
+from pathspace_graph.mapping.registration import Matches, Motion, RefinedMotion
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, OpenLapSettings
 
-from ..scenes.drives import detections, map_log, replay, true_poses
+from ..scenes.drives import Mapped, detections, map_beginning, map_log, replay, true_poses
 from ..scenes.kidnapped import laps_log, pear_track, put_down
 
 Array = NDArray[np.float64]
@@ -35,17 +45,25 @@ NOTHING = Gating(np.zeros(0, np.intp), np.zeros(0, bool), np.zeros(0))
 """No detection was tested."""
 
 
-def mapper_of(log: Log) -> FixedLagMapper:
-    """Returns a mapper that goes on from the window's own prior when its loop closes."""
-    settings = MapperSettings()
-    settings = replace(settings, open_lap=replace(settings.open_lap, prior="window"))
-    return FixedLagMapper(settings, log.odometry_sigma)
+SETTINGS = MapperSettings(open_lap=OpenLapSettings(prior="window"))
+"""The mapper goes on from the window's own prior when its loop closes."""
+
+
+@cache
+def three_laps() -> Log:
+    return laps_log(pear_track())
+
+
+def put_down_on(distance: float) -> tuple[Log, Mapped]:
+    """Returns the log of a vehicle that is put down farther on (m), and a mapper as it was until then."""
+    log = put_down(three_laps(), SECOND_LAP, distance)
+    return log, map_beginning(three_laps(), round(10.0 * SECOND_LAP), SETTINGS)
 
 
 @cache
 def clean() -> tuple[Log, FixedLagMapper, list[CycleResult]]:
     log = laps_log(pear_track(), laps=2)
-    return log, *map_log(log, mapper_of(log))
+    return log, *map_log(log, FixedLagMapper(SETTINGS, log.odometry_sigma))
 
 
 def apart(log: Log, results: list[CycleResult]) -> Array:
@@ -61,8 +79,8 @@ def test_a_clean_drive_is_good_in_every_cycle() -> None:
 
 @pytest.mark.parametrize("distance", [5.0, 30.0])
 def test_a_vehicle_that_is_put_down_farther_on_is_lost_and_found(distance: float) -> None:
-    log = put_down(laps_log(pear_track()), SECOND_LAP, distance)
-    results = map_log(log, mapper_of(log))[1]
+    log, before = put_down_on(distance)
+    results = map_log(log, *before)[1]
     conditions, stamps = [r.health.condition for r in results], [r.t for r in results]
     lost = stamps[conditions.index(LOST)]
     assert SECOND_LAP < lost < SECOND_LAP + 4.0
@@ -77,9 +95,9 @@ def test_a_vehicle_that_is_put_down_farther_on_is_lost_and_found(distance: float
 
 
 def test_the_map_does_not_move_while_the_vehicle_is_lost() -> None:
-    log = put_down(laps_log(pear_track()), SECOND_LAP, 30.0)
-    mapper, known = mapper_of(log), list[Array]()
-    for odometry, cycle in split_odometry(log):
+    log, (mapper, before) = put_down_on(30.0)
+    known = list[Array]()
+    for odometry, cycle in islice(split_odometry(log), len(before), None):
         result = replay(mapper, odometry, cycle)
         if result.notice == FOUND:
             break
@@ -97,7 +115,7 @@ def test_the_map_does_not_move_while_the_vehicle_is_lost() -> None:
 
 def test_two_places_that_look_alike_are_not_told_apart() -> None:
     log = put_down(laps_log(pear_track(skew=0.0)), SECOND_LAP, 12.0)
-    _, results = map_log(log, mapper_of(log))
+    _, results = map_log(log, FixedLagMapper(SETTINGS, log.odometry_sigma))
     assert results[-1].health.condition == LOST
     assert FOUND not in {result.notice for result in results}
 
@@ -112,8 +130,7 @@ def test_the_uncertainty_of_the_position_is_that_of_the_last_step() -> None:
 
 
 def test_detections_across_the_infield_are_explained_by_the_map_and_ghosts_are_not() -> None:
-    log = clean()[0]
-    mapper = map_log(log, mapper_of(log))[0]
+    mapper = copied(clean()[1], {})
     smoother, table = mapper.smoother, mapper.smoother.map.detections
     far = np.array([mapper.control_points(LEFT)[k] for k in (5, 12)])
     ghosts = np.array([[200.0, 0.0], [0.0, 200.0]])
@@ -130,8 +147,7 @@ def test_detections_across_the_infield_are_explained_by_the_map_and_ghosts_are_n
 
 def test_a_wrong_colour_says_nothing_about_the_vehicle() -> None:
     """Detections on the right curve that are called left, and one on the left curve."""
-    log = clean()[0]
-    mapper = map_log(log, mapper_of(log))[0]
+    mapper = copied(clean()[1], {})
     smoother, table = mapper.smoother, mapper.smoother.map.detections
     right, left = (mapper.boundaries[b].spline(mapper.control_points(b)) for b in (RIGHT, LEFT))
     points = np.concatenate([right.evaluate(np.array([10.0, 40.0])), left.evaluate(np.array([20.0]))])
@@ -173,6 +189,19 @@ def test_the_motion_that_took_the_vehicle_away_is_undone() -> None:
     np.testing.assert_allclose(found.motion.vector[2], inverse(away)[2], atol=0.05)
 
 
+def test_the_prior_of_a_place_that_was_found_has_three_times_the_sigmas_of_its_registration() -> None:
+    """Its detections are used once more, in the window: without them, only the prior is left."""
+    smoother = copied(clean()[1].smoother, {})
+    covariance = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.002], [0.0, 0.002, 0.01]])
+    nothing = Matches(np.zeros(0, np.intp), *[np.zeros(0)] * 4, np.zeros((3, 3)), np.zeros(3))  # type: ignore[arg-type]
+    motion = Motion(smoother.map.state.poses[-1, :2].copy(), np.array([0.1, -0.05, 0.01]))
+    jump = start_anew(smoother, smoother.next_cycle - 5, RefinedMotion(motion, nothing, covariance))
+    assert np.hypot(*jump[:2]) < 0.3
+    smoother.map.detections.release(np.arange(len(smoother.map.detections)))
+    newest = pose_keys(np.array([smoother.next_cycle - 1]))
+    np.testing.assert_allclose(smoother.covariance(newest), 9.0 * covariance, atol=1e-6)
+
+
 def test_no_place_is_found_with_too_few_detections() -> None:
     log, mapper, _ = clean()
     search = Search(mapper.smoother)
@@ -191,8 +220,7 @@ def test_the_remembered_path_has_a_bound() -> None:
 
 
 def test_forgetting_the_poses_keeps_all_that_the_prior_knows_of_the_map() -> None:
-    log = laps_log(pear_track(), laps=2)
-    smoother = map_log(log, mapper_of(log))[0].smoother
+    smoother = copied(clean()[1].smoother, {})
     smoother.reactivate()
     window = pose_keys(np.arange(smoother.first_cycle, smoother.next_cycle))
     others = np.setdiff1d(smoother.layout.keys, window)

@@ -28,7 +28,7 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.drives import bean_track, lap_log, map_log, noisy, replay, true_poses
+from ..scenes.drives import Mapped, bean_track, lap_log, map_beginning, map_log, noisy, replay, true_poses
 from ..scenes.graph import columns_of, dense_rows
 
 Array = NDArray[np.float64]
@@ -41,8 +41,13 @@ def log() -> Log:
 
 
 @cache
-def run() -> tuple[FixedLagMapper, list[CycleResult]]:
+def run() -> Mapped:
     return map_log(log())
+
+
+def open_lap() -> Mapped:
+    """Returns a mapper shortly before its loop closes, and what it said."""
+    return map_beginning(log(), closing_cycle(run()[1]) - 5)
 
 
 def with_settings(**changes: object) -> MapperSettings:
@@ -186,7 +191,7 @@ def test_poses_are_held_until_the_swap_where_the_window_empties_faster() -> None
     drive, closes = log(), len(swapped()[1].chain) - 1
     cycles = [c for k, c in enumerate(drive.cycles) if k <= closes or (k - closes) % 2 == 0]
     slow = replace(drive, cycles=tuple(cycles))
-    mapper, slower = map_log(slow)
+    mapper, slower = map_log(slow, *map_beginning(drive, closes))
     assert sum(result.jump is not None for result in slower) == 1
     truth = drive.truth
     assert truth is not None
@@ -213,7 +218,7 @@ def test_a_batch_that_does_not_converge_closes_nothing_and_says_so(monkeypatch: 
     """Its optimum is farther away than nothing at all, so it is never near enough."""
     monkeypatch.setattr(drive_record, "SOLVED", 0.0)
     monkeypatch.setattr(drive_record, "_submit", _unconverged)
-    mapper, results = map_log(log(), FixedLagMapper())
+    mapper, results = map_log(log(), *open_lap())
     notices = {result.notice for result in results if result.notice}
     assert notices == {"the loop stays open: the batch of the lap has not converged"}
     assert not mapper.closed and len(mapper.corrected_poses) == 0
@@ -223,7 +228,7 @@ def test_where_the_process_dies_the_loop_closes_by_the_window_s_own_prior(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(drive_record, "solve_lap", _exit)
-    mapper, results = map_log(log())
+    mapper, results = map_log(log(), *open_lap())
     died, own = [result.notice for result in results if result.notice]
     assert died == "the loop stays open: the process of the batch has died"
     assert own == "the map goes on from the window's own prior: the process of the batch has died"

@@ -100,13 +100,14 @@ def test_what_is_expected_counts_up_to_its_cap() -> None:
         assert laid is not None
         np.testing.assert_allclose(laid.pose, POSE, atol=1e-6)
         assert laid.cost == pytest.approx(cost, abs=1e-3)
+        assert laid.away == pytest.approx(1.0 / sigmas[0] ** 2 + 0.01 / sigmas[2] ** 2, rel=1e-3)
 
 
 def test_the_heading_may_have_turned_around() -> None:
     known = scattered()
     mean = POSE + np.array([0.4, 0.4, 2.0 * np.pi])
     laid = lay(beside(known, slice(None)), known, mean, np.diag([1.0, 1.0, 100.0]), REACH)
-    assert laid is not None and laid.cost == pytest.approx(0.32, abs=1e-6)
+    assert laid is not None and laid.cost == laid.away == pytest.approx(0.32, abs=1e-6)
 
 
 def test_the_information_is_that_of_repeated_observations() -> None:
@@ -130,7 +131,7 @@ def test_the_information_is_that_of_repeated_observations() -> None:
 
 # --- how sure it is --------------------------------------------------------------------------------------
 
-SURE = Laid(POSE, np.eye(3), MISFIT * MIN_CONES, MIN_CONES, MIN_SHARE, ODDS)
+SURE = Laid(POSE, np.eye(3), MISFIT * MIN_CONES, MIN_CONES, MIN_SHARE, ODDS, away=0.0)
 
 
 def test_each_limit_has_two_sides() -> None:
@@ -144,6 +145,7 @@ def test_each_limit_has_two_sides() -> None:
     likely = replace(SURE, odds=ODDS - 0.1)
     assert likely.is_likely and not likely.is_sure
     assert not replace(SURE, odds=ODDS_NEARBY - 0.1).is_likely
+    assert replace(SURE, away=8.9).is_likely and not replace(SURE, away=9.1).is_likely
 
 
 @pytest.mark.parametrize(("gone", "agrees"), [(3, True), (5, False)])
@@ -303,7 +305,7 @@ def test_another_road_beside_is_no_return(lane: float, is_same: bool) -> None:
 
 def test_a_pose_before_the_newest_moves_with_it() -> None:
     true = along(LAP, (20.0, 1.0 / 12.0))
-    laid = Laid(true[-1], np.eye(3), 0.0, 20, 1.0, np.inf)
+    laid = Laid(true[-1], np.eye(3), 0.0, 20, 1.0, np.inf, 0.0)
     revisit = revisit_of(laid, true, 8, len(true) - 11)
     np.testing.assert_allclose(revisit.local, relative(true[8], true[-11]), atol=1e-9)
     assert (revisit.earlier, revisit.later) == (8, len(true) - 11)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -106,12 +108,31 @@ def posterior(shown: Array, known: Array, prior: Array) -> tuple[Array, Array]:
 SETTINGS = MapperSettings()
 
 
-def shown(entry: int, value: float, sigma: float) -> MapperSettings:
+def shown(entry: int, value: float, sigma: float, settings: MapperSettings = SETTINGS) -> MapperSettings:
     """Returns what is left of the priors after a drive that shows one calibration with a sigma."""
-    prior = np.array(SETTINGS.sigmas_calibrations)
+    prior = np.array(settings.sigmas_calibrations)
     values, sigmas = np.zeros(7), 1e3 * prior
     values[entry], sigmas[entry] = value, sigma
-    return with_inflated_priors(*posterior(values, sigmas, prior), SETTINGS)
+    return with_inflated_priors(*posterior(values, sigmas, prior), settings)
+
+
+@pytest.mark.parametrize(
+    ("entry", "held", "sigmas", "doubt"),
+    [
+        (0, False, (0.05, 0.02), np.inf),
+        (0, True, (0.005, 0.002), 4.0),
+        (1, False, (0.05, 0.02), np.inf),
+        (1, True, (0.005, 0.02), np.inf),
+    ],
+)
+def test_a_scale_that_is_held_is_neither_widened_nor_doubted(
+    entry: int, held: bool, sigmas: tuple[float, float], doubt: float
+) -> None:
+    """The drive shows the scale or the bias ten sigmas off."""
+    prior = SETTINGS.sigmas_calibrations[entry]
+    settings = replace(SETTINGS, odometry=OdometrySettings(hold_scale=held))
+    found = shown(entry, 10.0 * prior, 0.1 * prior, settings).odometry
+    assert (found.sigmas, found.doubt) == (pytest.approx(sigmas), doubt)
 
 
 @pytest.mark.parametrize(("value", "wide"), [(0.0189, False), (0.0191, True), (-0.0191, True), (0.0, False)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from pathspace_graph.mapping.registration import (
     is_certain,
     is_within_reach,
     near_start,
+    passes_start,
     register,
 )
 from pathspace_graph.mapping.state import State
@@ -169,6 +171,17 @@ def test_a_lost_vehicle_is_registered_from_the_best_place_of_the_beginning() -> 
     found = scene.register(np.diag([8.0, 8.0, 0.2]) ** 2)
     assert found is not None
     np.testing.assert_allclose(found.motion.apply(scene.poses[:, :2]), scene.truth[:, :2], atol=0.3)
+
+
+def test_a_lost_vehicle_is_not_registered_farther_away_than_it_can_be() -> None:
+    """It has drifted by 25 m, and its prior is 1.5 times as wide as what it says of itself.
+
+    99.9 % of such drifts are within 4.04 standard deviations: here it is 2.1 or 7.6 of them.
+    """
+    scene = window()
+    scene.drift(motion(22.0, -12.0, 0.1, scene.truth[-1, :2]))
+    assert scene.register(np.diag([8.0, 8.0, 0.2]) ** 2) is not None
+    assert scene.register(np.diag([2.2, 2.2, 0.2]) ** 2) is None
 
 
 # --- refusals --------------------------------------------------------------------------------------------
@@ -351,3 +364,22 @@ def test_near_the_start_is_a_matter_of_place_and_direction(
         path.update(np.array([x, 0.0, 0.0]))
     assert near_start(path, np.array(pose), ClosingSettings()) is near
     assert not near_start(path, np.array(pose), ClosingSettings(min_path=100.0))
+
+
+@pytest.mark.parametrize(("lateral", "passes"), [(0.0, True), (4.9, True), (5.1, False), (-5.1, False)])
+def test_the_start_is_not_passed_on_a_neighbouring_lane(lateral: float, passes: bool) -> None:
+    """The drive began at the origin along x; 300 m later it comes back beside it, up to 5 m away.
+
+    Only a row of cones 7 m to the left is known, which doesn't lie between the lanes.
+    """
+    path = DrivenPath()
+    loop = [[0.0, 0.0], [100.0, 0.0], [100.0, -50.0], [-20.0, -50.0]]
+    corners = np.array([*loop, [-20.0, lateral], [10.0, lateral]])
+    for begin, end in pairwise(corners):
+        heading = np.arctan2(*(end - begin)[::-1])
+        for share in np.linspace(0.0, 1.0, round(float(np.hypot(*(end - begin))) * 2)):
+            path.update(np.append(begin + share * (end - begin), heading))
+    state, x = State(), np.arange(0.0, 40.0, 4.0)
+    state.add_boundary(LEFT, *boundary_through(np.column_stack([x, np.full(10, 7.0)])))
+    assert passes_start(state, path, motion(0.0, 0.0, 0.0)) is passes
+    assert not passes_start(state, path, motion(0.0, 0.0, 0.6))  # nor across the lane

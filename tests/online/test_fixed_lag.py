@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.accuracy import cone_distances, lap_metrics
 from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_errors
+from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
@@ -34,6 +36,7 @@ from ..scenes.drives import (
     exact_log,
     lap_log,
     map_log,
+    noisy,
     true_poses,
 )
 
@@ -358,6 +361,31 @@ def test_odometry_alone_is_integrated_exactly(lag: float) -> None:
     assert len(mapper.poses) == round(lag * 10) + 1
 
 
+@pytest.mark.failing
+@pytest.mark.parametrize("left_out", [1, 3])
+def test_twists_of_cycles_that_are_left_out_are_not_lost(
+    left_out: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However a cycle fails, the next pose is the integral of all twists."""
+    rng, works = np.random.default_rng(0), FixedLagMapper._predict
+    twists = np.column_stack([rng.uniform(2.0, 12.0, 200), rng.normal(size=200), rng.uniform(-1.0, 1.0, 200)])
+    log = exact_log(twists, np.zeros((0, 2)), np.zeros(0, np.intp))
+    bad = {cycle.t for cycle in log.cycles[20 : 20 + left_out]}
+
+    def fails(mapper: FixedLagMapper, reading: Reading) -> None:
+        works(mapper, reading)
+        if reading.detections.t in bad:
+            raise np.linalg.LinAlgError("no convergence")
+
+    monkeypatch.setattr(FixedLagMapper, "_predict", fails)
+    mapper, results = map_log(log)
+    assert [result.t for result in results if "the cycle is not used" in result.notice] == sorted(bad)
+    expected, used = integrate(twists[:-1], DT)[::CYCLE], np.ones(len(results), bool)
+    used[20 : 20 + left_out] = False
+    np.testing.assert_allclose(poses_of(results)[used], expected[used], atol=1e-9)
+    assert len(mapper.smoother.times) <= used.sum()
+
+
 def test_a_first_cycle_after_the_first_odometry_starts_where_it_has_driven() -> None:
     """The map frame is the vehicle at the first odometry stamp, not at the first cycle."""
     log = exact_log(ahead(8.0, 3.0), np.zeros((0, 2)), np.zeros(0, np.intp))
@@ -394,6 +422,16 @@ def test_the_window_holds_the_lag() -> None:
         mapper.update(odometry, cycle)
         counts.append(len(mapper.poses))
     assert counts == [min(k, 11) for k in range(1, len(log.cycles) + 1)]
+
+
+def test_a_cycle_in_which_a_curve_grows_takes_its_own_number_of_steps() -> None:
+    """The poses are the same to the bit until a curve grows; where one begins, one step is the optimum."""
+    log = noisy(exact_log(ahead(8.0, 2.0), *corridor(60.0)), seed=1)
+    _, once = map_log(log, FixedLagMapper(MapperSettings(steps_grown=1), ODOMETRY_SIGMA))
+    _, twice = map_log(log, FixedLagMapper(MapperSettings(steps_grown=2), ODOMETRY_SIGMA))
+    same = (poses_of(once) == poses_of(twice)).all(axis=1)
+    begins, grows, *_ = [k for k, (a, b) in enumerate(pairwise(once), 1) if a.sizes != b.sizes]
+    assert once[begins].sizes == (5, 5) and int(same.argmin()) == grows
 
 
 # --- looking changes nothing -----------------------------------------------------------------------------

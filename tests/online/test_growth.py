@@ -402,6 +402,18 @@ def test_an_uncertain_cone_extends_a_curve_once_it_is_certain(alone: FixedLagMap
     assert grow(alone, along_x())[2:] == [(6.5, 2.0)]
 
 
+@pytest.mark.parametrize(("driven", "grown"), [(7.0, [(8.0, 2.0)]), (5.5, [])])
+def test_an_uncertain_cone_blocks_growth_only_until_it_was_passed(
+    alone: FixedLagMapper, driven: float, grown: list[tuple[float, float]]
+) -> None:
+    """The cone at x = 6 m is known to 0.69 m, the one at 8 m well."""
+    track(alone, (0.0, 2.0), (4.0, 2.0))
+    assert len(grow(alone, along_x())) == 2
+    far_track(alone, (6.0, 2.0), 1.2, 3)
+    track(alone, (8.0, 2.0))
+    assert grow(alone, along_x(driven))[2:] == grown
+
+
 def test_a_curve_does_not_begin_through_uncertain_cones(alone: FixedLagMapper) -> None:
     far_track(alone, (0.0, 2.0), 1.2, 3)
     far_track(alone, (4.0, 2.0), 1.2, 3)

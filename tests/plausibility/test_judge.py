@@ -11,9 +11,10 @@ from pathspace_graph import hints
 from pathspace_graph.eval.hints import GOOD, backs_up, causes_of, in_unix_time, one_boundary, stands_first
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.plausibility.judge import positions_in_metres
 from pathspace_graph.sim.mistakes import MISTAKES, in_frame, late, with_points, with_twists
 
-from ..scenes.drives import ahead, corridor, exact_log, short_drive
+from ..scenes.drives import ahead, corridor, detections, exact_log, short_drive
 
 SAID = {
     "positions in millimetres": ("in millimetres", "multiply x and y by 0.001"),
@@ -140,6 +141,35 @@ def test_impossible_speeds_are_told_without_detections() -> None:
     for cycles in ((), (nothing,)):
         found = hints(Log(odometry, cycles, np.ones(3)))
         assert [hint.cause for hint in found] == ["speeds", "yaw rate"]
+
+
+@pytest.mark.parametrize(("bad", "causes"), [(1, []), (9, []), (11, ["speeds", "yaw rate"])])
+def test_a_few_outliers_among_good_readings_are_no_mistake_of_units(bad: int, causes: list[str]) -> None:
+    """Of a hundred readings so many are beyond any vehicle; a tenth of them may be."""
+    twist = np.tile([8.0, 0.0, 0.4], (100, 1))
+    twist[20 : 20 + bad] = [8e3, 0.0, 40.0]
+    found = hints(Log(Odometry(0.02 * np.arange(100), twist), (), np.ones(3)))
+    assert [hint.cause for hint in found] == causes
+
+
+@pytest.mark.parametrize(
+    ("typical", "said"),
+    [
+        (0.049, "divided by 1000"),
+        (0.051, ""),
+        (119.0, ""),
+        (121.0, "in centimetres"),
+        (2e4, "in millimetres"),
+    ],
+)
+def test_positions_are_told_beyond_what_a_detector_sees(typical: float, said: str) -> None:
+    """Nearer than 5 cm or farther than 120 m there are no cones."""
+    nothing = Odometry(0.1 * np.arange(10), np.zeros((10, 3)))
+    seen = detections(0.5, np.array([[0.9, 0.0], [0.0, 1.0], [1.1, 0.0]]) * typical, np.zeros(3, np.intp))
+    log = Log(nothing, (seen,), np.ones(3))
+    found = [hint.line for hint in positions_in_metres(log)[1]]
+    assert len(found) == bool(said)
+    assert all(said in line for line in found)
 
 
 def test_a_log_with_hardly_any_odometry_is_not_judged() -> None:

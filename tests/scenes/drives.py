@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.checkpoint import copied
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
@@ -113,10 +117,27 @@ def noisy(log: Log, seed: int, sigma: float = 0.1) -> Log:
     return replace(log, cycles=cycles)
 
 
-def map_log(log: Log, mapper: FixedLagMapper | None = None) -> tuple[FixedLagMapper, list[CycleResult]]:
-    """A mapper after the log, and what it said after each cycle."""
+Mapped = tuple[FixedLagMapper, list[CycleResult]]
+"""A mapper, and what it said after each cycle."""
+
+
+def map_log(log: Log, mapper: FixedLagMapper | None = None, known: Sequence[CycleResult] = ()) -> Mapped:
+    """A mapper after the log, which has said what is known of its first cycles already."""
     mapper = mapper or FixedLagMapper(odometry_sigma=log.odometry_sigma)
-    return mapper, [replay(mapper, *cycle) for cycle in split_odometry(log)]
+    rest = islice(split_odometry(log), len(known), None)
+    return mapper, [*known, *(replay(mapper, *cycle) for cycle in rest)]
+
+
+@cache
+def _beginning_of(log: Log, cycles: int, settings: MapperSettings | None) -> Mapped:
+    mapper = FixedLagMapper(settings, log.odometry_sigma)
+    return map_log(replace(log, cycles=log.cycles[:cycles]), mapper)
+
+
+def map_beginning(log: Log, cycles: int, settings: MapperSettings | None = None) -> Mapped:
+    """A copy of a mapper after the first cycles of a log that a scene keeps, which is mapped once."""
+    mapper, results = _beginning_of(log, cycles, settings)
+    return copied(mapper, {}), [*results]
 
 
 def replay(mapper: FixedLagMapper, odometry: Odometry, detections: Detections) -> CycleResult:

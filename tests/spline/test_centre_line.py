@@ -13,6 +13,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.boundary import boundaries_cross
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
+from pathspace_graph.spline.planning import _uncrossed as uncrossed
 
 from ..scenes.maps import circle
 
@@ -243,6 +244,32 @@ def test_no_map_is_refused_and_no_normals_meet(seed: int, closed: bool) -> None:
     assert np.abs(np.diff(np.unwrap(line.heading))).max() < 0.6
     for spline, way in ((left, 1.0), (right, -1.0)):
         assert (way * spline.foot_points(line.points).distance < 0.0).all()
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_both_of_two_normals_that_meet_are_shortened_and_only_on_that_side(side: float) -> None:
+    """They meet 5 m and 4 m from their points 3 m apart, and each keeps 0.95 of that; a third meets none."""
+    points = np.array([[0.0, 0.0], [3.0, 0.0], [20.0, 0.0]])
+    meeting = np.array([3.0, 4.0 * side])
+    normal = np.array([side * meeting / 5.0, [0.0, 1.0], [0.0, 1.0]])
+    widths = [np.full(3, 6.0), np.full(3, 7.0)]
+    left, right = uncrossed(points, normal, widths, False)
+    short, kept = (left, right) if side > 0.0 else (right, left)
+    np.testing.assert_allclose(short[:2], [0.95 * 5.0, 0.95 * 4.0])
+    assert {short[2], *kept} == {6.0, 7.0}
+
+
+@pytest.mark.parametrize(("apart", "left"), [(10, [0.95 * 125.0**0.5, 0.95 * 5.0]), (11, [20.0, 20.0])])
+def test_normals_up_to_ten_points_apart_must_not_meet(apart: int, left: list[float]) -> None:
+    """The first one meets the last one 5 m to its left, above the ends of all between."""
+    points = np.column_stack([np.arange(apart + 1.0), np.zeros(apart + 1)])
+    normal = np.tile([0.0, 1.0], (apart + 1, 1))
+    normal[0] = np.array([apart, 5.0]) / np.hypot(apart, 5.0)
+    width = np.full(apart + 1, 0.1)
+    width[[0, -1]] = 20.0
+    shortened, _ = uncrossed(points, normal, [width, width], False)
+    np.testing.assert_allclose(shortened[[0, -1]], left)
+    np.testing.assert_array_equal(shortened[1:-1], 0.1)
 
 
 @pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional vectors")

@@ -73,6 +73,26 @@ def test_a_corner_is_braked_for_and_left_with_what_the_tyres_have() -> None:
     assert profile.speed[101] == profile.speed[100]  # nothing is left for acceleration at the apex
 
 
+@pytest.mark.parametrize(("braking", "most"), [(False, 4.0), (True, 8.0)])
+def test_a_bend_is_accelerated_and_braked_in_with_as_much_as_the_ellipse_leaves(
+    braking: bool, most: float
+) -> None:
+    """A radius of 16 m is driven at 12 m/s at most: at 6 m/s a quarter of the grip is taken.
+
+    What is left is `sqrt(1 - 1/16)` = 0.968 of the acceleration, and less the faster the vehicle is.
+    """
+    ends = {"end" if braking else "begin": 6.0}
+    profile = speed_profile(open_line(np.full(40, 1 / 16.0), 0.25), CAR, **ends)
+    speed = profile.speed[::-1] if braking else profile.speed
+    found = np.abs(profile.acceleration[:-1])
+    found = found[::-1] if braking else found
+    assert found[0] == pytest.approx(0.968246 * most, rel=1e-6)
+    free = speed[1:] < 12.0 - 1e-9
+    assert free.sum() > 5
+    expected = most * np.sqrt(1.0 - (speed[:-1] ** 2 / (9.0 * 16.0)) ** 2)
+    np.testing.assert_allclose(found[free], expected[free])
+
+
 curvatures = st.lists(st.floats(-0.5, 0.5), min_size=4, max_size=60).map(np.array)
 
 
