@@ -46,8 +46,9 @@ def run() -> Mapped:
 
 
 def open_lap() -> Mapped:
-    """Returns a mapper shortly before its loop closes, and what it said."""
-    return map_beginning(log(), closing_cycle(run()[1]) - 5)
+    """Returns a mapper shortly before it is at its beginning again, and what it said."""
+    mapper, results = run()
+    return map_beginning(log(), closing_cycle(results) - mapper.settings.open_lap.cycles - 5)
 
 
 def with_settings(**changes: object) -> MapperSettings:
