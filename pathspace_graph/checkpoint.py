@@ -39,9 +39,6 @@ class Recovery:
 
     def take_back(self, estimator: object, *shared: object) -> None:
         """Take an estimator back to what it was after the last call that was noted."""
-        self._go_back(estimator, *shared)
-
-    def _go_back(self, estimator: object, *shared: object) -> None:
         if self._copy is None:
             raise RuntimeError("expected a copy of the estimator, found none")
         attributes = self._held(self._copy, estimator, shared)  # the copy stays, for the next failure
@@ -52,7 +49,7 @@ class Recovery:
                 again()
             except Exception:  # it did not fail before: something outside has changed
                 self._calls = self._calls[:done]
-                self._go_back(estimator, *shared)
+                self.take_back(estimator, *shared)
                 return
 
     def _held(self, values: dict[str, Any], estimator: object, shared: tuple[object, ...]) -> dict[str, Any]:

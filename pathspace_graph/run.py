@@ -289,6 +289,9 @@ class _Run:
 
     def result(self, name: str) -> RunResult:
         self._take_snapshots(before=float("inf"))
+        begin = time.perf_counter()
+        _ask(self._estimator, "finish")
+        self._waited += time.perf_counter() - begin
         estimator, records, track = self._estimator, self._records, self._estimator.map()
         if self._laps.last_lap_is_complete:
             self._lap_maps.append((self._laps.lap, track))

@@ -107,21 +107,6 @@ def test_an_estimator_goes_back_to_its_last_noted_call() -> None:
             assert holder.value == known
 
 
-def test_doubtful_calls_are_made_in_another_way() -> None:
-    """No copy is made since the first of them, however many there are."""
-    holder, recovery = Holder([]), Recovery()
-
-    def add(number: int) -> None:
-        holder.value.append(number)
-
-    for number in range(3 * Recovery.EVERY):
-        recovery.before(holder)
-        add(number)
-        recovery.called(partial(add, number), is_doubtful=number >= 5)
-    recovery.undo(holder, instead=lambda call: partial(call.func, -call.args[0]))
-    assert holder.value == [*range(5), *(-k for k in range(5, 3 * Recovery.EVERY))]
-
-
 @pytest.mark.failing
 def test_a_call_that_fails_when_it_is_made_again_ends_the_way_back() -> None:
     holder, recovery, fine = Holder([]), Recovery(), [True]

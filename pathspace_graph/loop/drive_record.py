@@ -23,7 +23,6 @@ from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.se2 import compose, path_lengths, to_map, to_vehicle, wrap_angle
-from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.front_end.noise import NoiseLearner
@@ -123,12 +122,6 @@ class DriveRecord:
         earlier, window = unwrap(self.poses[: first + 1]), smoother.variables.poses
         bent = bend(earlier, {0: earlier[0], **keyframes, first: window[0]})
         self.replaced(bent[:first], window)
-
-    def seen(self, cycle: int, sensor: Array) -> Detections:
-        """Return all detections of a cycle, corrected by the calibration (5,) of the sensor, or (0,)."""
-        seen = self._noise.for_map(self._seen[cycle]).with_others(self._orange[cycle])
-        twists = np.tile(self._motions[cycle].odometry.twist, (len(seen.labels), 1))
-        return replace(seen, points_vehicle=corrected(seen.points_vehicle, twists, sensor))
 
     def recurrence(self) -> Recurrence | None:
         """Return the recurrence of the path driven, if odometry alone says that the lap is over."""

@@ -103,7 +103,7 @@ class TrackLoop:
         """Return whether it is time to register the newest detections with the beginning of an open loop."""
         settings, length = self.settings.closing, self._path.length
         newest = self._smoother.variables.poses[-1]
-        if self.closed or self._rests or self._lap_batch is not None:
+        if self.closed or self._rests or self._lap_batch is not None or length < self._loop_rests:
             return False
         if not near_start(self._path, newest, settings):
             return False
@@ -200,6 +200,15 @@ class TrackLoop:
         if batch is not None and batch.due <= self._smoother.next_cycle <= batch.last:
             batch.wait()
 
+    def finish(self) -> Array | None:
+        """Take the result of a batch that is under way, as no cycle follows; return the jump (3,) if any."""
+        if self._lap_batch is None:
+            return None
+        self._lap_batch.wait()
+        outcome, self._lap_batch = self._lap_batch.marginal(0.0), None
+        self._batch_ends.append(self._smoother.next_cycle - 1)
+        return None if outcome is None else self._take(outcome)[0]
+
     def resume(self) -> None:
         """Send the lap that was being solved when a snapshot was taken, which the process has not seen."""
         if self._lap_batch is not None:
@@ -237,6 +246,7 @@ class TrackLoop:
                 return None, ""
             if outcome.is_final:
                 self.record.give_up(outcome.reason)
+                self._loop_rests = 0.0  # a registration may close the loop at once
             return None, f"{STAYS_OPEN}: {outcome.reason}"
         if repairs and (not notice or self._crosses(outcome.splines) > self._boundaries_cross):
             return None, ""
@@ -244,9 +254,10 @@ class TrackLoop:
             return None, f"{STAYS_OPEN}: {outcome.objection}"
         if not self.closed:
             self._closes()
-        self.corrected_poses, self.lap_seconds = outcome.poses, outcome.seconds
+        self.lap_seconds = outcome.seconds
         jump, self._settled = go_on_from(smoother, outcome), self._path.length
         self.record.replaced(outcome.poses[: outcome.first_kept], smoother.variables.poses)
+        self.corrected_poses = self.record.poses
         self._boundaries_cross = self._crosses()
         return jump, notice
 
@@ -275,10 +286,8 @@ class TrackLoop:
     def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
         """Send the lap to its batch, which begins at a map that has just been closed, or at odometry.
 
-        In a replay the batch ends in the recorded cycle. One under way is given up: there is one process.
+        In a replay the batch ends in the recorded cycle.
         """
-        if self._lap_batch is not None:
-            self._lap_batch.give_up()
         open_lap, smoother = self.settings.open_lap, self._smoother
         first, cycle = smoother.first_cycle, smoother.next_cycle - 1
         wait = max(min(open_lap.cycles, cycle - first), int(open_lap.cycles_share * cycle))

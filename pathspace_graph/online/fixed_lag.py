@@ -145,8 +145,7 @@ class FixedLagMapper(MapperEstimate):
         watch.lap("simplify")
         jump, notice = self.loop.go_on(closes, watch.spent)
         if jump is not None:
-            window = self.smoother.first_cycle, self.poses
-            self.orange.place_again(self.smoother.variables.sensor, (0, self.corrected_poses), window)
+            self._place_orange()
         watch.lap("swap")
         if self.loop.is_searching:
             jump, notice = self._find(reading)
@@ -200,6 +199,18 @@ class FixedLagMapper(MapperEstimate):
             self.front_end.gate.refuse()
             raise ReadingError("factors", "none with a late cycle", len(factors), t=cycle.detections.t)
         return cycle
+
+    def finish(self) -> None:
+        """Take the result of a batch that is under way, where the drive is over and no cycle follows.
+
+        A lap that was recognized in the last metres of a drive closes only then.
+        """
+        if self.loop.finish() is not None:
+            self._place_orange()
+
+    def _place_orange(self) -> None:
+        window = self.smoother.first_cycle, self.poses
+        self.orange.place_again(self.smoother.variables.sensor, (0, self.corrected_poses), window)
 
     def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
         detections = self.front_end.use_late(detections, self.smoother.times)

@@ -159,14 +159,14 @@ class ClosureSettings(Positive, group="batch.closure"):
 
 @dataclass(frozen=True)
 class OpenLapSettings(Positive, group="open_lap"):
-    """Batch over the open lap when the loop closes online."""
+    """Batch over the open lap, which closes the loop online."""
 
     UNLIMITED = ("max_cycles", "max_cones")
 
     prior: Literal["batch", "window"] = "batch"
     """Prior after closing: a batch over the open lap, or with `window` what the window has marginalized."""
     cycles: int = 20
-    """Cycles after closing at which the batch replaces the prior, or as many as the window holds."""
+    """Cycles after the return at which the batch closes the loop, or as many as the window holds."""
     cycles_share: float = 0.03
     """Share of a long lap's cycles that replaces `cycles` where it is more; the window grows until then."""
     late: int = 100
@@ -174,7 +174,7 @@ class OpenLapSettings(Positive, group="open_lap"):
     ends: tuple[int, ...] = ()
     """Cycles in which the batches replace the prior in a replay: `batches.ends` of `summary.json`."""
     retry: float = 20.0
-    """Length of path to the next attempt at a loop that the detections were against (m)."""
+    """Least length of path from one batch of the lap to the next, where it does not agree (m)."""
     max_cycles: float = 6000.0
     """Most cycles of an open lap that is solved as a batch; a longer one is left to the window."""
     max_cones: float = 1500.0

@@ -134,6 +134,26 @@ def test_what_lies_out_of_view_is_searched_for_only_in_the_end_and_on_closed_cur
         np.testing.assert_array_equal(table.used, [True, strict and periodic])
 
 
+@pytest.mark.parametrize(("y", "own"), [(1.2, True), (1.9, True), (2.1, False)])
+@pytest.mark.parametrize("strict", [False, True])
+def test_a_detection_belongs_to_the_nearer_of_two_lanes(y: float, own: bool, strict: bool) -> None:
+    """The row runs out along y = 0 and back along y = 3, and the gate is wide enough for both.
+
+    A detection beyond the middle may be the nearer one's by errors of a merge radius.
+    """
+    phi = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 9)[1:-1]
+    bend = np.column_stack([60.0 + 1.5 * np.cos(phi), 1.5 + 1.5 * np.sin(phi)])
+    back = np.array([60.0, 3.0]) - bend
+    lanes = np.concatenate([line(0.0), bend, line(3.0)[::-1], back])
+    state = state_of({LEFT: lanes}, np.array([[20.0, -2.0, 0.0]]), periodic=True)
+    table = detections_of(np.array([[5.0, y + 2.0]]), np.array([LEFT]), SIGMA)
+    associate(state, table, SETTINGS, 9.0, strict)
+    assert bool(table.used[0]) is (own or strict)
+    if table.used[0]:
+        foot = state.boundaries[LEFT].evaluate(state.control_points(LEFT), table.u)
+        np.testing.assert_allclose(foot[0], [25.0, 0.0 if own else 3.0], atol=0.1)
+
+
 def test_a_detection_beyond_the_end_of_a_curve_is_not_used() -> None:
     assert not associated([[62.0, 2.0]], [LEFT], strict=True).used.any()
 

@@ -82,7 +82,7 @@ def test_a_cone_that_the_curve_cuts_off_is_found_as_well() -> None:
     before = cones_of_curve(state, detections, LEFT, system.settings)
     k = len(before.u) // 2
     own = np.flatnonzero((detections.label == LEFT) & (np.abs(detections.u - before.u[k]) < 1.0))
-    detections.point[own] += np.array([0.0, 1.8])
+    detections.measured[own] += np.array([0.0, 1.8])
     detections.release(own)
     after = cones_of_curve(state, detections, LEFT, system.settings)
     assert len(after.u) == len(before.u)

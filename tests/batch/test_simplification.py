@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.association import cones_of_curve
 from pathspace_graph.batch.simplification import Scatter, cross_validated, new_from_old, reknot, simplified
 from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.detections import DetectionTable
@@ -46,6 +47,20 @@ def test_the_poses_stay_and_the_curves_have_fewer_control_points_on_the_same_lin
         u = np.linspace(boundary.tables.low, boundary.tables.high, 50)
         y = boundary.evaluate(few.control_points(label), u)[:, 1]
         np.testing.assert_allclose(np.abs(y), 2.0, atol=1e-3)
+
+
+def test_a_stray_cone_beside_a_curve_does_not_bend_it() -> None:
+    """The optimum has left its detections out, which are as many as those of other cones."""
+    state, detections, settings = dense_scene()
+    along = detections.points_map(slice(None), state.variables)[:, 0]
+    own = np.flatnonzero((detections.label == LEFT) & (np.abs(along - 24.0) < 1.0))
+    detections.measured[own] += [0.0, 1.2]
+    detections.release(own)
+    assert (np.abs(cones_of_curve(state, detections, LEFT, settings).points[:, 1] - 3.2) < 0.1).sum() == 1
+    few, _ = simplified(state, detections, settings)
+    boundary = few.boundaries[LEFT]
+    u = np.linspace(boundary.tables.low, boundary.tables.high, 80)
+    np.testing.assert_allclose(boundary.evaluate(few.control_points(LEFT), u)[:, 1], 2.0, atol=0.01)
 
 
 def test_a_map_that_is_uncertain_as_a_whole_stays_so() -> None:

@@ -15,6 +15,7 @@ import pytest
 from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
 from pathspace_graph.factors.footpoint import TOLERANCES, joint_foot_points, refine_joint_foot_points
 from pathspace_graph.factors.kernels import _KERNELS, COMPILED, IN_NUMPY, NUMPY_ONLY
+from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, ORIGIN_KEY, Layout, control_keys, pose_keys
 
@@ -26,6 +27,7 @@ for _module in (
     "graph.inactive",
     "graph.relative",
     "graph.rows",
+    "mapping.constellation",
     "mapping.path",
     "mapping.smoother",
     "mapping.tentative",
@@ -144,6 +146,21 @@ def tracks(rng: np.random.Generator) -> tuple[Any, ...]:
     return columns, 5.0 * rng.normal(size=(COUNT, 2)), smeared, 0.7, (0.5, 2.0, 2.5)
 
 
+def constellations(rng: np.random.Generator) -> tuple[Any, ...]:
+    """Cones of two labels, the same with noise from a pose, and what is expected of it."""
+    points, labels, pose = rng.uniform(-12.0, 12.0, (COUNT, 2)), rng.integers(0, 2, COUNT), poses(rng, 1)
+    seen = to_vehicle(points + pose[0, :2], pose) + 0.1 * rng.normal(size=(COUNT, 2))
+    known = points + pose[0, :2], 0.01 * covariances(rng), labels
+    about = pose[0] + (0.7, -0.4, 0.1), 0.1 * information(rng, 3)
+    return (
+        (seen, 0.01 * covariances(rng), labels),
+        known,
+        *about,
+        (4.0, 0.3),
+        (0.25, 9.0, 0.5, 0.05, 1.0, 10.0),
+    )
+
+
 def seen_curves(rng: np.random.Generator, periodic: bool) -> tuple[Any, ...]:
     """Curves, and detections in use on them, of two cycles of three."""
     spans, control_points = curves(rng, periodic, 3)
@@ -191,6 +208,8 @@ CASES: dict[str, Arguments] = {
     ),
     "gated": gate,
     "merged": tracks,
+    "merged_in_turn": lambda rng: (*(given := tracks(rng))[1:3], given[4]),
+    "laid": constellations,
     "curve_rows": lambda rng: seen_curves(rng, False),
     "in_view": lambda rng: views(rng, False),
     "whitened_odometry": lambda rng: (

@@ -148,16 +148,37 @@ ERRORS = np.array([0.05, -0.3, 0.1, 0.08, 0.2])
 
 
 def test_where_the_odometry_is_trusted_the_ranges_take_the_whole_ratio() -> None:
+    """The scale of the speeds is as good as known, and its uncertainty is that of the size."""
     settings = replace(SETTINGS, calibration=CalibrationSettings(trust="odometry"))
     found = learner(noise(ERRORS)).calibrated(settings)
     assert found.odometry == replace(settings.odometry, hold_scale=True)
+    assert found.odometry.sigmas == (0.02 * settings.odometry.sigma_scale, settings.odometry.sigma_bias)
+    assert found.odometry.sigma_size == settings.odometry.sigma_scale
+    assert settings.odometry.sigma_size == 0.0
     doubted = found.odometry.widened()
-    assert doubted.sigma_scale == settings.odometry.sigma_scale  # never both free
+    assert doubted.sigmas[0] == found.odometry.sigmas[0]  # never both free
     assert doubted.sigma_bias > settings.odometry.sigma_bias
     np.testing.assert_array_equal(found.calibration.means, ERRORS)
-    np.testing.assert_array_equal(found.calibration.sigmas, np.maximum(SIGMA, settings.calibration.sigmas))
+    expected = np.maximum(SIGMA, settings.calibration.sigmas)
+    expected[3] = 0.1
+    np.testing.assert_array_equal(found.calibration.sigmas, expected)
     assert found.calibration.doubt == inf
     assert replace(found, odometry=settings.odometry, calibration=settings.calibration) == settings
+
+
+def test_the_trusted_scale_is_held_whatever_error_contradicts_its_prior() -> None:
+    """Ranges that err far out alone look right near by: the scale of the speeds would take their errors."""
+    yaw_only = np.array([0.2, 0.0, 0.0, 0.0, 0.0])
+    settings = replace(SETTINGS, calibration=CalibrationSettings(trust="odometry"))
+    found = learner(noise(yaw_only)).calibrated(settings)
+    assert found.odometry == replace(settings.odometry, hold_scale=True)
+    assert found.calibration.sigma_range_scale == 0.1
+    np.testing.assert_array_equal(found.calibration.means, yaw_only)
+    by_ranges = replace(SETTINGS, calibration=CalibrationSettings(trust="ranges"))
+    found = learner(noise(yaw_only)).calibrated(by_ranges)
+    assert found.odometry == SETTINGS.odometry
+    assert found.calibration.range_scale == 0.0
+    assert found.calibration.sigma_range_scale == SETTINGS.calibration.sigma_range_scale
 
 
 def test_where_the_ranges_are_trusted_the_speeds_take_the_whole_ratio() -> None:
@@ -174,32 +195,18 @@ def test_where_the_ranges_are_trusted_the_speeds_take_the_whole_ratio() -> None:
     assert found.calibration.sigma_range_scale == settings.calibration.sigma_range_scale
 
 
-def test_the_smoother_of_odometry_and_ranges_sets_the_size_of_the_map() -> None:
-    """In a second the poses walk 0.013 m or 0.14 m; the mean of 80 detections errs by about 0.1 m."""
-    smooth, rough = noise(per_cycle=8.0), noise(odometry=1.0, per_cycle=8.0)
-    assert smooth.along is not None
-    by_ranges = 0.3 * np.sqrt(smooth.along.inflation(20, 0.1) * 0.1 / 8.0)
-    assert smooth.twist_sigma[0] * np.sqrt(0.02) < by_ranges < rough.twist_sigma[0] * np.sqrt(0.02)
-    assert learner(smooth).trusts_odometry(SETTINGS)
-    assert not learner(rough).trusts_odometry(SETTINGS)
+def test_odometry_sets_the_size_of_the_map_where_a_range_is_known_worse_than_its_scale() -> None:
+    """Half a per cent, of 10 m, are 5 cm."""
+    sharp, rough = (
+        learner(replace(noise(), along=RayNoise(np.array([sigma, 0.0]), 0.5, 2.0)))
+        for sigma in (0.049, 0.051)
+    )
+    assert not sharp.trusts_odometry(SETTINGS)
+    assert rough.trusts_odometry(SETTINGS)
     for trust, expected in (("odometry", True), ("ranges", False)):
         own = replace(SETTINGS, calibration=CalibrationSettings(trust=trust))  # type: ignore[arg-type]
-        assert learner(smooth).trusts_odometry(own) is expected
-        assert learner(rough).trusts_odometry(own) is expected
-
-
-def test_errors_that_stay_with_a_cone_make_ranges_the_worse_measure_of_size() -> None:
-    """In a second the poses walk 0.049 m; ranges err by 0.033 m if 90 detections are independent.
-
-    Where half of each variance stays with a cone for 2 s, 20 detections 0.1 s apart count as two, and the
-    ranges err by 0.113 m.
-    """
-    fresh, staying = (
-        replace(noise(odometry=0.35, per_cycle=8.0), along=RayNoise(np.array([0.1, 0.02]), share, 2.0))
-        for share in (0.0, 0.5)
-    )
-    assert not learner(fresh).trusts_odometry(SETTINGS)
-    assert learner(staying).trusts_odometry(SETTINGS)
+        assert sharp.trusts_odometry(own) is expected
+        assert rough.trusts_odometry(own) is expected
 
 
 # --- learning --------------------------------------------------------------------------------------------

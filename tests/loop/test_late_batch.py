@@ -22,12 +22,12 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import drive_record
 from pathspace_graph.loop.map_repair import REPAIRED
-from pathspace_graph.loop.track_loop import LONGEST_WAIT, OWN_PRIOR
+from pathspace_graph.loop.track_loop import LONGEST_WAIT, OWN_PRIOR, STAYS_OPEN, TrackLoop
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -39,7 +39,6 @@ from ..scenes.kidnapped import laps_log, pear_track
 
 Work = Callable[..., Any]
 PERIOD, NEVER = 0.1, -1
-LATE = f"{OWN_PRIOR}: the batch of the lap was late"
 
 
 class Slow(Future[LapMarginal | None]):
@@ -127,8 +126,14 @@ def drive(
     return results
 
 
-def due_cycle(results: list[CycleResult]) -> int:
-    return [result.closed for result in results].index(True) + MapperSettings().open_lap.cycles
+def due_cycle(batch: Slow) -> int:
+    """The cycle in which a batch is due that was sent in the last one of its lap."""
+    return len(batch.lap.chain) - 1 + MapperSettings().open_lap.cycles
+
+
+def own_prior(reason: str) -> list[str]:
+    """The notices where a batch has failed for good, and a registration closes the loop."""
+    return [f"{STAYS_OPEN}: {reason}", f"{OWN_PRIOR}: {reason}"]
 
 
 def test_no_cycle_waits_longer_than_its_period_and_the_swap_comes_once_the_result_is_there(
@@ -136,17 +141,19 @@ def test_no_cycle_waits_longer_than_its_period_and_the_swap_comes_once_the_resul
 ) -> None:
     mapper = stem.mapper()
     results = drive(mapper, sent, 7, log(), stem.results)
-    due = due_cycle(results)
-    assert [k for k, result in enumerate(results) if result.jump is not None] == [due + 7]
-    assert mapper.batches().ends == (due + 7,)
     (batch,) = sent
+    due = due_cycle(batch)
+    assert [k for k, result in enumerate(results) if result.jump is not None] == [due + 7]
+    assert [result.closed for result in results] == [k >= due + 7 for k in range(len(results))]
+    assert mapper.batches().ends == (due + 7,)
     assert len(batch.timeouts) == 8
     assert all(0.0 <= timeout < PERIOD + 1e-9 for timeout in batch.timeouts)
     assert not any(result.notice for result in results)
 
 
 def test_where_the_stamps_jump_a_cycle_does_not_wait_for_all_that_time(sent: list[Slow], stem: Stem) -> None:
-    due = due_cycle(drive(stem.mapper(), sent, 0, log(), stem.results))
+    drive(stem.mapper(), sent, 0, log(), stem.results)
+    due = due_cycle(sent[0])
     sent.clear()
     gap = replace(log(), cycles=(*log().cycles[: due + 1], *log().cycles[due + 16 :]))
     drive(stem.mapper(), sent, 3, gap, stem.results)
@@ -223,8 +230,10 @@ def test_a_batch_that_never_ends_is_given_up_and_the_window_is_the_lag_again(
     monkeypatch.setattr(drive_record, "_end_worker", lambda: ended.append(True))
     mapper = with_settings(late=12)
     results = drive(mapper, sent, NEVER, log())
-    end = due_cycle(results) + 13
-    assert {k: result.notice for k, result in enumerate(results) if result.notice} == {end: LATE}
+    end = due_cycle(sent[0]) + 13
+    notices = {k: result.notice for k, result in enumerate(results) if result.notice}
+    assert [*notices.values()] == own_prior("the batch of the lap was late")
+    assert min(notices) == end and [result.closed for result in results].index(True) == max(notices)
     assert mapper.batches().ends == (end,)
     assert ended == [True]
     assert len(mapper.poses) == 31
@@ -263,21 +272,6 @@ def test_an_interrupt_does_not_reach_the_process_of_the_batch_and_reaches_this_o
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
-def test_a_loop_that_closes_while_a_batch_from_odometry_is_under_way_gives_that_batch_up(
-    sent: list[Slow], stem: Stem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given_up: list[object] = []
-    monkeypatch.setattr(drive_record, "_end_worker", lambda: given_up.append(sent[-1]))
-    mapper = stem.mapper()
-    for cycle in stem.rest(log()):
-        mapper.update(*cycle)
-        if sent:
-            break
-    mapper.loop._begin_batch(sent[0].lap.start)
-    assert given_up == sent[:1] and len(sent) == 2
-    assert mapper.batches().ends == ()
-
-
 @pytest.mark.parametrize("error", [ValueError("a\nb"), np.linalg.LinAlgError("c"), KeyError(3)])
 def test_what_fails_in_the_process_is_a_notice(error: Exception, sent: list[Slow], stem: Stem) -> None:
     mapper, notices = stem.mapper(), []
@@ -286,18 +280,9 @@ def test_what_fails_in_the_process_is_a_notice(error: Exception, sent: list[Slow
             sent[0].set_exception(error)
         notices.append(mapper.update(*cycle).notice)
     told = " ".join(str(error).split())
-    assert [notice for notice in notices if notice] == [
-        f"{OWN_PRIOR}: the batch of the lap has failed: {type(error).__name__}: {told}"
-    ]
-
-
-def test_a_singular_system_says_itself_what_it_is(sent: list[Slow], stem: Stem) -> None:
-    mapper, notices = stem.mapper(), []
-    for cycle in stem.rest(log()):
-        if sent and not sent[0].done():
-            sent[0].set_exception(SingularSystemError("singular"))
-        notices.append(mapper.update(*cycle).notice)
-    assert [notice for notice in notices if notice] == [f"{OWN_PRIOR}: singular"]
+    failed = f"the batch of the lap has failed: {type(error).__name__}: {told}"
+    assert [notice for notice in notices if notice] == own_prior(failed)
+    assert mapper.closed and len(sent) == 1
 
 
 def test_where_no_process_can_be_begun_there_is_a_notice(stem: Stem, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -309,9 +294,8 @@ def test_where_no_process_can_be_begun_there_is_a_notice(stem: Stem, monkeypatch
     monkeypatch.setattr(loky, "ProcessPoolExecutor", lambda **_: Executor())
     mapper = stem.mapper()
     results = [replay(mapper, *cycle) for cycle in stem.rest(log())]
-    assert [result.notice for result in results if result.notice] == [
-        f"{OWN_PRIOR}: the batch of the lap has failed: OSError: out of memory"
-    ]
+    failed = own_prior("the batch of the lap has failed: OSError: out of memory")
+    assert [result.notice for result in results if result.notice] == failed
 
 
 KILLED = """
@@ -356,57 +340,78 @@ def test_a_late_batch_is_sent_again_by_a_restored_mapper(
     assert digest(restored) == digest(mapper)
 
 
-# --- a closing that its lap speaks against ---------------------------------------------------------------
+# --- a batch that does not agree -------------------------------------------------------------------------
+
+Refuse = Callable[[Slow], None]
 
 
-def test_a_closing_that_the_lap_speaks_against_is_taken_back(sent: list[Slow], stem: Stem) -> None:
-    """The mapper goes on as one that never closed there, and closes some metres later."""
-    mapper, notices, closed = stem.mapper(), list[str](), list[bool]()
-    for odometry, detections in stem.rest(log()):
+def says(objection: str) -> Refuse:
+    """What ends a batch whose map is objected to."""
+
+    def end(batch: Slow) -> None:
+        marginal = solve_lap(batch.lap)
+        assert marginal is not None
+        batch.set_result(replace(marginal, objection=objection))
+
+    return end
+
+
+def is_singular(batch: Slow) -> None:
+    batch.set_exception(SingularSystemError("singular"))
+
+
+def is_against_the_loop(batch: Slow) -> None:
+    batch.set_result(None)
+
+
+@pytest.mark.parametrize(
+    ("refuse", "reason"),
+    [
+        (says("its boundaries cross"), "its boundaries cross"),
+        (is_singular, "singular"),
+        (is_against_the_loop, "the detections are against the loop"),
+    ],
+)
+def test_a_loop_stays_open_until_a_batch_agrees(
+    refuse: Refuse, reason: str, sent: list[Slow], stem: Stem
+) -> None:
+    """The next one is sent some metres later."""
+    mapper, results = stem.mapper(), []
+    for cycle in stem.rest(log()):
         for batch in sent:
             if not batch.done():
-                marginal = solve_lap(batch.lap)
-                assert marginal is not None
-                refused = replace(marginal, objection="its boundaries cross")
-                batch.set_result(refused if batch is sent[0] else marginal)
-        result = mapper.update(odometry, detections)
-        notices.append(result.notice)
-        closed.append(result.closed)
-    again = notices.index("the loop is open again: its boundaries cross")
-    first = closed.index(True)
-    assert first < again
-    assert closed[again - 1]
-    assert not closed[again]
-    assert mapper.closed
-    assert len(sent) == 2
-    assert mapper.recovery.failures == 0
-    sent.clear()
-    known = stem.mapper()
-    drive(known, sent, 0, log(), stem.results)
-    for label, boundary in known.map().boundaries.items():
-        own = mapper.map().boundaries[label]
-        assert isinstance(own, SplineBoundary)
-        assert isinstance(boundary, SplineBoundary)
-        assert own.spline.length() == pytest.approx(boundary.spline.length(), rel=0.01)
+                refuse(batch) if batch is sent[0] else batch.end()
+        results.append(mapper.update(*cycle))
+    notices = [k for k, result in enumerate(results) if result.notice]
+    assert [results[k].notice for k in notices] == [f"{STAYS_OPEN}: {reason}"]
+    assert results[notices[0]].jump is None and not results[notices[0]].closed
+    jumps = [k for k, result in enumerate(results) if result.jump is not None]
+    assert [result.closed for result in results].index(True) == jumps[0] > notices[0]
+    assert len(sent) == 2 and mapper.recovery.failures == 0
+    between = sent[1].lap.chain.dead_reckoned(np.zeros(2))[len(sent[0].lap.chain) - 1 :]
+    assert path_lengths(between)[-1] >= mapper.settings.open_lap.retry
 
 
-def test_what_is_taken_back_is_as_if_it_had_not_been_closed(sent: list[Slow], stem: Stem) -> None:
-    """Up to the refusal, a mapper that may not close at all is the same to the last bit."""
-    cycles = [*stem.rest(log())]
-    mapper, careful = stem.mapper(), stem.mapper()
-    first = None
-    for k, (odometry, detections) in enumerate(cycles):
-        if sent and not sent[0].done():
-            marginal = solve_lap(sent[0].lap)
-            assert marginal is not None
-            sent[0].set_result(replace(marginal, objection="its boundaries cross"))
-        result = mapper.update(odometry, detections)
-        first = k if first is None and result.closed else first
-        if "open again" in result.notice:
-            break
-    for j, (odometry, detections) in enumerate(cycles[: k + 1]):
-        if first is not None and j >= first:
-            careful.loop.pause()
-        careful.update(odometry, detections)
-    assert not careful.closed
-    assert digest(careful) == digest(mapper)
+def test_nothing_changes_before_a_batch_agrees(
+    sent: list[Slow], stem: Stem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mapper whose batches are all refused maps on as one that never sends any.
+
+    Its window is longer while a batch is under way.
+    """
+    refused, open_map = stem.mapper(), stem.mapper()
+    for cycle in stem.rest(log()):
+        for batch in sent:
+            if not batch.done():
+                is_singular(batch)
+        refused.update(*cycle)
+    assert len(sent) >= 1 and not refused.closed
+    monkeypatch.setattr(TrackLoop, "_close_by_batch", lambda *_: None)
+    for cycle in stem.rest(log()):
+        open_map.update(*cycle)
+    assert not open_map.closed
+    np.testing.assert_allclose(refused.poses[-1], open_map.poses[-1], atol=0.02)
+    for label, boundary in open_map.boundaries.items():
+        u = np.linspace(0.0, boundary.confirmed_end, 100)
+        curves = (m.boundaries[label].evaluate(m.control_points(label), u) for m in (refused, open_map))
+        np.testing.assert_allclose(*curves, atol=0.05)

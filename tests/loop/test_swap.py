@@ -1,4 +1,4 @@
-"""The swap: after closing, the map goes on from the batch of the open lap, and nothing is counted twice."""
+"""The swap: the loop closes as the map goes on from the batch of the lap, and nothing is counted twice."""
 
 from __future__ import annotations
 
@@ -46,8 +46,9 @@ def run() -> Mapped:
 
 
 def open_lap() -> Mapped:
-    """Returns a mapper shortly before its loop closes, and what it said."""
-    return map_beginning(log(), closing_cycle(run()[1]) - 5)
+    """Returns a mapper shortly before it is at its beginning again, and what it said."""
+    mapper, results = run()
+    return map_beginning(log(), closing_cycle(results) - mapper.settings.open_lap.cycles - 5)
 
 
 def with_settings(**changes: object) -> MapperSettings:
@@ -59,10 +60,11 @@ def closing_cycle(results: list[CycleResult]) -> int:
     return [result.closed for result in results].index(True)
 
 
-def test_the_swap_comes_the_set_number_of_cycles_after_closing_and_is_reported() -> None:
+def test_the_loop_closes_by_the_swap_the_set_number_of_cycles_after_the_return() -> None:
     mapper, results = run()
+    _, lap = swapped()
     swaps = [cycle for cycle, result in enumerate(results) if result.jump is not None]
-    assert swaps == [closing_cycle(results) + mapper.settings.open_lap.cycles]
+    assert swaps == [len(lap.chain) - 1 + mapper.settings.open_lap.cycles] == [closing_cycle(results)]
     jump = results[swaps[0]].jump
     assert jump is not None
     assert np.isfinite(jump).all()
@@ -186,9 +188,8 @@ def test_poses_of_the_lap_are_the_solved_ones_and_later_ones_move_with_the_last(
 
 
 def test_poses_are_held_until_the_swap_where_the_window_empties_faster() -> None:
-    """After closing, cycles come at half the rate; the marginal has none of the poses it must not have."""
-    drive, results = log(), run()[1]
-    closes = closing_cycle(results)
+    """After the return, cycles come at half the rate; the marginal has none of the poses it must not have."""
+    drive, closes = log(), len(swapped()[1].chain) - 1
     cycles = [c for k, c in enumerate(drive.cycles) if k <= closes or (k - closes) % 2 == 0]
     slow = replace(drive, cycles=tuple(cycles))
     mapper, slower = map_log(slow, *map_beginning(drive, closes))
@@ -214,24 +215,28 @@ def test_a_lap_with_too_many_cones_keeps_the_prior_and_says_so() -> None:
     ]
 
 
-def test_a_batch_that_does_not_converge_keeps_the_prior_and_says_so(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_batch_that_does_not_converge_closes_nothing_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its optimum is farther away than nothing at all, so it is never near enough."""
     monkeypatch.setattr(drive_record, "SOLVED", 0.0)
     monkeypatch.setattr(drive_record, "_submit", _unconverged)
-    _, results = map_log(log(), *open_lap())
-    assert [result.notice for result in results if result.notice] == [
-        "the map goes on from the window's own prior: the batch of the lap has not converged"
-    ]
+    mapper, results = map_log(log(), *open_lap())
+    notices = {result.notice for result in results if result.notice}
+    assert notices == {"the loop stays open: the batch of the lap has not converged"}
+    assert not mapper.closed and len(mapper.corrected_poses) == 0
 
 
-def test_a_process_that_dies_keeps_the_prior_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_process_dies_the_loop_closes_by_the_window_s_own_prior(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(drive_record, "solve_lap", _exit)
-    _, results = map_log(log(), *open_lap())
-    assert [result.notice for result in results if result.notice] == [
-        "the map goes on from the window's own prior: the process of the batch has died"
-    ]
+    mapper, results = map_log(log(), *open_lap())
+    died, own = [result.notice for result in results if result.notice]
+    assert died == "the loop stays open: the process of the batch has died"
+    assert own == "the map goes on from the window's own prior: the process of the batch has died"
+    assert mapper.closed and all(result.jump is None for result in results)
+    truth = log().truth
+    assert truth is not None
+    assert lap_metrics(mapper.map(), truth, 0).rmse < 0.1
 
 
 def _unconverged(work: Callable[..., LapMarginal | None], *arguments: object) -> Future[LapMarginal | None]:
@@ -266,7 +271,7 @@ def test_the_poses_of_the_lap_are_corrected_as_soon_as_the_loop_closes() -> None
     drive = noisy(replace(drive, odometry_sigma=np.array([0.1, 0.1, 0.02])), seed=3)
     mapper, results = FixedLagMapper(MapperSettings(), drive.odometry_sigma), []
     for cycle in split_odometry(drive):
-        results.append(mapper.update(*cycle))
+        results.append(replay(mapper, *cycle))
         if mapper.closed:
             break
     assert len(mapper.corrected_poses) == len(results)

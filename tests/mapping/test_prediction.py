@@ -120,9 +120,9 @@ def shown(entry: int, value: float, sigma: float, settings: MapperSettings = SET
     ("entry", "held", "sigmas", "doubt"),
     [
         (0, False, (0.05, 0.02), np.inf),
-        (0, True, (0.005, 0.002), 4.0),
+        (0, True, (0.0001, 0.002), 4.0),
         (1, False, (0.05, 0.02), np.inf),
-        (1, True, (0.005, 0.02), np.inf),
+        (1, True, (0.0001, 0.02), np.inf),
     ],
 )
 def test_a_scale_that_is_held_is_neither_widened_nor_doubted(

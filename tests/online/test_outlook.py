@@ -119,7 +119,7 @@ def test_a_mapper_that_has_seen_nothing_has_no_outline() -> None:
 
 
 def test_a_closed_map_is_confirmed_as_a_whole() -> None:
-    mapper, _ = map_log(lap_log(bean_track(), overrun=25.0))
+    mapper, _ = map_log(lap_log(bean_track(), overrun=45.0))
     assert mapper.closed
     track = mapper.map()
     for label, outline in mapper.outline().boundaries.items():

@@ -85,17 +85,22 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
     derivatives = by_sensor(detections.measured, detections.twist)[:, :, : len(calibration) - 2]
     points = detections.measured - derivatives @ calibration[2:]
     points += sigma[:, None] * rng.normal(size=points.shape)
-    driven = chain.odometry
-    noise = np.linalg.solve(driven.whiteners, rng.normal(size=(*driven.deltas.shape, 1)))[..., 0]
-    local = noise + driven.by_calibration @ calibration[:2]
-    first = rng.multivariate_normal(chain.first, np.linalg.inv(chain.first_information))
     noisy = BatchSystem(
         replace(detections, measured=points, u=detections.u.copy()),
-        _with_errors(replace(chain, first=first), local),
+        drawn_chain(chain, calibration[:2], rng),
         system.settings,
         system.kernel,
     )
     return noisy, calibration
+
+
+def drawn_chain(chain: LogOdometry, calibration: Array, rng: np.random.Generator) -> LogOdometry:
+    """Returns the same drive measured with the odometry's own noise and a calibration (2,)."""
+    driven = chain.odometry
+    noise = np.linalg.solve(driven.whiteners, rng.normal(size=(*driven.deltas.shape, 1)))[..., 0]
+    local = noise + driven.by_calibration @ calibration
+    first = rng.multivariate_normal(chain.first, np.linalg.inv(chain.first_information))
+    return _with_errors(replace(chain, first=first), local)
 
 
 def _with_errors(chain: LogOdometry, local: Array) -> LogOdometry:

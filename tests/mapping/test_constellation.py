@@ -1,0 +1,332 @@
+"""Constellations: the pose that lays cones on others, how certain it is, and which returns are believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.se2 import compose, left_of, path_lengths, relative, rotation, to_map, to_vehicle
+from pathspace_graph.io.log import Detections
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.mapping.constellation import (
+    MIN_CONES,
+    MIN_SHARE,
+    MISFIT,
+    NEARBY,
+    ODDS,
+    ODDS_NEARBY,
+    RANGE,
+    SIGHTINGS,
+    SIGMA,
+    Constellation,
+    Laid,
+    SeenIn,
+    find_return,
+    lay,
+    relative_pose,
+    return_to_beginning,
+    revisit_of,
+)
+from pathspace_graph.mapping.detections import DetectionColumns
+from pathspace_graph.mapping.tentative import TentativeTracks, merged_in_turn
+from pathspace_graph.settings.mapper import MapperSettings
+
+SETTINGS = MapperSettings()
+GROWTH = SETTINGS.growth
+COVARIANCE = 0.01
+"""Variance of a cone in each direction (m^2)."""
+POSE = np.array([3.0, -2.0, 0.5])
+NOTHING = np.zeros((3, 3))
+"""Information of a prior that knows nothing."""
+REACH = (4.0, 0.3)
+
+
+def constellation(points: Array, labels: IntArray | None = None) -> Constellation:
+    """Return cones whose colours alternate by default."""
+    colours = np.arange(len(points)) % 2 if labels is None else labels
+    return Constellation(points, np.tile(COVARIANCE * np.eye(2), (len(points), 1, 1)), colours)
+
+
+def scattered(count: int = 20, seed: int = 1) -> Constellation:
+    return constellation(np.random.default_rng(seed).uniform(-10.0, 10.0, (count, 2)))
+
+
+def row(gaps: Array) -> Constellation:
+    """Return two rows of cones beside a straight, with the same gaps (m)."""
+    x = np.append(0.0, np.cumsum(gaps))
+    sides = [np.column_stack([x, np.full(len(x), y)]) for y in (2.0, -2.0)]
+    return constellation(np.concatenate(sides), np.repeat([LEFT, RIGHT], len(x)))
+
+
+def beside(known: Constellation, chosen: slice | IntArray, pose: Array = POSE) -> Constellation:
+    """Return some of the cones as they are seen from a pose (3,)."""
+    picked = np.arange(len(known.labels))[chosen]
+    part = Constellation(known.points[picked], known.covariances[picked], known.labels[picked])
+    return part.seen_from(pose)
+
+
+# --- the pose --------------------------------------------------------------------------------------------
+
+
+def test_a_few_cones_tell_the_pose_from_which_they_were_seen() -> None:
+    """The information is that of each cone's distance, by the variances of both and of slow errors."""
+    known = scattered()
+    laid = lay(beside(known, slice(10)), known, POSE + np.array([1.2, -0.9, 0.2]), NOTHING, REACH)
+    assert laid is not None and laid.is_sure
+    np.testing.assert_allclose(laid.pose, POSE, atol=1e-6)
+    assert laid.cost == pytest.approx(0.0, abs=1e-9)
+    assert (laid.count, laid.share) == (10, 1.0)
+    arm = left_of(known.points[:10] - POSE[:2])
+    by_turn, sum_of_squares = arm.sum(axis=0), np.sum(arm**2)
+    expected = np.array([[10.0, 0.0, by_turn[0]], [0.0, 10.0, by_turn[1]], [*by_turn, sum_of_squares]])
+    np.testing.assert_allclose(laid.information, expected / (SIGMA**2 + 2.0 * COVARIANCE), atol=1e-3)
+
+
+def test_a_cone_lies_on_one_of_its_own_colour_only() -> None:
+    known = scattered()
+    other = replace(beside(known, slice(12)), labels=1 - known.labels[:12])
+    laid = lay(other, known, POSE, NOTHING, REACH)
+    assert laid is None or not laid.agrees
+
+
+def test_what_is_expected_counts_up_to_its_cap() -> None:
+    """The pose is a metre and a tenth of a radian off, which are one sigma each, or any number of them."""
+    known, mean = scattered(), POSE + np.array([1.0, 0.0, 0.1])
+    for sigmas, cost in (((1.0, 1.0, 0.1), 2.0), ((0.01, 0.01, 0.001), 9.0)):
+        laid = lay(beside(known, slice(None)), known, mean, np.diag(np.array(sigmas) ** -2.0), REACH)
+        assert laid is not None
+        np.testing.assert_allclose(laid.pose, POSE, atol=1e-6)
+        assert laid.cost == pytest.approx(cost, abs=1e-3)
+        assert laid.away == pytest.approx(1.0 / sigmas[0] ** 2 + 0.01 / sigmas[2] ** 2, rel=1e-3)
+
+
+def test_the_heading_may_have_turned_around() -> None:
+    known = scattered()
+    mean = POSE + np.array([0.4, 0.4, 2.0 * np.pi])
+    laid = lay(beside(known, slice(None)), known, mean, np.diag([1.0, 1.0, 100.0]), REACH)
+    assert laid is not None and laid.cost == laid.away == pytest.approx(0.32, abs=1e-6)
+
+
+def test_the_information_is_that_of_repeated_observations() -> None:
+    """Errors of samples have the claimed covariance, but for the efficiency that the cap of squares costs.
+
+    Cones whose errors are those of their covariances alone tell more than is claimed.
+    """
+    rng, known = np.random.default_rng(3), scattered(16)
+    variances = SIGMA**2 + 2.0 * COVARIANCE, 2.0 * COVARIANCE
+    for variance, (least, most) in zip(variances, ((0.9, 1.6), (0.15, 0.4)), strict=True):
+        squares = []
+        for _ in range(300):
+            noise = np.sqrt(variance) * rng.normal(size=known.points.shape)
+            noisy = replace(known, points=known.points + noise)
+            laid = lay(noisy.seen_from(POSE), known, POSE, NOTHING, (1.0, 0.1))
+            assert laid is not None
+            off = laid.pose - POSE
+            squares.append(off @ laid.information @ off / 3.0)
+        assert least < np.mean(squares) < most
+
+
+# --- how sure it is --------------------------------------------------------------------------------------
+
+SURE = Laid(POSE, np.eye(3), MISFIT * MIN_CONES, MIN_CONES, MIN_SHARE, ODDS, away=0.0)
+
+
+def test_each_limit_has_two_sides() -> None:
+    assert SURE.is_sure and SURE.is_likely
+    for worse in (
+        replace(SURE, cost=1.01 * SURE.cost),
+        replace(SURE, share=MIN_SHARE - 0.01),
+        replace(SURE, count=MIN_CONES - 1, cost=0.0),
+    ):
+        assert not worse.agrees and not worse.is_sure and not worse.is_likely
+    likely = replace(SURE, odds=ODDS - 0.1)
+    assert likely.is_likely and not likely.is_sure
+    assert not replace(SURE, odds=ODDS_NEARBY - 0.1).is_likely
+    assert replace(SURE, away=8.9).is_likely and not replace(SURE, away=9.1).is_likely
+
+
+@pytest.mark.parametrize(("gone", "agrees"), [(3, True), (5, False)])
+def test_most_cones_must_lie_on_earlier_ones(gone: int, agrees: bool) -> None:
+    """A fifth of them may lie on none."""
+    known = scattered()
+    moved = known.points + np.where(np.arange(20) < gone, 50.0, 0.0)[:, None]
+    laid = lay(replace(known, points=moved).seen_from(POSE), known, POSE, NOTHING, REACH)
+    assert laid is not None
+    assert laid.share == pytest.approx(1.0 - gone / 20)
+    assert laid.agrees is agrees
+
+
+@pytest.mark.parametrize(("sigmas", "agrees"), [(1.5, True), (1.65, False)])
+def test_cones_that_lie_beside_others_do_not_agree(sigmas: float, agrees: bool) -> None:
+    """Half of them lie to one side and half to the other, by the same distance, which no motion explains."""
+    points = np.array([[6.0 * (k // 4), 6.0 * (k % 4)] for k in range(16)])
+    off = sigmas * np.sqrt(SIGMA**2 + 2.0 * COVARIANCE) * np.where(np.arange(16) % 4 % 3, 1.0, -1.0)
+    moved = points + np.column_stack([off, np.zeros(16)])
+    laid = lay(constellation(moved).seen_from(POSE), constellation(points), POSE, NOTHING, (0.4, 0.01))
+    assert laid is not None and laid.share == 1.0
+    assert laid.cost == pytest.approx(16.0 * sigmas**2, rel=1e-3)
+    assert laid.agrees is agrees
+
+
+def test_rows_at_regular_distances_fit_in_many_places() -> None:
+    """The same rows at distances that differ by some decimetres fit in one."""
+    rng = np.random.default_rng(2)
+    regular, pose = np.full(19, 4.0), np.array([30.0, 0.0, 0.0])
+    irregular = regular + rng.uniform(-0.8, 0.8, 19)
+    chosen = np.concatenate([np.arange(5, 13), np.arange(25, 33)])
+    for gaps, is_sure in ((regular, False), (irregular, True)):
+        known = row(gaps)
+        laid = lay(beside(known, chosen, pose), known, pose, np.diag([0.1, 0.1, 100.0]), (8.0, 0.1))
+        assert laid is not None and laid.agrees
+        np.testing.assert_allclose(laid.pose, pose, atol=0.01)
+        assert laid.is_sure is is_sure
+
+
+@pytest.mark.parametrize(("seen", "known"), [(MIN_CONES - 1, 20), (MIN_CONES - 1, MIN_CONES - 1), (0, 20)])
+def test_a_few_cones_are_laid_on_none(seen: int, known: int) -> None:
+    cones = scattered()
+    assert lay(beside(cones, slice(seen)), beside(cones, slice(known)), POSE, NOTHING, REACH) is None
+
+
+# --- cones of detections ---------------------------------------------------------------------------------
+
+
+def test_detections_are_merged_in_turn_as_tracks_are() -> None:
+    rng = np.random.default_rng(4)
+    points = np.repeat(rng.uniform(-9.0, 9.0, (15, 2)), 8, axis=0) + 0.3 * rng.normal(size=(120, 2))
+    roots = rng.normal(size=(120, 2, 2))
+    covariances = 0.02 * np.eye(2) + 0.1 * roots @ roots.transpose(0, 2, 1)
+    tracks = TentativeTracks(GROWTH)
+    for k in range(120):
+        tracks.add(points[k : k + 1], covariances[k : k + 1], 0.0)
+    found, information, counts = merged_in_turn(points, covariances, GROWTH)
+    assert 15 <= len(found) < 60
+    np.testing.assert_allclose(found, tracks.points, atol=1e-12)
+    np.testing.assert_allclose(information, tracks.information, rtol=1e-12)
+    np.testing.assert_array_equal(counts, tracks.counts)
+
+
+def test_cones_are_seen_often_enough_near_enough_and_in_colour() -> None:
+    """Each of four cones but the first lacks one of these."""
+    near, far = [5.0, 1.0], [RANGE + 1.0, 0.0]
+    rows = [(near, LEFT)] * SIGHTINGS + [([5.0, -3.0], LEFT)] * (SIGHTINGS - 1)
+    rows += [(far, LEFT)] * SIGHTINGS + [([1.0, 4.0], UNKNOWN)] * SIGHTINGS
+    points, labels = np.array([point for point, _ in rows]), np.array([label for _, label in rows])
+    seen = Detections(0.0, points, np.tile(0.03 * np.eye(2), (len(rows), 1, 1)), labels)
+    found = Constellation.of(DetectionColumns.of([seen]), POSE[None], GROWTH)
+    np.testing.assert_allclose(found.points, to_map(np.array([near]), POSE[None]))
+    np.testing.assert_allclose(found.covariances, [0.03 / SIGHTINGS * np.eye(2)], atol=1e-12)
+    np.testing.assert_array_equal(found.labels, [LEFT])
+
+
+# --- passes of a drive -----------------------------------------------------------------------------------
+
+STEP = 0.5
+DRIFT = np.array([1.0, -0.8, 0.03])
+"""Error of the last pose of a drive, which grows with the path (m, m, rad)."""
+
+
+def along(*pieces: tuple[float, float]) -> Array:
+    """Return poses (n, 3) a step apart on pieces of a path, each a length (m) and a curvature (1/m)."""
+    poses = [np.zeros(3)]
+    for length, curvature in pieces:
+        for _ in range(round(length / STEP)):
+            poses.append(compose(poses[-1], np.array([STEP, 0.0, STEP * curvature])))
+    return np.array(poses)
+
+
+def sensor(poses: Array, seed: int = 0) -> SeenIn:
+    """Return what is seen from true poses (P, 3): cones at irregular places beside and around the path."""
+    rng = np.random.default_rng(seed)
+    at = poses[np.arange(0, len(poses), 6), :2]
+    cones = at + rng.uniform(-5.0, 5.0, at.shape)
+
+    def seen_in(cycles: IntArray) -> DetectionColumns:
+        seen = []
+        for k in cycles.tolist():
+            points = to_vehicle(cones, poses[k : k + 1])
+            near = np.hypot(*points.T) < RANGE - 1.0
+            covariances = np.tile(0.02 * np.eye(2), (near.sum(), 1, 1))
+            seen.append(Detections(0.0, points[near], covariances, np.flatnonzero(near) % 2))
+        table = DetectionColumns.of(seen)
+        return replace(table, cycle=cycles[table.cycle])
+
+    return seen_in
+
+
+def drifted(poses: Array) -> Array:
+    """Return poses (P, 3) whose error grows to `DRIFT` in the end."""
+    return poses + np.linspace(0.0, 1.0, len(poses))[:, None] * DRIFT
+
+
+ROUND = 2.0 * np.pi * 12.0
+LAP, ON_ROUND, ENTRY = (ROUND, 1.0 / 12.0), (ROUND, -1.0 / 12.0), (20.0, 0.0)
+
+
+def test_a_lap_ends_where_the_cones_of_its_beginning_are() -> None:
+    true = along(LAP, (20.0, 1.0 / 12.0))
+    poses = drifted(true)
+    revisit = return_to_beginning(sensor(true), poses, SETTINGS)
+    assert revisit is not None
+    assert revisit.later == len(poses) - 1
+    np.testing.assert_allclose(revisit.local, relative(true[revisit.earlier], true[-1]), atol=0.25)
+    assert abs(revisit.local[0]) < 2.0 * STEP  # the earlier pose is the nearest one
+
+
+def test_a_round_of_a_skidpad_is_no_lap() -> None:
+    """Its cones are met again as surely, but the newest path does not cross the start."""
+    true = along(ENTRY, ON_ROUND, (10.0, -1.0 / 12.0))
+    poses, seen_in = drifted(true), sensor(true)
+    found = find_return(seen_in, poses, 40.0, NEARBY, GROWTH)
+    assert found is not None and found[0].is_sure
+    assert return_to_beginning(seen_in, poses, SETTINGS) is None
+
+
+def test_an_open_road_meets_no_cones_again() -> None:
+    true = along((150.0, 0.01))
+    assert return_to_beginning(sensor(true), true, SETTINGS) is None
+
+
+@pytest.mark.parametrize(("lane", "is_same"), [(0.0, True), (2.0, True), (4.0, False)])
+def test_another_road_beside_is_no_return(lane: float, is_same: bool) -> None:
+    """The second pass is so far (m) to the left of the first, whose sensor has seen its cones as well."""
+    first = along((40.0, 0.0))
+    elsewhere, beside_it = np.array([80.0, 40.0, 0.0]), np.array([0.0, lane, 0.0])
+    true = np.concatenate([first, along((6.0, 0.0)) + elsewhere, first[10:60] + beside_it])
+    found = find_return(sensor(true), true, float(path_lengths(first)[-1]), NEARBY, GROWTH)
+    assert (found is not None) is is_same
+    if found is not None:
+        np.testing.assert_allclose(found[0].pose, true[-1], atol=0.1)
+        assert found[1] == 59
+
+
+def test_a_pose_before_the_newest_moves_with_it() -> None:
+    true = along(LAP, (20.0, 1.0 / 12.0))
+    laid = Laid(true[-1], np.eye(3), 0.0, 20, 1.0, np.inf, 0.0)
+    revisit = revisit_of(laid, true, 8, len(true) - 11)
+    np.testing.assert_allclose(revisit.local, relative(true[8], true[-11]), atol=1e-9)
+    assert (revisit.earlier, revisit.later) == (8, len(true) - 11)
+
+
+def test_the_information_moves_with_the_pose() -> None:
+    """The covariance in the frame of the earlier pose is that of samples, for an error of 1 cm and 1 mrad."""
+    rng = np.random.default_rng(0)
+    frame, centre = np.array([4.0, 1.0, 0.7]), np.array([7.0, -3.0, 2.1])
+    arm = np.array([-6.0, 2.0, -0.4])
+    spread = rng.normal(size=(3, 3)) * np.array([[1e-2], [1e-2], [1e-3]])
+    covariance = spread @ spread.T
+    later = compose(centre, relative(centre, centre + arm))
+    revisit = relative_pose((3, frame), (9, later), centre, np.linalg.inv(covariance))
+    np.testing.assert_allclose(revisit.local, relative(frame, later))
+    samples = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
+    moved = np.empty_like(samples)
+    for k, (x, y, turn) in enumerate(samples):
+        position = centre[:2] + (x, y) + rotation(turn) @ (later[:2] - centre[:2])
+        moved[k] = relative(frame, np.append(position, later[2] + turn))
+    found = np.linalg.inv(revisit.root.T @ revisit.root)
+    expected = np.cov(moved.T)
+    size = np.sqrt(np.diagonal(expected))
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=0.04)
