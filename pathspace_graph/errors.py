@@ -72,12 +72,17 @@ def solving(what: str) -> Iterator[None]:
         raise SolveError(f"{what} has failed: {type(error).__name__}: {error}") from error
 
 
+LEAST_BEGIN: Final = 3  # number of letters from which a beginning may stand for a name
+NEAR: Final = 0.6  # least similarity (0 to 1) of a name that may have been meant
+
+
 def check_name(name: Any, known: Iterable[str], expected: str) -> None:
-    """Raise a SettingsError that names the nearest known name if one is near, unless `name` is known."""
+    """Raise a SettingsError that names the nearest known name, if one is near, unless `name` is known."""
     known = list(known)
     if name in known:
         return
-    near = get_close_matches(str(name), known, n=1)
+    begins = [one for one in known if len(str(name)) >= LEAST_BEGIN and one.startswith(str(name))]
+    near = begins or get_close_matches(str(name), known, n=1, cutoff=NEAR)
     hint = f", the nearest is '{near[0]}'" if near else ""
     raise SettingsError(f"{expected}, found '{name}'{hint}")
 

@@ -10,6 +10,7 @@ from typing import ClassVar, Final
 from pathspace_graph.settings.online import HealthSettings
 
 from .labels import BOUNDARIES, NAMES
+from .lengths import Length, Text
 
 GOOD: Final = "good"
 DEGRADED: Final = "degraded"
@@ -21,7 +22,7 @@ CONDITIONS: Final = (GOOD, DEGRADED, LOST)
 class Health:
     """How far the estimate of a cycle can be trusted."""
 
-    LENGTHS: ClassVar = {"reason": 1}
+    LENGTHS: ClassVar = {"reason": 0}
 
     condition: str = ""  # good, degraded or lost; empty without a monitor
     reason: str = ""  # why the condition is not good
@@ -115,8 +116,8 @@ class HealthMonitor:
         degraded = settings.share_degraded if newest.closed else settings.open_degraded
         blind = newest.t - (newest.t if self._last_offered is None else self._last_offered)
         if newest.sigma > settings.sigma_degraded:
-            reason = f"the position is uncertain by {newest.sigma:.1f} m"
-            return Health(LOST if newest.sigma > settings.sigma_lost else DEGRADED, reason)
+            uncertain = Text("the position is uncertain by {sigma:.2g} m", sigma=Length(newest.sigma))
+            return Health(LOST if newest.sigma > settings.sigma_lost else DEGRADED, uncertain)
         if share < degraded:
             wrong = self._wrong_side() if share < lost and newest.closed else ""
             reason = wrong or f"{100 * share:.0f} % of the detections lie on the map"

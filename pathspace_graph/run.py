@@ -30,7 +30,7 @@ from .laps import LapCounter
 class CycleResult(Brief):
     """Result of an online estimator in one perception cycle."""
 
-    LENGTHS: ClassVar = {"pose": POSE, "jump": POSE, "notice": 1, "health": 0}
+    LENGTHS: ClassVar = {"pose": POSE, "jump": POSE, "notice": 0, "health": 0}
 
     t: float
     """Stamp of the cycle (s)."""

@@ -22,7 +22,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .errors import ReadingError, SettingsError, check_type, solving
 from .labels import LEFT, RIGHT, UNKNOWN
-from .lengths import POSE, scaled, times
+from .lengths import POSE, Text, scaled, times
 from .run import settings_dict, split_odometry
 
 C = TypeVar("C", bound=type[Any])
@@ -165,19 +165,31 @@ class FrontDoor:
 
 
 def noise_at(noise: Array | KnownNoise | None, scale: float) -> Array | KnownNoise | None:
-    if noise is None or isinstance(noise, KnownNoise):
+    if noise is None:
+        return None
+    if isinstance(noise, KnownNoise):
+        positive_sigmas(noise.odometry)
         return scaled(noise, 1.0 / scale)
+    return np.asarray(times(positive_sigmas(noise), POSE, 1.0 / scale))
+
+
+def positive_sigmas(values: Any) -> Array:
+    """Return the standard deviations (3,) of a twist; SettingsError for anything but positive numbers."""
     try:
-        return np.asarray(times(np.asarray(noise, float), POSE, 1.0 / scale))
+        sigmas = np.array(values, float)
     except (TypeError, ValueError):
-        raise SettingsError(f"odometry_sigma: expected 3 positive numbers, found {noise!r:.80}") from None
+        sigmas = np.zeros(0)
+    if sigmas.shape != (3,) or not ((sigmas > 0.0) & (sigmas < np.inf)).all():
+        found = values.tolist() if isinstance(values, np.ndarray) else values
+        raise SettingsError(f"odometry_sigma: expected 3 positive numbers, found {found!r:.80}")
+    return sigmas
 
 
 def in_scene(error: ReadingError, scale: float) -> ReadingError:
-    expected, found = times(error.expected, 1, scale), error.found
-    if expected != error.expected and isinstance(found, float):
-        found = found * scale
-    return type(error)(error.field, expected, found, error.row, error.t)
+    if not isinstance(error.expected, Text):
+        return error
+    found = error.found * scale if isinstance(error.found, float) else error.found
+    return type(error)(error.field, error.expected.scaled(scale), found, error.row, error.t)
 
 
 def at_scale(estimator: C) -> C:
@@ -236,7 +248,10 @@ def _outwards(method: Callable[..., Any]) -> Callable[..., Any]:
             if not isinstance(length, Real):
                 raise SettingsError(f"{name}: expected a number (m), found {length!r}")
         scale = self._door.scene.value
-        return scaled(method(self, distance / scale, step / scale), scale)
+        try:
+            return scaled(method(self, distance / scale, step / scale), scale)
+        except SettingsError as error:
+            raise SettingsError(times(error.args[0], 0, scale)) from None
 
     return ahead if method.__name__ == "ahead" else answer
 

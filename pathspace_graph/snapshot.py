@@ -46,6 +46,7 @@ from pathspace_graph.io.parsing import parse_json, read_bytes, shown
 
 from .checkpoint import Recovery
 from .errors import InputError, PathspaceError, SettingsError
+from .lengths import Length, Text
 
 E = TypeVar("E")
 Structure = dict[str, Any]
@@ -172,6 +173,8 @@ TYPES: Final[dict[type, tuple[Callable[[Any], Iterable[Any]], Callable[..., Any]
         lambda *values: dict(zip(values[::2], values[1::2], strict=True)),
     ),
     deque: (lambda ring: (ring.maxlen, *ring), lambda longest, *values: deque(values, longest)),
+    Text: (lambda text: (text.template, text.figures), lambda template, figures: Text(template, **figures)),
+    Length: (lambda length: (length.value, length.power), Length),
     slice: (lambda span: (span.start, span.stop, span.step), slice),
     KDTree: (lambda tree: (np.array(tree.data),), KDTree),
     Recovery: (lambda recovery: (recovery.failures,), Recovery),

@@ -237,7 +237,7 @@ def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
     run, said = outcome.result, list[str]()
     if run is not None:
         said += [record.notice for record in run.cycles if record.notice]
-        said += [] if run.vehicle is None else diagnose(run.vehicle, run.settings)
+        said += [] if run.vehicle is None else diagnose(run.vehicle, run.settings, run.scale)
     record: Record = {"format": FORMAT, "id": cell.id, "cell": cell.names, "versions": versions()}
     record |= {"failure": outcome.failure, "traceback": outcome.trace}
     record |= {"notices": "; ".join(dict.fromkeys(said)), "laps": lap_rows(outcome.rows)}

@@ -107,7 +107,10 @@ def measure(
     if any(health):
         values |= {f"reported_{level}": health.count(level) / len(health) for level in (DEGRADED, LOST)}
     if run.vehicle is not None:
-        values |= {f"{name}_by_prior": value for name, value in by_prior(run.vehicle, run.settings).items()}
+        values |= {
+            f"{name}_by_prior": value
+            for name, value in by_prior(run.vehicle, run.settings, run.scale).items()
+        }
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
     if isinstance(run, BatchResult) and has_cones(log.truth):

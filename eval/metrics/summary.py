@@ -18,9 +18,10 @@ from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.lengths import scaled
-from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
+from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.scale import scale_of
+from pathspace_graph.spline.crossing import Crossing
 
 from .accuracy import LapMetrics, lap_metrics, root_mean_square, true_lap_ends
 from .consistency import consistency_at_cones
@@ -51,8 +52,10 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         summary["seconds"] = {"mean": float(np.mean(seconds)), "p99": p99, "max": max(seconds)}
     if result.batches is not None:
         summary["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
+    if crossed := crossings_of(result):
+        summary["crossings"] = [_crossing(one) for one in crossed]
     if hints:
-        summary["hints"] = [asdict(hint) for hint in hints]
+        summary["hints"] = [hint.texts for hint in hints]
     told = [record for record in result.cycles if record.jump is not None or record.notice]
     if told:
         keys = ("cycle", "t", "jump", "notice")
@@ -62,18 +65,23 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         summary["health"] = {**number, "stretches": [asdict(of) for of in stretches_of(result)]}
     if result.noise is not None:
         summary["noise"] = _noise(result.noise, log)
-        notes = noise_lines(result.noise)
+        notes = noise_lines(result.noise, result.scale)
         summary |= {"notes": notes} if notes else {}
     state = result.vehicle
     if state is not None:
         summary["calibration"] = {name: value for name, (value, _) in state.by_name.items()}
         summary["calibration"] |= {f"{name}_sigma": sigma for name, (_, sigma) in state.by_name.items()}
         summary["heading_sigma"] = float(state.sigmas[2])
-        found = diagnose(state, result.settings)
+        found = diagnose(state, result.settings, result.scale)
         summary |= {"diagnosis": found} if found else {}
     if log.truth is not None:
         summary |= _map_errors(result, log, log.truth) | _trajectory_errors(result, log.truth)
     return summary
+
+
+def _crossing(crossing: Crossing) -> dict[str, Any]:
+    x, y = crossing.place.tolist()
+    return {"boundary": NAMES[crossing.label], "x": x, "y": y, "driven": crossing.driven}
 
 
 def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import ClassVar, Final
 
 import gtsam
 import numpy as np
+from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SettingsError, SolveError
@@ -36,6 +37,7 @@ from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, Vehicle
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE as POSE_LENGTHS
+from pathspace_graph.lengths import Length, Text, joined
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.motion import known_noise, size_of_vehicle, with_inflated_priors, with_size
 from pathspace_graph.mapping.state import State
@@ -54,11 +56,11 @@ from .system import BatchSystem, Biweight, CurveGauge, Evaluation
 ROOM: Final = 4.0  # distance from its foot points in which a factor searches them (m along the curve)
 HALVINGS: Final = 6  # most halvings of the room while another foot point in it is nearer, as in a bend
 SAME: Final = 1e-3  # distance below which two foot points are the same (m along the curve)
-STRETCH: Final = 25.0  # length of the stretches of the drive by which a map is judged (m)
+STRETCH: Final = 25.0  # length of the stretches of the drive by which a miss is located (m)
 FEW: Final = 20  # number of detections below which a stretch says nothing
-USUALLY: Final = 80.0  # percentile of the stretches' shares of explained detections that is usual for a log
-POOR: Final = 0.6  # share of the usual one below which a stretch is poorly mapped; good maps have 0.9
-MOST_POOR: Final = 1.0 / 3.0  # most of the drive that may be so: ways to a track have no boundaries
+NEAR: Final = 2.5  # farthest from the drive that detections are near it, by the usual distance of used ones
+MISSES: Final = 1.0 / 3.0  # least share of the detections near the drive on no boundary that is a miss
+SHOWN: Final = 3  # most stretches that are told
 
 
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
@@ -194,7 +196,10 @@ NAME: Final = "spline"  # name of the estimator on the command line
 class BatchResult(BatchRun):
     """The result of a batch optimization, how it ended, and its uncertainty."""
 
-    LENGTHS: ClassVar = RunResult.LENGTHS | {"map_covariance": 2, "scatter": 0, "online": 0}
+    LENGTHS: ClassVar = RunResult.LENGTHS | {
+        **dict.fromkeys(("scatter", "online", "objection"), 0),
+        "map_covariance": 2,
+    }
 
     convergence: Convergence
     map_covariance: Array
@@ -331,19 +336,28 @@ def _optimizer(judged: JudgedLog, on_round: Callable[[], None] | None) -> Optimi
 
 
 def unmapped(detections: DetectionTable, poses: Array) -> str:
-    """Return that the boundaries explain too few detections along too much of a drive; empty if they don't.
+    """Return that a third of what was detected near a drive lies on no boundary, and where; or nothing.
 
-    A stretch is judged by the share of its detections that lies on them, over that of the better stretches,
-    since a sensor may see things that are no cones everywhere.
+    What is far from the drive may be of another road, or no cone.
     """
-    stretch = (path_lengths(poses) // STRETCH).astype(np.intp)[detections.cycle]
-    offered = np.bincount(stretch)
-    used = np.bincount(stretch, detections.used, len(offered))
-    share = used[offered >= FEW] / offered[offered >= FEW]
-    poor = share < POOR * np.percentile(share, USUALLY) if len(share) else np.zeros(1, bool)
-    if poor.mean() <= MOST_POOR:
+    if len(detections.cycle) == 0:
         return ""
-    return f"the boundaries lack the cones of {100.0 * poor.mean():.0f} % of the drive"
+    driven, used = path_lengths(poses), detections.used
+    points = to_map(detections.measured, poses[detections.cycle])
+    distance = np.asarray(KDTree(poses[:, :2]).query(points)[0])
+    near = distance < NEAR * np.median(distance[used] if used.any() else distance)
+    missed = near & ~used
+    if missed.sum() < MISSES * near.sum():
+        return ""
+    stretch = (driven[detections.cycle] // STRETCH).astype(np.intp)
+    count = np.bincount(stretch, near)
+    poor = (count >= FEW) & (np.bincount(stretch, missed, len(count)) >= MISSES * count)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], poor, [False]])))
+    ends = np.minimum(STRETCH * edges.reshape(-1, 2), driven[-1]).tolist()[:SHOWN]
+    told = [Text("{a:.3g} to {b:.3g} m", a=Length(a), b=Length(b)) for a, b in ends]
+    where = Text(" ({stretches} of the drive)", stretches=joined(told, ", ")) if told else ""
+    said = "{share:.0f} % of what was detected near the drive lies on no boundary{where}"
+    return Text(said, share=100.0 * missed.sum() / near.sum(), where=where)
 
 
 def _known(system: BatchSystem, at: Evaluation) -> FactoredSystem:

@@ -152,7 +152,7 @@ def write_checked(log: Log, out: Path, source: Path) -> None:
 def report(notes: Counter[str], rule: LabelRule, log: Log, out: Path) -> None:
     """Print what the labels were taken for, what was left out or assumed how often, and the log in short."""
     say(*(f"{count} {text}" for text, count in notes.items() if count))
-    measured = [] if log.measured is None else [measured_line(log.measured)]
+    measured = [] if log.measured is None else [measured_line(log.measured, scale_of(log))]
     labels = [rule.told()] if rule.met else []
     if hint := rule.hint():
         note(f"hint: {hint}")

@@ -28,14 +28,15 @@ from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.plausibility.diagnosis import diagnose, noise_lines
+from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
+from pathspace_graph.spline.crossing import crossings_told
 
-NOT_CONVERGED: Final = 3  # exit code of a batch whose result is written, but is not the optimum
+NOT_TRUSTED: Final = 3  # exit code of a result that is written, but is not the optimum or no map of the drive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +85,8 @@ class Online:
         report(result, log)
         written = [str(path) for path in (self.out, self.save_view, self.animate) if path is not None]
         say(f"written to {', '.join(written)}")
+        crossed = crossings_told(crossings_of(result))
+        end_untrusted([f"not a map of the drive: {crossed}"] if crossed else [])
 
     def _viewing(self) -> Any:
         """Return the module of viewers and films if one is asked for; importing matplotlib is slow."""
@@ -146,13 +149,20 @@ class Batch:
         write_result(self.out, result, summarize_batch(result, log, hints))
         report(result, log)
         say(f"written to {self.out}")
-        known = result if isinstance(result, BatchResult) else None
-        wrong = f"not a map of the drive: {known.objection}" if known and known.objection else ""
+        known, wrong = result if isinstance(result, BatchResult) else None, list[str]()
         if not result.converged:
-            wrong = f"not converged: {known.convergence.reason if known else 'associations still change'}"
-        if wrong:
-            note(wrong)
-            raise SystemExit(NOT_CONVERGED)
+            reason = known.convergence.reason if known else "associations still change"
+            wrong.append(f"not converged: {reason}")
+        objections = [known.objection if known else "", crossings_told(crossings_of(result))]
+        wrong += [f"not a map of the drive: {objection}" for objection in objections if objection]
+        end_untrusted(wrong)
+
+
+def end_untrusted(wrong: Sequence[str]) -> None:
+    """Print as errors what is wrong with a result that is written, and end with an exit code; or go on."""
+    if wrong:
+        note(*wrong)
+        raise SystemExit(NOT_TRUSTED)
 
 
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
@@ -191,7 +201,8 @@ def report(result: RunResult, log: Log) -> None:
         late = f"{result.batches.late} cycle{'' if result.batches.late == 1 else 's'}"
         say(f"in a vehicle the batch of the lap would have been {late} late")
     state = result.vehicle
-    say(*noise_lines(result.noise), *([] if state is None else diagnose(state, result.settings)))
+    say(*noise_lines(result.noise, result.scale))
+    say(*([] if state is None else diagnose(state, result.settings, result.scale)))
     if missing := not_mapped(result.map, log):
         note("; ".join(missing))
 

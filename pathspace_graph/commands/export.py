@@ -14,11 +14,13 @@ from pathspace_graph.io.export import LocalPlane
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
-from pathspace_graph.io.results import TRAJECTORY_FILE, read_trajectory, write_trajectory
+from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory, write_trajectory
 from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.spline.ahead import LEAST_STEP, MOST_POINTS
+from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told
 
 Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
+ALONG_THE_ROAD = ("centerline", "profile", "geojson", "lanelet2")  # formats that say where to drive
 ON_EARTH = ("geojson", "lanelet2")  # formats that have latitude and longitude
 
 
@@ -62,6 +64,8 @@ class Export:
             return
         track = read_map(self.map)
         check_length(track, self.step, file)
+        if self.format in ALONG_THE_ROAD:
+            check_crossings(track, self.map)
         with atomic_file(self.out) as temporary:
             try:
                 self._write(temporary, track, plane)
@@ -98,6 +102,17 @@ def write_true_path(folder: Path, out: Path) -> None:
         raise InputError(folder, f"expected a log with {TRUTH_POSES_FILE}, or a map, found neither")
     with atomic_file(out) as temporary:
         write_trajectory(temporary, truth.pose_t, truth.poses)
+
+
+def check_crossings(track: Map, folder: Path) -> None:
+    """Raise an InputError where the vehicle drove across a boundary, if its trajectory is in the folder."""
+    files = (folder / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE))
+    file = next((file for file in files if file.exists()), None)
+    if file is None:
+        return
+    crossed = crossings_told(crossed_boundaries(track.splines, read_trajectory(file)[1][:, :2]))
+    if crossed:
+        raise InputError(folder / MAP_FILE, f"expected the map of the drive in {file.name}: {crossed}")
 
 
 def check_length(track: Map, step: float, file: Path) -> None:

@@ -20,7 +20,6 @@ import tyro
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.overrides import leaves, read_settings
 from pathspace_graph.io.parsing import MAX_INTEGER, shown
-from pathspace_graph.settings.checked import check_gone
 from pathspace_graph.settings.mapper import MapperSettings
 
 HELP: Final = ("-h", "--help")
@@ -106,8 +105,6 @@ def _start(command: type[Any], arguments: list[str]) -> tuple[Any, list[str]]:
     if not _estimates(command):
         start = getattr(command, "start", None)
         return start(arguments) if start else None, arguments
-    for option in (word.partition("=")[0] for word in arguments if word.startswith("--")):
-        check_gone(option.removeprefix("--").replace("-", "_"), option)
     words = [part for word in arguments for part in word.split("=", word.startswith(f"{SETTINGS}="))]
     if SETTINGS not in words:
         return None, arguments

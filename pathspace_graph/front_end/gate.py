@@ -27,7 +27,7 @@ from pathspace_graph.io.log import (
     read_log,
 )
 from pathspace_graph.labels import LEFT, NAMES
-from pathspace_graph.lengths import scaled
+from pathspace_graph.lengths import Length, Text, joined, scaled
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.scale import in_scene, scale_of
 from pathspace_graph.settings.online import LimitSettings
@@ -69,7 +69,7 @@ class Admitted:
         """Return the result of the cycle with what was counted at the gate."""
         if not (self.dropped or self.late or self.refused):
             return result
-        notice = "; ".join(text for text in (self.notice, result.notice) if text)
+        notice = joined([self.notice, result.notice])
         return replace(result, notice=notice, dropped=self.dropped, late=self.late, refused=self.refused)
 
 
@@ -201,6 +201,9 @@ def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, A
         row, column = divmod(int(good.argmin()), len(TWIST))
         name, unit = list(TWIST.items())[column]
         expected = f"{name} from -{most[column]:g} to {most[column]:g} {unit}"
+        if unit == "m/s":
+            limit = Length(most[column])
+            expected = Text("{name} from -{limit:g} to {limit:g} m/s", name=name, limit=limit)
         raise ReadingError("odometry.twist", expected, float(twists[row, column]), row)
     return stamps, twists
 
@@ -238,14 +241,30 @@ def possible_detections(detections: Detections, t: float, limits: LimitSettings)
     if good.all():
         return Detections(t, points, covariances, labels), ""
     row = int(good.argmin())
-    expected = f"a distance from {MIN_RANGE:g} to {limits.range_max:g} m"
-    found: object = points[row].tolist()
-    if near[row]:
-        expected = f"a covariance with sigmas from {MIN_SIGMA:g} to {MAX_SIGMA:g} m"
-        found = covariances[row].tolist()
-    many = f"{count - int(good.sum())} of {count} detections dropped"
-    notice = f"{many}: expected {expected}, found {found} in row {row}"
+    expected, found = _impossible(points[row], covariances[row], near[row], limits)
+    notice = Text(
+        "{dropped} of {count} detections dropped: expected {expected}, found {found} in row {row}",
+        dropped=count - int(good.sum()),
+        count=count,
+        expected=expected,
+        found=found,
+        row=row,
+    )
     return Detections(t, points[good], covariances[good], labels[good]), notice
+
+
+def _impossible(point: Array, covariance: Array, is_near: bool, limits: LimitSettings) -> tuple[Text, Text]:
+    """Return what was expected of a detection, and what was found: its position (2,) or covariance (2, 2)."""
+    if not is_near:
+        low, high = Length(MIN_RANGE), Length(limits.range_max)
+        x, y = map(Length, point.tolist())
+        expected = Text("a distance from {low:g} to {high:g} m", low=low, high=high)
+        return expected, Text("[{x:g}, {y:g}]", x=x, y=y)
+    low, high = Length(MIN_SIGMA), Length(MAX_SIGMA)
+    entries = dict(zip(("xx", "xy", "yx", "yy"), covariance.ravel().tolist(), strict=True))
+    squares = {name: Length(entry, power=2) for name, entry in entries.items()}
+    expected = Text("a covariance with sigmas from {low:g} to {high:g} m", low=low, high=high)
+    return expected, Text("[[{xx:g}, {xy:g}], [{yx:g}, {yy:g}]]", **squares)
 
 
 @compiled

@@ -147,6 +147,12 @@ class Map:
         covariance = self.covariance_of(left, right)
         return centre_line(left.spline, right.spline, covariance, left.spline.periodic, step)
 
+    @property
+    def splines(self) -> dict[int, BSpline]:
+        """Return the boundaries that are curves, by label."""
+        boundaries = self.boundaries.items()
+        return {label: one.spline for label, one in boundaries if isinstance(one, SplineBoundary)}
+
     def curves(self, purpose: str) -> tuple[SplineBoundary, SplineBoundary]:
         """Return both boundaries, which must be curves, and both closed or both open."""
         left, right = (self.curve(label, purpose) for label in BOUNDARIES)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_json, parse_toml, read_text, shown
-from pathspace_graph.settings.checked import check_gone, in_words, is_of
+from pathspace_graph.settings.checked import in_words, is_of
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]  # new values by dotted field
@@ -33,7 +33,6 @@ def override(settings: T, overrides: Overrides, where: str) -> T:
     known, before = leaves(settings), f"{where}." if where else ""
     for name, value in overrides.items():
         if name not in known:
-            check_gone(name, f"{before}{name}")
             check_name(name, known, f"{where}: expected a known setting" if where else "expected a setting")
         settings = _set(settings, name.split("."), value, f"{before}{name}")
     return settings

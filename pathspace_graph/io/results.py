@@ -77,7 +77,7 @@ CYCLE_COLUMNS: Final = {  # columns of `cycles.csv` with their types; any furthe
 class CycleRecord:
     """One row of `cycles.csv` (FORMATS)."""
 
-    LENGTHS: ClassVar = {"jump": POSE, "notice": 1, "reason": 1}
+    LENGTHS: ClassVar = {"jump": POSE, "notice": 0, "reason": 0}
 
     cycle: int
     """Number of the perception cycle, from 0."""

@@ -15,6 +15,7 @@ from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.lengths import joined
 from pathspace_graph.mapping.constellation import relative_pose
 from pathspace_graph.mapping.motion import inflate_priors
 from pathspace_graph.mapping.path import DrivenPath
@@ -247,11 +248,11 @@ class TrackLoop:
             if outcome.is_final:
                 self.record.give_up(outcome.reason)
                 self._loop_rests = 0.0  # a registration may close the loop at once
-            return None, f"{STAYS_OPEN}: {outcome.reason}"
+            return None, joined([STAYS_OPEN, outcome.reason], ": ")
         if repairs and (not notice or self._crosses(outcome.splines) > self._boundaries_cross):
             return None, ""
         if outcome.objection and not repairs:
-            return None, f"{STAYS_OPEN}: {outcome.objection}"
+            return None, joined([STAYS_OPEN, outcome.objection], ": ")
         if not self.closed:
             self._closes()
         self.lap_seconds = outcome.seconds

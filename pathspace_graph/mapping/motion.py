@@ -6,15 +6,15 @@ from typing import Final, Self
 
 import numpy as np
 
-from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, SENSOR_KEY, pose_key
+from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, pose_key
 from pathspace_graph.graph.window import MapRows, SmootherSettings
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.io.results import VehicleState
+from pathspace_graph.scale import positive_sigmas
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.settings.online import OdometrySettings
 
@@ -75,10 +75,7 @@ def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
     if not isinstance(sigma, KnownNoise):
         stated = sigma is not None
         sigma = KnownNoise(np.array(sigma if stated else ODOMETRY_SIGMA), odometry_stated=stated)
-    noise = np.array(sigma.odometry, float)
-    if noise.shape != (POSE,) or not ((noise > 0.0) & (noise < np.inf)).all():
-        raise SettingsError(f"odometry_sigma: expected {POSE} positive numbers, found {noise.tolist()}")
-    return replace(sigma, odometry=noise)
+    return replace(sigma, odometry=positive_sigmas(sigma.odometry))
 
 
 def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:

@@ -19,6 +19,7 @@ from pathspace_graph.health import GOOD
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.lengths import joined
 from pathspace_graph.loop.closing import SIGMA_STEP, apply_correspondences, simplify
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.motion import known_noise, predict
@@ -154,7 +155,7 @@ class FixedLagMapper(MapperEstimate):
             self.growth.clear()
         self.smoother.marginalize(self.loop.first_kept)
         watch.lap("marginalize")
-        notice = "; ".join(filter(None, (notice, self.growth.notice, reading.notice, learned)))
+        notice = joined([notice, self.growth.notice, reading.notice, learned])
         return self._result(cycle.detections.t, watch.laps, jump, notice)
 
     def _without(
@@ -181,7 +182,7 @@ class FixedLagMapper(MapperEstimate):
                 continue
             self.recovery.called(again)
             self._unused = unused if cycle.late else None
-            return replace(result, notice="; ".join(filter(None, (failed, consequence, result.notice))))
+            return replace(result, notice=joined([failed, consequence, result.notice]))
         self.recovery.take_back(self, self.front_end.gate)
         self._unused = unused if cycle.late else cycle.odometry
         return self._result(cycle.detections.t, {}, None, f"{failed}; the cycle is not used")

@@ -8,6 +8,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
+from pathspace_graph.lengths import Length, Text, joined
 from pathspace_graph.mapping import path
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import SIDES, Candidates, End, PathAhead, chain, crosses
@@ -236,9 +237,13 @@ class Growth:
         if label not in self._full:
             self._full.add(label)
             boundary = self._state.boundaries[label]
-            size = f"{boundary.size} control points on {boundary.confirmed_end:.0f} m"
-            notice = f"the open {NAMES[label]} boundary grows no further, with {size}"
-            self.notice = f"{self.notice}; {notice}" if self.notice else notice
+            notice = Text(
+                "the open {name} boundary grows no further, with {size} control points on {length:.3g} m",
+                name=NAMES[label],
+                size=boundary.size,
+                length=Length(boundary.confirmed_end),
+            )
+            self.notice = joined([self.notice, notice])
 
 
 def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> BoolArray:

@@ -14,7 +14,9 @@ from pathspace_graph.front_end.gate import TWIST
 from pathspace_graph.front_end.measurement import DRIFT, LEAST
 from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
 from pathspace_graph.io.log import CALIBRATION, Log
-from pathspace_graph.io.results import RunNoise, VehicleState
+from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
+from pathspace_graph.lengths import POSE, Length, Text, joined, scaled
+from pathspace_graph.spline.crossing import Crossing, crossed_boundaries
 
 from .hint import Hint, told
 
@@ -33,24 +35,28 @@ CAUSES: Final = {  # by the name of the calibration
     "scale": Cause("speeds are {:.1f} % too {}", 100.0, ("high", "low")),
     "bias": Cause("the yaw rate is {:.4f} rad/s too {}", 1.0, ("high", "low")),
     "yaw": Cause("the sensor is turned by {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
-    "lateral": Cause("the sensor sits {:.2f} m too far to the {}", 1.0, ("left", "right")),
+    "lateral": Cause("the sensor sits {:.2g} m too far to the {}", 1.0, ("left", "right")),
     "latency": Cause("detections are {:.0f} ms {} than their stamps", 1e3, ("older", "newer")),
     "range_scale": Cause("ranges are {:.1f} % too {}", 100.0, ("long", "short")),
-    "range_bias": Cause("ranges are {:.2f} m too {}", 1.0, ("long", "short")),
+    "range_bias": Cause("ranges are {:.2g} m too {}", 1.0, ("long", "short")),
 }
 
 
-def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, float]:
-    """Return each calibration whose prior is in a run's settings over the prior's standard deviation."""
+def by_prior(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.0) -> dict[str, float]:
+    """Return each calibration whose prior is in a run's settings over the prior's standard deviation.
+
+    Lengths of the state are those of a scene of this scale, lengths in settings those at scale 1.
+    """
+    state = scaled(state, 1.0 / scale)
     groups = {name: "odometry" if name in CALIBRATION else "calibration" for name in state.by_name}
     priors = {name: settings.get(group, {}).get(f"sigma_{name}") for name, group in groups.items()}
     return {name: state.by_name[name][0] / prior for name, prior in priors.items() if prior is not None}
 
 
-def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
+def diagnose(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.0) -> list[str]:
     """Return a line for each calibration that its prior in the settings did not expect, with the cause."""
     lines = []
-    for name, ratio in by_prior(state, settings).items():
+    for name, ratio in by_prior(state, settings, scale).items():
         if abs(ratio) > LIMIT:
             cause, size = CAUSES[name], abs(state.by_name[name][0])
             text = cause.text.format(cause.unit * size, cause.signs[0 if ratio > 0.0 else 1])
@@ -58,23 +64,30 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-REFERENCE: Final = 10.0  # range at which the noise of detections is told (m)
+def crossings_of(result: RunResult) -> list[Crossing]:
+    """Return where the vehicle drove across the boundaries of its map."""
+    path = result.trajectory if result.smoothed is None else result.smoothed
+    return crossed_boundaries(result.map.splines, path[:, :2])
+
+
+REFERENCE: Final = 10.0  # range at which the noise of detections is told (m, at scale 1)
 CLEAR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is told
-# size beyond which it is told (rad, m, s, -, m)
+# size beyond which it is told (rad, m, s, -, m, at scale 1)
 WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
+LENGTHS: Final = ("lateral", "range_bias")  # errors of the sensor in m
 TOLD: Final = {
     "latency": ("stamps {:.0f} ms {}", ("late", "early")),
     "yaw": ("turned {:.1f} degrees to the {}", ("left", "right")),
-    "lateral": ("{:.2f} m too far to the {}", ("left", "right")),
+    "lateral": ("{:.2g} m too far to the {}", ("left", "right")),
 }
 STAYING: Final = 0.1  # share of the variance from which errors that stay with a cone are told
 
 
-def noise_lines(noise: RunNoise | None) -> list[str]:
+def noise_lines(noise: RunNoise | None, scale: float = 1.0) -> list[str]:
     """Return a line on what was measured, and another one where ranges and speeds disagree."""
     if noise is None or noise.measured is None or "measured" not in (noise.odometry, noise.detections):
         return []
-    lines = [measured_line(noise.measured)]
+    lines = [measured_line(noise.measured, scale)]
     if noise.size is not None:
         share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
         whose, other = {"odometry": ("odometry's", "ranges"), "ranges": ("ranges'", "odometry")}[noise.size]
@@ -83,26 +96,28 @@ def noise_lines(noise: RunNoise | None) -> list[str]:
     return lines
 
 
-def measured_line(measured: MeasuredNoise) -> str:
-    """Return a line on the noise, and the constant errors of the sensor that are clearly there."""
+def measured_line(measured: MeasuredNoise, scale: float = 1.0) -> str:
+    """Return a line on the noise in a scene of this scale, and the clear constant errors of the sensor."""
     forward, sideways, turning = (f"{sigma:.2g}" for sigma in measured.odometry)
     line = f"measured: odometry {forward} m/s, {sideways} m/s, {turning} rad/s from sample to sample"
     if measured.along is None or measured.across is None:
         return line
     rays = measured.along, measured.across
-    along, across = (float(ray.sigmas(np.array([REFERENCE]))[0]) for ray in rays)
-    line += f"; detections {along:.2g} m along and {across:.2g} m across the ray at {REFERENCE:g} m"
+    at = REFERENCE * scale
+    along, across = (float(ray.sigmas(np.array([at]))[0]) for ray in rays)
+    line += f"; detections {along:.2g} m along and {across:.2g} m across the ray at {at:g} m"
     if max(ray.share for ray in rays) > STAYING:
         shares = " and ".join(f"{100.0 * ray.share:.0f} %" for ray in rays)
         times = " and ".join(f"{ray.time:g} s" for ray in rays)
         line += f", of which {shares} of the variance stay with a cone for {times}"
-    errors = _errors(measured)
+    errors = _errors(measured, scale)
     return f"{line}; {', '.join(errors)}" if errors else line
 
 
-def _errors(measured: MeasuredNoise) -> list[str]:
+def _errors(measured: MeasuredNoise, scale: float) -> list[str]:
+    worth = {name: scale * least if name in LENGTHS else least for name, least in WORTH.items()}
     errors = zip(SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True)
-    clear = {name: value for name, value, sigma in errors if abs(value) > max(CLEAR * sigma, WORTH[name])}
+    clear = {name: value for name, value, sigma in errors if abs(value) > max(CLEAR * sigma, worth[name])}
     texts = [
         text.format(CAUSES[name].unit * abs(clear[name]), words[clear[name] < 0.0])
         for name, (text, words) in TOLD.items()
@@ -112,7 +127,7 @@ def _errors(measured: MeasuredNoise) -> list[str]:
     if "range_scale" in clear:
         ranges.append(f"{clear['range_scale']:+.1%}".replace("%", " %"))
     if "range_bias" in clear:
-        ranges.append(f"{'-' if clear['range_bias'] < 0.0 else '+'} {abs(clear['range_bias']):.2f} m")
+        ranges.append(f"{'-' if clear['range_bias'] < 0.0 else '+'} {abs(clear['range_bias']):.2g} m")
     return [*texts, f"ranges {' '.join(ranges)}"] if ranges else texts
 
 
@@ -146,15 +161,18 @@ def _odometry(log: Log) -> list[Hint]:
     large = NOISE_FACTOR * most < log.odometry_sigma
     stated, hints = log.odometry_sigma, []
     for which, values, size in ((small, least, "small"), (large, most, "large")):
-        figures = [
-            f"{name} scatters by {values[k]:.2g} {unit}, where {stated[k]:.2g} is stated"
-            for k, (name, unit) in enumerate(TWIST.items())
-            if which[k]
-        ]
+        figures = [_scatter(k, float(values[k]), float(stated[k])) for k in np.flatnonzero(which).tolist()]
         if figures:
             slow = ", unless it stands for errors that change slowly" if size == "large" else ""
-            hints.append(told("noise of odometry", figures=", ".join(figures), size=size + slow))
+            hints.append(told("noise of odometry", figures=joined(figures, ", "), size=size + slow))
     return hints
+
+
+def _scatter(component: int, value: float, stated: float) -> Text:
+    """Return that a component of the twist scatters by a value where another one is stated."""
+    (name, unit), power = list(TWIST.items())[component], POSE[component]
+    template = "{name} scatters by {value:.2g} {unit}, where {stated:.2g} is stated"
+    return Text(template, name=name, unit=unit, value=Length(value, power), stated=Length(stated, power))
 
 
 def _detections(log: Log) -> list[Hint]:
@@ -173,7 +191,7 @@ def _detections(log: Log) -> list[Hint]:
             at = float(np.median(ranges[near]))
             scatter = float(ray.sigmas(np.array([at]))[0])
             stated = scatter * float(np.median(sigmas[near, axis] / ray.sigmas(ranges[near])))
-            figures = {"scatter": scatter, "at": at, "stated": stated}
+            figures = {"scatter": Length(scatter), "at": Length(at), "stated": Length(stated)}
             hints.append(told("noise of detections", way=name, size=size, **figures))
     return hints
 

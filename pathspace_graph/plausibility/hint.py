@@ -1,31 +1,62 @@
 """A hint: what is odd about a log, where it is, its likely cause, and what to do; and the table of them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE
 
 
 @dataclass(frozen=True)
 class Hint:
-    """A likely mistake in a log, with the figure that shows it."""
+    """A likely mistake in a log, by its row of `TABLE` and the numbers that show it; words are made last."""
 
-    LENGTHS: ClassVar = {"found": 1, "likely": 1, "advice": 1}
+    LENGTHS: ClassVar = {"figures": 0}
 
-    cause: str
-    """Kind of the mistake, which begins its row in `TABLE`."""
-    file: str
-    columns: str
-    """Columns of the file, in words."""
-    found: str
-    """What was found, with its figure."""
-    likely: str
-    advice: str
+    mistake: str
+    """Key of its row."""
+    figures: Mapping[str, Any]
+    """Numbers and words of the row's texts by their names there; each in m or m/s is a `Length`."""
+
+    @property
+    def cause(self) -> str:
+        """Return the kind of the mistake."""
+        return self._text(0)
+
+    @property
+    def file(self) -> str:
+        return self._text(1)
+
+    @property
+    def columns(self) -> str:
+        """Return the columns of the file, in words."""
+        return self._text(2)
+
+    @property
+    def found(self) -> str:
+        """Return what was found, with its figure."""
+        return str(self.figures.get("found") or self._text(3))
+
+    @property
+    def likely(self) -> str:
+        return self._text(4)
+
+    @property
+    def advice(self) -> str:
+        return self._text(5)
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """Return the texts by name, as in `summary.json`."""
+        names = ("cause", "file", "columns", "found", "likely", "advice")
+        return {name: getattr(self, name) for name in names}
 
     @property
     def line(self) -> str:
         return f"{self.file}, {self.columns}: {self.found}; likely cause: {self.likely}; {self.advice}"
+
+    def _text(self, column: int) -> str:
+        return TABLE[self.mistake][column].format(**self.figures)
 
 
 def because(hints: Sequence[Hint]) -> str:
@@ -37,7 +68,7 @@ def because(hints: Sequence[Hint]) -> str:
 _T, _XY, _V, _WZ, _K = "column t", "columns x, y", "columns vx, vy", "column wz", "columns xx, xy, yy"
 _LABEL = "column label"
 _EXPECTED = (
-    "{as_written:.0%} of the detections lie where the odometry expects them, and {share:.0%} if it is so"
+    "{as_written:.0f} % of the detections lie where the odometry expects them, and {share:.0f} % if it is so"
 )
 _TURNED = "static cones move as they would for a sensor that is turned by {angle}"
 _BY_READINGS = "--noise measured takes what is measured"
@@ -106,31 +137,29 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
         "the sensor is turned by {angle} in the vehicle{side}",
         "state the sensor's mounting, or turn the detections by that into the vehicle's frame"),
     "place": ("mounting", DETECTIONS_FILE, _XY,
-        "static cones move as they would for a sensor {place} of the point that the odometry describes",
+        "static cones move as they would for a sensor {along:.2f} m {ahead_or_behind} and {aside:.2f} m to "
+        "the {left_or_right} of the point that the odometry describes",
         "the detections are in the sensor's frame, whose origin is not the vehicle's",
         "add {ahead:.2f} to x and {left:.2f} to y, or state the sensor's mounting"),
     "covariances": ("covariances", DETECTIONS_FILE, _K,
         "detections of one cone are {scatter:.2g} m apart as a rule, by their covariances {claimed:.2g} m",
         "the covariances are in {unit}, or no covariances at all", "give each detection's covariance in m^2"),
     "one label": ("labels", DETECTIONS_FILE, _LABEL,
-        "all labels are {label}, and {share:.0%} of the cones are on that side", _CLASSES,
+        "all labels are {label}, and {share:.0f} % of the cones are on that side", _CLASSES,
         "write left, right or unknown for each detection"),
     "foreign labels": ("labels", DETECTIONS_FILE, _LABEL, "the labels are {words}", _CLASSES,
         "write left, right or unknown (or blue, yellow) for each detection"),
     "unexplained": ("unexplained", DETECTIONS_FILE, _XY,
-        "only {share:.0%} of the detections lie where any motion expects them",
+        "only {share:.0f} % of the detections lie where any motion expects them",
         "bearings in degrees were taken for radians, or the two files are not of one drive",
         "compare a few cycles with what the sensor saw"),
     "noise of odometry": ("noise", LOG_FILE, "[odometry] sigma", "{figures}",
         "the stated noise is too {size}", _BY_READINGS),
     "noise of detections": ("noise", DETECTIONS_FILE, _K,
-        "detections scatter by {scatter:.2g} m {way} the ray at {at:.0f} m, where {stated:.2g} m is stated",
+        "detections scatter by {scatter:.2g} m {way} the ray at {at:.2g} m, where {stated:.2g} m is stated",
         "the covariances are too {size}", _BY_READINGS),
 }  # fmt: skip
 
 
-def told(mistake: str, **figures: object) -> Hint:
-    """Return the hint about a mistake of the table, with its figures; a share is written as `12 %`."""
-    cause, *texts = TABLE[mistake]
-    file, columns, found, likely, advice = (text.format(**figures) for text in texts)
-    return Hint(cause, file, columns, found.replace("%", " %") if "%}" in texts[2] else found, likely, advice)
+def told(mistake: str, **figures: Any) -> Hint:
+    return Hint(mistake, figures)

@@ -230,7 +230,7 @@ class Trial:
 
 
 def far_better(trial: Trial, reference: Trial) -> dict[str, float] | None:
-    """Return the shares that both explain where they differ, or None unless the trial is clearly better."""
+    """Return the shares (%) that both explain where they differ, None unless the trial is clearly better."""
     gain = trial.explained - reference.explained
     telling: BoolArray = np.abs(gain) > TELLING
     if not telling.any():
@@ -238,7 +238,7 @@ def far_better(trial: Trial, reference: Trial) -> dict[str, float] | None:
     share, as_written = (float(one.explained[telling].mean()) for one in (trial, reference))
     chance = float(scipy.special.bdtrc(int((gain[telling] > 0.0).sum()) - 1, int(telling.sum()), 0.5))
     clear = chance < CHANCE and share > FAR_BETTER * as_written and share > LEAST_SHARE
-    return {"as_written": as_written, "share": share} if clear else None
+    return {"as_written": 100.0 * as_written, "share": 100.0 * share} if clear else None
 
 
 class Trials:

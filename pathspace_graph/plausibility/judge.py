@@ -15,7 +15,7 @@ from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.parsing import read_table, shown
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
-from pathspace_graph.lengths import scaled
+from pathspace_graph.lengths import Length, scaled
 from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
 
@@ -159,14 +159,14 @@ def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
     else:
         return log, []
     cycles = [replace(cycle, points_vehicle=cycle.points_vehicle * unit) for cycle in log.cycles]
-    hint = told("unit of positions", typical=typical, what=what, factor=unit)
+    hint = told("unit of positions", typical=Length(typical), what=what, factor=unit)
     return replace(log, cycles=tuple(cycles)), [hint]
 
 
 def beyond_any_vehicle(odometry: Odometry) -> list[Hint]:
     speed = float(np.quantile(np.hypot(odometry.twist[:, 0], odometry.twist[:, 1]), 0.9))
     rate = float(np.quantile(np.abs(odometry.twist[:, 2]), 0.9))
-    found = [told("too fast", speed=speed)] if speed > FASTEST else []
+    found = [told("too fast", speed=Length(speed))] if speed > FASTEST else []
     return [*found, told("turns too fast", rate=rate)] if rate > FASTEST_TURN else found
 
 
@@ -280,10 +280,9 @@ def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
     if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURNED or sigma > TURNED_SIGMA):
         return found
     side = ", with y to the right" if frame.mirrored else ""
-    hint = told("turned", angle=_angle(frame.turn + yaw, 1), side=side)
-    figure = next((one.found for one in found if one.cause == "sensor frame"), hint.found)
+    figure = next((one.found for one in found if one.cause == "sensor frame"), "")
     others = [one for one in found if one.cause not in ("sensor frame", "y to the right")]
-    return [*others, replace(hint, found=figure)]
+    return [*others, told("turned", angle=_angle(frame.turn + yaw, 1), side=side, found=figure)]
 
 
 def _placed(mounting: Mounting) -> list[Hint]:
@@ -291,9 +290,10 @@ def _placed(mounting: Mounting) -> list[Hint]:
     if length < ARM or sigma > ARM_SIGMA * length:
         return []
     ahead, left = mounting.values[1:].tolist()
-    along, aside = "ahead" if ahead > 0.0 else "behind", "left" if left > 0.0 else "right"
-    place = f"{abs(ahead):.1f} m {along} and {abs(left):.1f} m to the {aside}"
-    return [told("place", place=place, ahead=ahead, left=left)]
+    words = {"ahead_or_behind": "ahead" if ahead > 0.0 else "behind"}
+    words["left_or_right"] = "left" if left > 0.0 else "right"
+    lengths = {"ahead": ahead, "left": left, "along": abs(ahead), "aside": abs(left)}
+    return [told("place", **words, **{name: Length(value) for name, value in lengths.items()})]
 
 
 def _certain(mounting: Mounting) -> list[Hint]:
@@ -302,7 +302,7 @@ def _certain(mounting: Mounting) -> list[Hint]:
     if not too_large and claimed * CLAIMED_LESS >= scatter:
         return []
     unit = "mm^2 or cm^2, not in m^2" if too_large else "another unit"
-    return [told("covariances", scatter=scatter, claimed=claimed, unit=unit)]
+    return [told("covariances", scatter=Length(scatter), claimed=Length(claimed), unit=unit)]
 
 
 def _labelled(trials: Trials, best: Trial) -> list[Hint]:
@@ -310,7 +310,7 @@ def _labelled(trials: Trials, best: Trial) -> list[Hint]:
     present = [label for label in (LEFT, RIGHT) if (labels == label).any()]
     if len(present) != 1 or (labels == UNKNOWN).any() or abs(best.sided - 0.5) > BOTH_SIDES:
         return []
-    return [told("one label", label=NAMES[present[0]], share=best.sided)]
+    return [told("one label", label=NAMES[present[0]], share=100.0 * best.sided)]
 
 
 def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
@@ -319,7 +319,7 @@ def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
     near = np.hypot(motion[:, 0], motion[:, 1]) < NEAR * np.nanmedian(size)
     near &= (np.abs(motion[:, 2]) < NEAR) & (pairs.count >= MANY)
     share = float(best.explained[near].mean()) if near.sum() >= LEAST_NEAR else 1.0
-    return [] if share > UNEXPLAINED else camera(pairs) or [told("unexplained", share=share)]
+    return [] if share > UNEXPLAINED else camera(pairs) or [told("unexplained", share=100.0 * share)]
 
 
 def camera(pairs: Pairs) -> list[Hint]:
@@ -327,7 +327,8 @@ def camera(pairs: Pairs) -> list[Hint]:
     spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
     least, most = spread.min(), spread.max()
     in_line = least < LINE_RATIO * most
-    return [told("camera", thin="xy"[int(spread.argmin())], least=least, most=most)] if in_line else []
+    thin, lengths = "xy"[int(spread.argmin())], {"least": Length(least), "most": Length(most)}
+    return [told("camera", thin=thin, **lengths)] if in_line else []
 
 
 NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label

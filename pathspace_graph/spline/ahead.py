@@ -16,6 +16,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.lengths import Length, Text
 
 from .bspline import dot
 from .centre_line import points_across
@@ -89,10 +90,17 @@ class TrackAhead:
         return float(self.arc_length[-1]) if len(self.arc_length) else 0.0
 
 
+def too_short(name: str, least: float, found: object) -> SettingsError:
+    """Return the error of a length that is less than `least` (m), or no number."""
+    number = Length(float(found)) if isinstance(found, Real) else repr(found)
+    expected = "{name}: expected a number of at least {least:g} m, found {found}"
+    return SettingsError(Text(expected, name=name, least=Length(least), found=number))
+
+
 def check_length(name: str, length: float) -> None:
     """Raise a SettingsError unless a length (m) is a number of at least the shortest step."""
     if not isinstance(length, Real) or not LEAST_STEP <= length < np.inf:
-        raise SettingsError(f"{name}: expected a number of at least {LEAST_STEP:g} m, found {length!r}")
+        raise too_short(name, LEAST_STEP, length)
 
 
 def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:
@@ -102,10 +110,10 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     """
     check_length("step", step)
     if not 0.0 < distance < np.inf:
-        raise SettingsError(f"distance: expected a positive number (m), found {distance:g}")
+        found = Length(distance)
+        raise SettingsError(Text("distance: expected a positive number (m), found {found:g}", found=found))
     if distance > MOST_POINTS * step:
-        least = distance / MOST_POINTS
-        raise SettingsError(f"step: expected a number of at least {least:g} m, found {step:g}")
+        raise too_short("step", distance / MOST_POINTS, step)
     samples = {label: _sampled(curve, distance) for label, curve in curves.items()}
     sides = [np.zeros((0, 2)) for _ in BOUNDARIES]
     for label, one in samples.items():

@@ -299,13 +299,20 @@ def at_level_crossing(points: Array, path: Array) -> BoolArray:
 
 def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
     """Return the points (k, 2) where two polylines cross at an angle of at least this sine."""
+    i, j, share = crossing_segments(a, b)
+    (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
+    turned = np.abs(side_of(p, q, p + s - r)) > sine * np.hypot(*(q - p).T) * np.hypot(*(s - r).T)
+    return np.asarray((p + share[:, None] * (q - p))[turned])
+
+
+def crossing_segments(a: Array, b: Array) -> tuple[IntArray, IntArray, Array]:
+    """Return the segments (k,) of two polylines that cross each other, and the share of the first's."""
     middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
     reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
     near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)
     i = np.repeat(np.arange(len(near)), [len(own) for own in near])
     j = np.array([k for own in near for k in own], np.intp)
-    (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
-    p, q, r, s = (points[segments_cross(p, q, r, s)] for points in (p, q, r, s))
-    turned = np.abs(side_of(p, q, p + s - r)) > sine * np.hypot(*(q - p).T) * np.hypot(*(s - r).T)
-    share = side_of(r, s, p) / (side_of(r, s, p) - side_of(r, s, q))
-    return np.asarray((p + share[:, None] * (q - p))[turned])
+    cross = segments_cross(a[i], a[i + 1], b[j], b[j + 1])
+    i, j = i[cross], j[cross]
+    before, after = side_of(b[j], b[j + 1], a[i]), side_of(b[j], b[j + 1], a[i + 1])
+    return i, j, before / (before - after)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
@@ -17,13 +18,15 @@ from pathspace_graph.batch.mapper import BatchMapper, BatchResult, unmapped
 from pathspace_graph.batch.optimizer import Convergence, Effort, Optimizer
 from pathspace_graph.batch.system import Evaluation
 from pathspace_graph.cli import main
-from pathspace_graph.commands.estimate import NOT_CONVERGED
+from pathspace_graph.commands.estimate import NOT_TRUSTED
 from pathspace_graph.errors import SolveError
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.reference import gap
+from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, write_log
 from pathspace_graph.io.map import SplineBoundary, read_map
+from pathspace_graph.lengths import times
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -197,7 +200,7 @@ def test_a_run_that_did_not_converge_is_written_and_reported(
     monkeypatch.setattr("pathspace_graph.batch.optimizer.Effort", lambda: Effort(rounds=1))
     with pytest.raises(SystemExit) as end:
         main(arguments)
-    assert end.value.code == NOT_CONVERGED
+    assert end.value.code == NOT_TRUSTED
     summary = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert not summary["convergence"]["converged"]
     assert summary["convergence"]["reason"] == "no round left"
@@ -213,22 +216,28 @@ def test_a_map_that_lacks_the_cones_of_a_part_of_the_drive_is_objected_to() -> N
     detections.release(np.flatnonzero(late)[::4])
     assert unmapped(detections, poses) == ""  # false detections are everywhere
     detections.release(np.flatnonzero(late))
-    share = int(unmapped(detections, poses).removeprefix("the boundaries lack the cones of ").split()[0])
-    assert 40 <= share <= 60
+    said, driven = unmapped(detections, poses), path_lengths(poses)
+    assert "% of what was detected near the drive lies on no boundary" in said
+    assert 40 <= int(said.split()[0]) <= 60
+    begin, end = map(float, re.findall(r"\((\S+) to (\S+) m of the drive\)", said)[0])
+    assert begin == pytest.approx(driven[len(poses) // 2], abs=25.0)  # where the first stretch begins
+    assert end == pytest.approx(driven[-1], rel=0.01)
+    assert f"({10.0 * begin:.3g} to {10.0 * end:.3g} m of the drive)" in times(said, 0, 10.0)
     assert unmapped(DetectionTable(), poses) == ""
 
 
 def test_a_map_that_is_objected_to_is_written_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("pathspace_graph.batch.mapper.MOST_POOR", -1.0)
+    monkeypatch.setattr("pathspace_graph.batch.mapper.MISSES", 0.0)
     write_log(bean(), tmp_path / "log")
     arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
     with pytest.raises(SystemExit) as end:
         main(arguments)
-    assert end.value.code == NOT_CONVERGED
-    assert (
-        "not a map of the drive: the boundaries lack the cones of 0 % of the drive" in capsys.readouterr().err
+    assert end.value.code == NOT_TRUSTED
+    said = capsys.readouterr().err
+    assert re.search(
+        r"not a map of the drive: \d % of what was detected near the drive .* \(0 to \d+ m", said
     )
     assert read_map(tmp_path / "map").size > 0
 

@@ -24,6 +24,7 @@ from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.crossing import Crossing
 
 from ..scenes.pretenders import contents
 
@@ -187,6 +188,28 @@ def test_a_second_run_keeps_the_earlier_result(tmp_path: Path) -> None:
     assert simulate(tmp_path / "log", "--seed", "1") == 0
     assert names(tmp_path) == {"log", "log.~1~"}
     assert contents(tmp_path / "log.~1~") == first
+
+
+@pytest.mark.parametrize("command", ["online", "batch"])
+def test_a_boundary_across_the_drive_is_told_with_its_place_and_exit_code_3(
+    command: str,
+    log_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = [Crossing(RIGHT, np.array([12.0, -3.5]), 40.0), Crossing(LEFT, np.zeros(2), 90.0)]
+    monkeypatch.setattr("pathspace_graph.plausibility.diagnosis.crossed_boundaries", lambda *_: found)
+    with pytest.raises(SystemExit) as end:
+        main([command, str(log_folder), "--out", str(tmp_path / "map")])
+    assert end.value.code == 3
+    said = capsys.readouterr().err.splitlines()
+    (line,) = [one for one in said if one.startswith("not a map of the drive")]
+    assert line.endswith(
+        "the right boundary lies across the way driven at x = 12 m, y = -3.5 m, after 40 m, and at 1 more"
+    )
+    first, _ = json.loads((tmp_path / "map" / "summary.json").read_text())["crossings"]
+    assert first == {"boundary": "right", "x": 12.0, "y": -3.5, "driven": 40.0}
 
 
 @pytest.mark.parametrize("estimator", ["landmark-fixed-lag", "spline"])

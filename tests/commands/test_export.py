@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from pathspace_graph.io.results import write_trajectory
 
 from ..scenes.maps import open_map, point_map, ring_map
 
+WITHIN = 20.0  # radius of a drive between the boundaries of the ring (m)
 ORIGIN = ["--origin", "-33.9", "-151.2", "-30"]
 
 
@@ -70,6 +72,28 @@ def test_bad_usage_ends_in_one_line_and_leaves_nothing(
     assert said in error
     assert error.count("\n") == 1
     assert not out.parent.exists()
+
+
+@pytest.mark.parametrize("kind", ["centerline", "profile", "geojson", "lanelet2"])
+def test_no_way_is_exported_where_the_drive_crosses_a_boundary(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The vehicle drives from inside of the ring across its left boundary to the right one."""
+    source, out = folder(tmp_path / "map", ring_map()), tmp_path / "out"
+    angles = np.linspace(0.0, 2.0 * np.pi, 200)
+    radius = WITHIN + np.where((angles > 2.0) & (angles < 3.0), -4.0, 0.0)
+    path = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), angles])
+    write_trajectory(source / "smoothed.tum", angles, path)
+    assert main(["export", str(source), "--as", kind, "--out", str(out), *ORIGIN]) == 2
+    error = capsys.readouterr().err
+    assert f"{source / 'map.json'}: expected the map of the drive in smoothed.tum: the left" in error
+    x, y = (float(word) for word in re.findall(r"[xy] = (\S+) m", error))
+    assert np.arctan2(y, x) == pytest.approx(2.0, abs=0.1)
+    assert not out.exists()
+    assert main(["export", str(source), "--as", "points", "--out", str(out)]) == 0
+    path[:, :2] *= WITHIN / radius[:, None]
+    write_trajectory(source / "smoothed.tum", angles, path)
+    assert main(["export", str(source), "--as", kind, "--out", str(tmp_path / "good"), *ORIGIN]) == 0
 
 
 def test_a_map_without_a_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,8 +1,7 @@
-"""Options: a short help and a full one, settings from a file, and names that are gone."""
+"""Options: a short help and a full one, settings from a file, and unknown names."""
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import sys
@@ -16,8 +15,7 @@ from pathspace_graph.cli import main, parse_command
 from pathspace_graph.commands.options import ESSENTIAL
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import write_json
-from pathspace_graph.io.overrides import leaves
-from pathspace_graph.settings.checked import GONE, check_gone
+from pathspace_graph.io.overrides import leaves, override
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
 SCREEN = 50
@@ -109,10 +107,6 @@ def test_options_on_the_command_line_stand_over_the_file(tmp_path: Path) -> None
 BAD_FILES = {
     "unknown name": ("gate.chii = 3\n", "'gate.chii', the nearest is 'gate.chi'"),
     "name of a group": ("gate = 3\n", "'gate'"),
-    "gone": (
-        "motion.memory = 0.65\n",
-        "motion.memory: expected a setting, found one that is gone: a constant",
-    ),
     "wrong type": ('lag = "long"\n', "lag: expected a number, found 'long'"),
     "wrong word": ('spline.knots = "none"\n', "spline.knots: expected"),
     "out of range": ("gate.chi = -1\n", "gate.chi: expected a positive number, found -1"),
@@ -150,12 +144,9 @@ def test_a_bad_summary_is_one_line_too(
         (["--settings", "--lag", "3"], "--settings: expected one file, found none"),
         (["--settings", "a.toml", "--settings", "b.toml"], "--settings: expected one file, found two"),
         (["--settings", "none.toml"], "none.toml: expected a file of settings, found none"),
-        (["--motion.memory", "3"], "--motion.memory: expected a setting, found one that is gone: a constant"),
-        (["--sides.half-width=3"], "--sides.half-width: expected a setting, found one that is gone"),
-        (["--film.widest-band", "3"], "--film.widest-band: expected a setting, found one that is gone"),
     ],
 )
-def test_options_that_are_wrong_or_gone_are_one_line(
+def test_options_that_are_wrong_are_one_line(
     options: list[str], says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["online", *ONLINE, *options]) == 2
@@ -164,25 +155,11 @@ def test_options_that_are_wrong_or_gone_are_one_line(
     assert error.count("\n") == 1
 
 
-# --- names that are gone ---------------------------------------------------------------------------------
-
-
-def gone() -> list[tuple[str, str]]:
-    lines = GONE.replace("\n ", " ").strip().splitlines()
-    groups = [line.partition(": ") for line in lines]
-    entries = [(group, entry.split(" ", 1)) for group, _, rest in groups for entry in rest.split(", ")]
-    return [(f"{group}.{name}".lstrip("."), place) for group, (name, place) in entries]
-
-
-def test_what_is_gone_is_no_setting_and_is_told_with_its_value() -> None:
-    known, names = set(leaves(MapperSettings())), [name for name, _ in gone()]
-    assert len(set(names)) == len(names)
-    assert known.isdisjoint(names)
-    for name, value in gone():
-        with pytest.raises(SettingsError, match=re.escape(f"{name}: expected a setting")) as error:
-            check_gone(name, name)
-        assert value and f"({value})" in str(error.value)
-    check_gone("lag", "lag")
+def test_a_setting_is_only_named_where_it_is_near() -> None:
+    with pytest.raises(SettingsError, match=r"found 'gate.chii', the nearest is 'gate.chi'$"):
+        override(MapperSettings(), {"gate.chii": 3.0}, "")
+    with pytest.raises(SettingsError, match=r"found 'film.brightness'$"):
+        override(MapperSettings(), {"film.brightness": 3.0}, "")
 
 
 def test_the_estimators_have_few_settings() -> None:

@@ -218,7 +218,7 @@ def test_orange_cones_are_points_once_they_were_seen_often_enough() -> None:
     found = cones.points()
     np.testing.assert_allclose(found[BIG_ORANGE].points, CONES[:2], atol=1e-12)
     np.testing.assert_allclose(found[ORANGE].points, CONES[2:], atol=1e-12)
-    np.testing.assert_allclose(found[ORANGE].covariance, (0.04 / 3 + 0.01) * np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(found[ORANGE].covariance, (1.15 * 0.04 / 3 + 0.01) * np.eye(2), atol=1e-12)
 
 
 def test_orange_cones_are_placed_again_where_poses_were_corrected() -> None:
@@ -257,3 +257,48 @@ def test_only_the_newest_sightings_of_orange_cones_are_remembered() -> None:
         cones.add(seen_from(np.zeros(3), cycle), np.zeros(0))
     assert len(cones._sightings) == OrangeCones.MOST
     assert cones._sightings[-1].cycle == OrangeCones.MOST + 19
+
+
+def gate(spacing: float) -> Array:
+    """Places of a start gate: a pair of cones on each side, 4 m apart."""
+    return np.array([[x, y] for x in (0.0, spacing) for y in (2.0, -2.0)])
+
+
+def driven_by(cones: OrangeCones, truth: Array, drifts: list[float], sigmas: tuple[float, float]) -> None:
+    """Detect cones in passes whose poses have drifted along the road, with errors along and across it."""
+    rng, cycle, count = np.random.default_rng(3), 0, len(truth)
+    for number, drift in enumerate(drifts):
+        slow = rng.normal(0.0, 0.3, truth.shape) * sigmas
+        for k in range(20):
+            points = truth + slow + rng.normal(0.0, 1.0, truth.shape) * sigmas
+            points[:, 0] += 10.0 + drift
+            covariances = np.tile(np.diag(np.square(sigmas)), (count, 1, 1))
+            seen = Detections(20.0 * number + 0.2 * k, points, covariances, np.full(count, BIG_ORANGE))
+            cones.add(Sighting(cycle, np.array([-10.0, 0.0, 0.0]), np.zeros(3), seen), np.zeros(0))
+            cycle += 1
+
+
+@pytest.mark.parametrize("spacing", [0.8, 1.0, 1.5])
+@pytest.mark.parametrize("sigmas", [(0.05, 0.05), (0.15, 0.15), (0.2, 0.2), (0.35, 0.1)])
+def test_a_gate_of_pairs_has_four_cones_however_often_it_is_passed(
+    spacing: float, sigmas: tuple[float, float]
+) -> None:
+    """The vehicle's place drifts by up to 0.9 m from pass to pass, more than the cones are apart."""
+    cones = OrangeCones(GrowthSettings(), 0.1)
+    driven_by(cones, gate(spacing), [0.0, 0.5, -0.4, 0.2], sigmas)
+    found = cones.points()[BIG_ORANGE].points
+    assert len(found) == 4
+    off = (found - found.mean(axis=0))[:, None] - (gate(spacing) - gate(spacing).mean(axis=0))
+    apart = np.hypot(off[..., 0], off[..., 1])
+    assert sorted(apart.argmin(axis=1).tolist()) == [0, 1, 2, 3]  # each of the four is there, by their shape
+    assert (apart.min(axis=1) < 0.1 + sigmas[0]).all()
+
+
+def test_a_false_cone_of_a_few_vague_detections_is_no_point() -> None:
+    cones = OrangeCones(GrowthSettings(), 0.1)
+    for cycle in range(4):
+        seen = Detections(
+            0.2 * cycle, np.array([[30.0, 1.0]]), 0.9**2 * np.eye(2)[None], np.array([BIG_ORANGE])
+        )
+        cones.add(Sighting(cycle, np.zeros(3), np.zeros(3), seen), np.zeros(0))
+    assert cones.points() == {}  # 0.45 m and more, where 0.4 m are asked for

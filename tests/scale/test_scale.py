@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import inspect
+import pickle
 import re
+from copy import deepcopy
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from importlib import import_module
@@ -20,7 +22,7 @@ from hypothesis import strategies as st
 from pathspace_graph.baselines.filters import CkfMapper
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.errors import ReadingError
+from pathspace_graph.errors import ReadingError, SettingsError
 from pathspace_graph.estimators import ONLINE, make_batch, make_online
 from pathspace_graph.eval.metrics.measures import measure
 from pathspace_graph.eval.metrics.summary import laps_of, summarize
@@ -30,12 +32,15 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.lengths import scaled
+from pathspace_graph.lengths import Length, Text, joined, scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.plausibility.diagnosis import diagnose, measured_line
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.scale import JUDGED, SceneScale, scale_of, width_and_gap
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.sim.mistakes import in_frame
 
 from ..scenes.drives import ODOMETRY_SIGMA, short_drive
 from ..scenes.paths import modules
@@ -156,11 +161,32 @@ def test_each_number_changes_by_its_own_power() -> None:
 
 
 def test_a_text_has_metres_of_the_scene() -> None:
-    said = CycleResult(0.0, np.zeros(3), (0, 0), 0, False, notice="12 control points on 34 m, at 3 m/s")
-    assert scaled(said, 10.0).notice == "12 control points on 340 m, at 30 m/s"
-    far = scaled(replace(said, notice="expected a distance from 0.01 to 300 m, found 7"), 0.1)
-    assert far.notice == "expected a distance from 0.001 to 30 m, found 7"
-    assert scaled(Health("lost", "the position is uncertain by 0.5 m"), 0.1).reason.endswith("by 0.05 m")
+    area = Text("{area:g} m^2 of {name}", area=Length(2.0, power=2), name="a 3 m mast")
+    assert scaled(Health("lost", area), 10.0).reason == "200 m^2 of a 3 m mast"
+    both = joined(["", area, Text("{far:.2f} m away", far=Length(3.0)), ""])
+    assert both == "2 m^2 of a 3 m mast; 3.00 m away"
+    said = CycleResult(0.0, np.zeros(3), (0, 0), 0, False, notice=both)
+    assert scaled(said, 0.1).notice == "0.02 m^2 of a 3 m mast; 0.30 m away"
+    for copy in (deepcopy(both), pickle.loads(pickle.dumps(both))):
+        assert scaled(replace(said, notice=copy), 10.0).notice == "200 m^2 of a 3 m mast; 30.00 m away"
+
+
+@pytest.mark.parametrize("scale", [0.1, 10.0])
+def test_every_message_of_a_mapper_is_in_metres_of_its_log(scale: float) -> None:
+    """Notices about dropped detections and about a curve that is full, and refused lengths and noise."""
+    log = scaled(short_drive(), scale)
+    cycles = [replace(cycle, points_vehicle=cycle.points_vehicle.copy()) for cycle in log.cycles[:60]]
+    cycles[5].points_vehicle[0] = [400.0 * scale, 0.0]
+    small = replace(MapperSettings(scale=scale), growth=GrowthSettings(max_size=8))
+    mapper = FixedLagMapper(small, log.odometry_sigma)
+    result = run_online(replace(log, cycles=tuple(cycles)), mapper)
+    notices = "; ".join(record.notice for record in result.cycles if record.notice)
+    assert f"from {0.01 * scale:g} to {300.0 * scale:g} m, found [{400.0 * scale:g}, 0] in row 0" in notices
+    assert f"left boundary grows no further, with 8 control points on {15.5 * scale:.3g} m" in notices
+    with pytest.raises(SettingsError, match=f"least {0.01 * scale:g} m, found {1e-3 * scale:g}$"):
+        mapper.ahead(10.0 * scale, 1e-3 * scale)
+    with pytest.raises(SettingsError, match=r"found \[1.0, -1.0, 1.0\]"):
+        FixedLagMapper(small, np.array([1.0, -1.0, 1.0]))
 
 
 @settings(max_examples=20, deadline=None)
@@ -318,6 +344,9 @@ def test_a_refusal_has_the_lengths_of_the_scene() -> None:
     fast = Odometry(np.array([0.0]), np.array([[12.0, 0.0, 0.0]]))
     with pytest.raises(ReadingError, match=r"vx from -10 to 10 m/s, found 12"):
         mapper.update(fast, replace(road(0.3, 0.3), t=0.1))
+    turning = Odometry(np.array([0.0]), np.array([[1.0, 0.0, 60.0]]))
+    with pytest.raises(ReadingError, match=r"wz from -10 to 10 rad/s, found 60"):
+        mapper.update(turning, replace(road(0.3, 0.3), t=0.1))
 
 
 # --- metrics ---------------------------------------------------------------------------------------------
@@ -338,3 +367,42 @@ def test_metrics_are_those_of_scale_one_times_the_scale() -> None:
 
 def test_a_small_scene_is_no_mistake_of_a_log() -> None:
     assert hints(scaled(short_drive(), 0.1)) == []
+
+
+@pytest.mark.parametrize(("scale", "ahead"), [(0.1, "add 0.2"), (10.0, "add 2")])
+def test_advice_on_the_mounting_is_in_metres_of_the_log(scale: float, ahead: str) -> None:
+    (found,) = hints(in_frame(scaled(short_drive(), scale), ahead=2.5 * scale, left=-1.0 * scale))
+    assert found.advice.startswith(ahead)
+    words = found.advice.split()
+    assert [float(words[1]), float(words[5])] == pytest.approx([2.5 * scale, -scale], abs=0.4 * scale)
+    along, aside = re.search(r"sensor (\S+) m ahead and (\S+) m to the right", found.found).groups()
+    assert [float(along), float(aside)] == pytest.approx([2.5 * scale, scale], abs=0.4 * scale)
+
+
+def test_a_hint_on_the_stated_noise_has_the_numbers_of_the_log() -> None:
+    log = scaled(short_drive(), 0.1)
+    stated = 0.4 * log.odometry_sigma
+    (found,) = hints(replace(log, odometry_sigma=stated))
+    said = re.findall(r"(v\w|wz) scatters by (\S+) (\S+), where (\S+) is stated", found.found)
+    assert [(name, unit) for name, _, unit, _ in said] == [("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s")]
+    assert [float(number) for *_, number in said] == pytest.approx(stated, rel=0.06)
+    assert [float(number) for _, number, *_ in said] == pytest.approx(log.odometry_sigma, rel=0.5)
+
+
+def test_a_diagnosis_of_a_small_scene_is_by_the_prior_at_scale_one() -> None:
+    """A sensor that is 0.05 m off in a scene of 1:10 is 0.5 m off by the prior of 0.1 m: five sigmas."""
+    settings = {"calibration": {"sigma_lateral": 0.1}}
+    sensor = {"sensor": np.array([0.0, 0.05, 0.0, 0.0, 0.0]), "sensor_covariance": np.eye(5)}
+    (line,) = diagnose(VehicleState(np.zeros(3), np.zeros(2), np.eye(5), **sensor), settings, 0.1)
+    assert line == "the sensor sits 0.05 m too far to the left (5.0 sigmas of its prior)"
+    noise = MeasuredNoise(
+        np.full(3, 0.02),
+        np.ones(3),
+        0.1,
+        *2 * [RayNoise(np.array([0.01, 0.01]))],
+        sensor=np.array([0.0, 0.02, 0.0, 0.0, 0.0]),
+        sensor_sigma=np.full(5, 1e-3),
+    )
+    assert measured_line(noise, 0.1).endswith(
+        "detections 0.02 m along and 0.02 m across the ray at 1 m; 0.02 m too far to the left"
+    )

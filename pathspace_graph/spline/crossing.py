@@ -1,0 +1,191 @@
+"""Where a vehicle drove across the boundaries of its map, which no true boundary allows.
+
+All limits are shares of the usual distance of the boundaries from the drive, so they fit scenes of any size.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.labels import LEFT, NAMES
+from pathspace_graph.lengths import Length, Text
+
+from .boundary import crossing_segments
+from .bspline import BSpline, cross, dot
+
+SAMPLES: Final = 8  # number of points for each control point by which the usual distance is found
+STEP: Final = 0.15  # distance of the samples of curves and drive
+MISSING: Final = 5.0  # step of a drive beyond which it is not known between two poses
+DEPTH: Final = 0.35  # how far behind a boundary the vehicle is across it: drivers cut corners
+BESIDE: Final = 2.5  # farthest that the boundary of a road lies from the drive along it
+ANOTHER: Final = 15.0  # least length driven between two passes of one place
+ALONG: Final = 0.9  # least cosine of the angle of a boundary and the drive along it
+PARTED: Final = 0.87  # largest cosine of the angle of two ways that cross
+MEETING: Final = 7.0  # how near to such a place boundaries may be crossed
+MET: Final = 0.5  # largest distance of two ways that cross
+MOST: Final = 500  # most samples of the drive that are looked at there
+ON_ROAD: Final = 0.5  # share of a stretch with another boundary beside it from which it is on the road
+
+
+class Crossing(NamedTuple):
+    """A place where the vehicle drove across a boundary of its map."""
+
+    label: int
+    place: Array  # (2,) in m, map frame
+    driven: float  # length of the drive up to there (m)
+
+
+def crossings_told(found: list[Crossing]) -> str:
+    """Return where the vehicle drove across boundaries in words; empty where it did not."""
+    if not found:
+        return ""
+    first, more = found[0], f", and at {len(found) - 1} more" if len(found) > 1 else ""
+    x, y, driven = map(Length, (*first.place.tolist(), first.driven))
+    return Text(
+        "the {name} boundary lies across the way driven at x = {x:.3g} m, y = {y:.3g} m, after {driven:.3g} m"
+        "{more}",
+        **{"name": NAMES[first.label], "x": x, "y": y, "driven": driven, "more": more},
+    )
+
+
+def crossed_boundaries(curves: Mapping[int, BSpline], path: Array) -> list[Crossing]:
+    """Return where a vehicle on a path (n, 2) drove across the boundaries of its map, in the order driven.
+
+    It does not where it cuts a corner, where it comes onto the road or leaves it for good, and where it
+    meets another part of its own way: roads that cross have boundaries there, and the laps of an open map
+    may lie beside each other.
+    """
+    moves = (np.diff(path, axis=0) != 0.0).any(axis=1)
+    path = path[np.append(moves[:1], moves)]
+    if len(path) < 2 or not curves:
+        return []
+    coarse = [curve.evaluate(np.linspace(*curve.domain, SAMPLES * curve.size)) for curve in curves.values()]
+    aside = float(np.median([KDTree(points).query(path)[0] for points in coarse]))
+    drive = _drive(path, aside)
+    lines = {label: _line(curve, STEP * aside) for label, curve in curves.items()}
+    found = [one for label in lines for one in _crossings(label, lines, drive, aside)]
+    return sorted(found, key=lambda one: one.driven)
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """Samples of a curve or of a drive, in driving order."""
+
+    points: Array  # (n, 2) in m, map frame
+    heading: Array  # (n, 2) unit vectors
+    length: Array  # (n,) length up to each sample (m)
+    pieces: list[slice]  # samples between which nothing is missing
+    closed: bool = False
+
+
+def _line(curve: BSpline, step: float) -> _Way:
+    u = np.linspace(*curve.domain, max(int(curve.length() / step), 2) + 1)
+    points = curve.evaluate(u)
+    return _Way(points, curve.tangent_unit(u), path_lengths(points), [slice(0, len(u))], curve.periodic)
+
+
+def _drive(path: Array, aside: float) -> _Way:
+    length = path_lengths(path)
+    missing = np.flatnonzero(np.diff(length) > MISSING * aside) + 1
+    known = [rows for rows in np.split(length, missing) if len(rows) > 1]
+    at = [np.linspace(rows[0], rows[-1], int(np.ptp(rows) / (STEP * aside)) + 2) for rows in known]
+    ends = np.cumsum([0, *map(len, at)]).tolist()
+    where = np.concatenate([np.zeros(0), *at])
+    points = np.column_stack([np.interp(where, length, column) for column in path.T])
+    pieces = [slice(*of) for of in pairwise(ends)]
+    step = np.concatenate([np.zeros((0, 2)), *(np.gradient(points[piece], axis=0) for piece in pieces)])
+    return _Way(points, step / np.maximum(np.hypot(*step.T), np.finfo(float).tiny)[:, None], where, pieces)
+
+
+def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float) -> list[Crossing]:
+    """Return the crossings of one boundary."""
+    line, found = lines[label], []
+    distance, foot = map(np.asarray, KDTree(line.points).query(drive.points))
+    inside = (foot > 0) & (foot < len(line.points) - 1)
+    deep = (line.closed | inside) & (distance > DEPTH * aside)  # nothing is beside a curve that has ended
+    reaches = np.asarray(KDTree(drive.points).query(line.points)[0]) > DEPTH * aside
+    for piece in drive.pieces:
+        rows, at, share = crossing_segments(drive.points[piece], line.points)
+        order = np.argsort(rows + share)
+        rows, at, share = rows[order] + piece.start, at[order], share[order]
+        between = rows.searchsorted(np.arange(piece.start, piece.stop))[deep[piece]]
+        loops = [k for k, ends in enumerate(pairwise(at), 1) if reaches[_between(*ends, line)].any()]
+        changes = _changes({*between.tolist(), *loops})
+        ends = [piece.start, *rows[changes].tolist(), piece.stop]
+        for k, change in enumerate(changes):
+            row, on_line = int(rows[change]), int(at[change])
+            step = drive.points[row + 1] - drive.points[row]
+            one = Crossing(label, drive.points[row] + share[change] * step, float(drive.length[row]))
+            leaves = (_turn(line.heading[on_line], step) > 0.0) == (label == LEFT)
+            beyond = slice(row + 1, ends[k + 2]) if leaves else slice(ends[k], row + 1)
+            is_last = k == (len(changes) - 1 if leaves else 0)
+            allowed = is_last and _is_off_road(label, lines, drive, beyond, aside)
+            allowed |= _meets_itself(one.place, drive, aside)
+            allowed |= not line.closed and _is_of_another_lap(one, line.heading[on_line], drive, aside)
+            if not allowed:
+                found.append(one)
+    return found
+
+
+def _between(first: int, second: int, line: _Way) -> IntArray:
+    """Return the samples of a curve between two of them, by the shorter way around a closed one."""
+    low, high = sorted((first, second))
+    rows = np.arange(low + 1, high + 1)
+    around = np.append(np.arange(high + 1, len(line.points)), np.arange(low + 1))
+    return around if line.closed and len(around) < len(rows) else rows
+
+
+def _changes(deep: set[int]) -> list[int]:
+    """Return the crossings after which the vehicle is on the other side of a curve.
+
+    `deep` are the parts of the drive between crossings, each by the number of crossings before it, in which
+    drive and curve part. From one of them to the next, an odd number of crossings changes the side.
+    """
+    return [a for a, b in pairwise(sorted(deep)) if (b - a) % 2]
+
+
+def _is_off_road(label: int, lines: Mapping[int, _Way], drive: _Way, beyond: slice, aside: float) -> bool:
+    """Return whether the drive beyond a boundary is along no other one, as where it comes onto the road."""
+    others = [_beside(other, line, drive, beyond, aside) for other, line in lines.items() if other != label]
+    return bool(others) and max(float(one.mean()) for one in others) < ON_ROAD
+
+
+def _beside(label: int, line: _Way, drive: _Way, rows: slice, aside: float) -> BoolArray:
+    """Return whether a boundary lies beside each sample (m,) of a stretch of the drive, on its own side."""
+    distance, foot = map(np.asarray, KDTree(line.points).query(drive.points[rows]))
+    heading, off = drive.heading[rows], line.points[foot] - drive.points[rows]
+    on_side = (cross(heading, off) > 0.0) == (label == LEFT)
+    along = np.abs(dot(heading, line.heading[foot])) > ALONG
+    return np.asarray(on_side & along & (distance < BESIDE * aside))
+
+
+def _meets_itself(place: Array, drive: _Way, aside: float) -> bool:
+    """Return whether the way crosses another part of itself near a place (2,)."""
+    near = np.flatnonzero(np.hypot(*(drive.points - place).T) < MEETING * aside)
+    near = near[:: 1 + len(near) // MOST]
+    points, heading, length = drive.points[near], drive.heading[near], drive.length[near]
+    parted = np.abs(heading @ heading.T) < PARTED
+    parted &= np.abs(length[:, None] - length) > ANOTHER * aside
+    offset = points[:, None] - points
+    return bool((parted & (np.hypot(offset[..., 0], offset[..., 1]) < MET * aside)).any())
+
+
+def _is_of_another_lap(one: Crossing, heading: Array, drive: _Way, aside: float) -> bool:
+    """Return whether a boundary with a heading (2,) lies beside another part of the way, on its own side."""
+    off = one.place - drive.points
+    across = cross(drive.heading, off) * (1.0 if one.label == LEFT else -1.0)
+    beside = (across > DEPTH * aside) & (across < BESIDE * aside)
+    beside &= np.abs(dot(drive.heading, off)) < STEP * aside
+    beside &= np.abs(drive.heading @ heading) > ALONG
+    return bool((beside & (np.abs(drive.length - one.driven) > ANOTHER * aside)).any())
+
+
+def _turn(a: Array, b: Array) -> float:
+    """Return the cross product of two vectors (2,), which is positive where b points to the left of a."""
+    return float(a[0] * b[1] - a[1] * b[0])
