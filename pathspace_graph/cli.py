@@ -7,6 +7,7 @@ import threading
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
+from multiprocessing import active_children
 from traceback import print_exc
 from typing import Any, Final
 
@@ -52,6 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _refuse(f"{error.filename or 'output'}: {error.strerror or error}", level)
     except KeyboardInterrupt:
+        for worker in active_children():  # they are spared by the signal
+            if worker.pid is not None:
+                os.kill(worker.pid, signal.SIGTERM)
         print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return INTERRUPTED
     return DONE

@@ -65,7 +65,9 @@ def progress(description: str, total: int | None = None, lines: int = 0) -> "Ite
     """
     level, console = VERBOSITY.get(), Console(stderr=True, highlight=False)
     lines = {Verbosity.QUIET: 0, Verbosity.VERBOSE: LINES}.get(level, lines)
-    text, remaining = TextColumn("{task.description}"), TextColumn("{task.fields[remaining]}")
+    text, remaining = (
+        TextColumn(f"{{task.{name}}}", markup=False) for name in ("description", "fields[remaining]")
+    )
     columns = (SpinnerColumn(), text, BarColumn(), MofNCompleteColumn(), remaining)
     shown = columns if total is not None or lines else columns[:2]
     hidden = level == Verbosity.QUIET or not console.is_terminal
@@ -94,7 +96,7 @@ class Steps:
             interval = -(-self._total // self._lines)
             if self._done % interval == 0 or self._done == self._total:
                 text = f"{self._description}: {self._done} of {self._total}, {remaining}"
-                self._display.console.print(text)
+                self._display.console.print(text, markup=False)
 
 
 def time_remaining(elapsed: float, done: int, total: int) -> str:

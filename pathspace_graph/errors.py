@@ -33,7 +33,7 @@ class ReadingError(PathspaceError):
         self.t = t  # stamp of the cycle (s), where it has one
         when = "" if t is None else f"cycle at {t:.12g} s: "
         where = field if row is None else f"{field}, row {row}"
-        value = f"{found:g}" if isinstance(found, float) else str(found)
+        value = f"{found:.12g}" if isinstance(found, float) else str(found)
         super().__init__(f"{when}{where}: expected {expected}, found {value}")
 
     def at(self, t: float) -> Self:
@@ -73,11 +73,11 @@ def solving(what: str) -> Iterator[None]:
 
 
 def check_name(name: Any, known: Iterable[str], expected: str) -> None:
-    """Raise a SettingsError that names the nearest known name, unless `name` is known."""
+    """Raise a SettingsError that names the nearest known name if one is near, unless `name` is known."""
     known = list(known)
     if name in known:
         return
-    near = get_close_matches(str(name), known, n=1, cutoff=0.0)
+    near = get_close_matches(str(name), known, n=1)
     hint = f", the nearest is '{near[0]}'" if near else ""
     raise SettingsError(f"{expected}, found '{name}'{hint}")
 

@@ -66,9 +66,10 @@ BATCH: Final[dict[str, MakeBatch]] = {
 }
 
 
-def check_online(name: str) -> None:
+def check_online(name: str, option: str = "--estimator") -> None:
     """Raise a SettingsError that names the known estimators, unless the name is one of them."""
-    check_name(name, ONLINE, f"--estimator: expected a known online estimator ({', '.join(sorted(ONLINE))})")
+    known = ", ".join(sorted(ONLINE))
+    check_name(name, ONLINE, f"{option}: expected a known online estimator ({known})")
 
 
 def check_batch(name: str) -> None:

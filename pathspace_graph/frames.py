@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 
 import pandas as pd
 
-from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.parsing import MAX_STAMP, Table, read_table
 from pathspace_graph.io.results import CYCLE_COLUMNS, CYCLES_FILE, RunResult
 
@@ -29,8 +28,7 @@ DIMENSIONS: Final = KEYS[1:]  # dimensions of a study's metrics
 def read_cycles(folder: Path | str) -> pd.DataFrame:
     """Return the cycles (s) of a run's folder, with the cycle as index; an InputError on a wrong file."""
     file = Path(folder) / CYCLES_FILE
-    with verified(file.parent, file.name):
-        table = read_table(file, [name for name in CYCLE_COLUMNS if name not in OPTIONAL])
+    table = read_table(file, [name for name in CYCLE_COLUMNS if name not in OPTIONAL])
     columns = {name: _column(table, name, CYCLE_COLUMNS.get(name, "str")) for name in table.columns}
     return pd.DataFrame(columns).set_index("cycle")
 

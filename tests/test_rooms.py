@@ -178,7 +178,6 @@ ASSIGNED = {
     "batch.mapper": {"system.settings", "system.chain", "system.revisits", "optimizer.system.revisits"},
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
-    "commands.estimate": {"column.justify"},  # of rich
     "eval.view.animation": {"writer.fig"},  # of matplotlib
     "front_end.motion": {"self._rest.sigma"},
     "front_end.sides": {"near.judged"},

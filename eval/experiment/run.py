@@ -15,7 +15,6 @@ from joblib import Parallel, delayed, parallel_config
 
 from pathspace_graph.errors import InputError, OutputError, SettingsError
 from pathspace_graph.io.files import check_target, remove_manifest, to_plain, write_json
-from pathspace_graph.io.manifest import verified
 from pathspace_graph.io.overrides import flatten
 from pathspace_graph.io.parsing import read_json
 from pathspace_graph.loop.drive_record import end_with
@@ -155,8 +154,7 @@ def check_folder(out: Path, plan: Plan) -> None:
     if not file.is_file():
         return
     try:
-        with verified(out, STUDY_FILE):
-            found = read_json(file, "a study")
+        found = read_json(file, "a study")
     except InputError as error:
         raise OutputError(str(error)) from error
     if not isinstance(found, dict):

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from pathspace_graph.console import note, progress, say
 from pathspace_graph.convert.bag import BagOptions, read_bag
-from pathspace_graph.convert.recording import Recording, to_log, windowed
+from pathspace_graph.convert.recording import Recording, rate, to_log, windowed
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Window
 from pathspace_graph.convert.text_files import read_csv, read_json_lines
 from pathspace_graph.convert.victoria_park import read_victoria_park
@@ -98,8 +98,8 @@ class Convert:
         check_target(out, LOG_FILE)
         rule = LabelRule(self.labels, self.label_field)
         with progress("converting"):
-            record = windowed(self._read(source, rule), self.window)
             file = source or Path(self.kind)
+            record = windowed(self._read(source, rule), self.window, file)
             log = with_measured_noise(to_log(record, self.frames, self.noise, file))
             write_checked(log, out, file)
         report(record.notes, rule, log, out)
@@ -161,12 +161,12 @@ def report(notes: Counter[str], rule: LabelRule, log: Log, out: Path) -> None:
 
 def outline(log: Log) -> str:
     """Return in a line what a look at the log should show first: rates, speeds, ranges and labels."""
-    twists, seconds = log.odometry.twist, max(float(np.ptp(log.odometry.t)), np.finfo(float).tiny)
+    twists, seconds = log.odometry.twist, float(np.ptp(log.odometry.t))
     ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
     labels = np.bincount(np.concatenate([cycle.labels for cycle in log.cycles]), minlength=len(NAMES))
     told = ", ".join(f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count)
     return (
-        f"odometry at {len(twists) / seconds:.3g} Hz, up to {np.hypot(*twists[:, :2].T).max():.3g} m/s and "
-        f"{np.abs(twists[:, 2]).max():.3g} rad/s; detections at {len(log.cycles) / seconds:.3g} Hz, "
+        f"odometry at {rate(len(twists), seconds)}, up to {np.hypot(*twists[:, :2].T).max():.3g} m/s and "
+        f"{np.abs(twists[:, 2]).max():.3g} rad/s; detections at {rate(len(log.cycles), seconds)}, "
         f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {told}"
     )

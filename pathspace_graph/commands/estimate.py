@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 from rich.table import Table
+from rich.text import Text
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from pathspace_graph import estimators
@@ -226,9 +227,9 @@ def health_outline(result: RunResult) -> list[str]:
 
 def laps_table(laps: list[LapMetrics]) -> Table:
     """Return the paper's Table 1 with a row for each lap."""
-    table = Table("lap", "rmse [m]", "missed [%]", "size")
-    for column in table.columns:
-        column.justify = "right"
+    table = Table()
+    for name in ("lap", "rmse [m]", "missed [%]", "size"):
+        table.add_column(Text(name), justify="right")  # a plain text would be markup, in which [m] is a style
     for row in laps:
         table.add_row(str(row.lap), f"{row.rmse:.3f}", f"{100 * row.missed:.1f}", str(row.size))
     return table

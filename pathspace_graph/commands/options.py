@@ -46,6 +46,8 @@ REQUIRED: Final = " (required)"
 _ANSI: Final = re.compile(r"\x1b\[[0-9;]*m")
 _FRAME: Final = " │\t"
 _RULE: Final = "─╭╮╰╯"
+_VALUE: Final = re.compile(r"(?:Error parsing|for argument|Missing value) '?(?:for argument ')?(--[\w.-]+)")
+_KINDS: Final = {int: "a whole number", float: "a number", Path: "a path", str: "a text", bool: "a flag"}
 _SIMILAR: Final = re.compile(r"(?:Perhaps you meant|Arguments similar to).*\n\W*(--\S+)")
 
 
@@ -76,8 +78,23 @@ def parse(command: type[Any], program: str, arguments: list[str]) -> Any:
         missing = [one for one in required if (one.text if one.is_place else f"{one.flag} ") in wrong]
         names = " and ".join(one.shown.removesuffix(REQUIRED) for one in missing)
         wrong = f"{program.rsplit(maxsplit=1)[-1]}: expected {names}, found none"
+    wrong = _in_words(wrong, command, arguments)
     nearest = f", the nearest is {', '.join(near)}" if near else ""
     raise SettingsError(f"{wrong}{nearest} (see {program} --help)")
+
+
+def _in_words(wrong: str, command: type[Any], arguments: list[str]) -> str:
+    """Return what is wrong with the value of an option in our words, and any other complaint as it is."""
+    named = _VALUE.search(wrong)
+    option = next((one for one in _options(command) if named and one.flag == named[1]), None)
+    if option is None:
+        return wrong
+    words = [part for word in arguments for part in word.split("=", word.startswith("--"))]
+    flags = [word.replace("_", "-") if word.startswith("--") else "" for word in words]
+    at = len(flags) - flags[::-1].index(option.flag)
+    end = next((k for k, flag in enumerate(flags[at:], at) if flag), len(words))
+    found = " ".join(words[at:end])
+    return f"{option.flag}: expected {option.expected}, found {shown(found) if found else 'none'}"
 
 
 def _estimates(command: type[Any]) -> bool:
@@ -145,6 +162,24 @@ class Option(NamedTuple):
         return f"--{self.name.replace('_', '-')}"
 
     @property
+    def expected(self) -> str:
+        """Return in words what the option takes."""
+        if words := self.words:
+            return f"one of {', '.join(sorted(words))}"
+        inner = [kind for one in (self.hint, *get_args(self.hint)) for kind in (one, *get_args(one))]
+        many = next((get_args(one) for one in inner if get_origin(one) is tuple), (self.hint,))
+        name = next((name for kind, name in _KINDS.items() if kind in inner), "a value")
+        if len(many) == 1 or Ellipsis in many:
+            return name
+        return f"{len(many)} {name.split(maxsplit=1)[1]}s"
+
+    @property
+    def words(self) -> list[str]:
+        """Return the words between which the option chooses, if it does."""
+        inner = [self.hint, *get_args(self.hint)]
+        return list(dict.fromkeys(word for one in inner for word in get_args(one) if isinstance(word, str)))
+
+    @property
     def shown(self) -> str:
         """Return the option with its default, the first of several words, or with what it takes."""
         if self.is_place:
@@ -152,9 +187,8 @@ class Option(NamedTuple):
         value, inner = self.default, [self.hint, *get_args(self.hint)]
         if self.hint is bool:
             return f"--{'.no-'.join(self.flag[2:].rsplit('.', 1))}" if value else self.flag
-        words = [word for one in inner for word in get_args(one) if isinstance(word, str)]
-        if words:
-            return f"{self.flag} {'|'.join(sorted(dict.fromkeys(words), key=lambda word: word != value))}"
+        if words := self.words:
+            return f"{self.flag} {'|'.join(sorted(words, key=lambda word: word != value))}"
         if value not in (None, NO_DEFAULT, ()):
             return f"{self.flag} {value}"
         takes = "PATH" if Path in inner else "TEXT" if str in inner else "NUMBER"

@@ -131,7 +131,7 @@ class Scale:
     def run(self) -> None:
         names = tuple(dict.fromkeys(self.estimators or ONLINE))
         for name in names:
-            check_online(name)
+            check_online(name, "--estimators")
         if self.quick and self.scaling != ScalingSettings():
             raise SettingsError("--quick: expected no other --scaling options with it, found some")
         check_target(self.out, timing.MARKER)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.parsing import read_text
 
 from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_of, twist_of, yaw_rate_of
-from .recording import Recording, twists_between
+from .recording import Recording, check_clock, rate, twists_between
 from .settings import LabelRule
 
 INSTALL: Final = "pip install 'pathspace-graph[ros]'"  # command that installs the package that reads bags
@@ -25,6 +26,18 @@ SUPPORTED: Final = {  # what a message must hold, by the option of its topic
     "--detections": "a point cloud, an array of markers, or a list of cones with points",
     "transforms": "transforms",
 }
+METADATA: Final = "metadata.yaml"  # file that describes the others in a folder of rosbag2
+DAMAGED: Final = "expected a ROS bag, found one that is compressed as a whole, or was cut off"
+DECOMPRESSED: Final = {  # commands that decompress a file, by its suffix
+    **dict.fromkeys((".zstd", ".zst"), "zstd -d {file} -o {inner}"),
+    **{".gz": "gunzip -k {file}", ".bz2": "bunzip2 -k {file}", ".lz4": "lz4 -d {file} {inner}"},
+}
+RECOVERED: Final = {  # commands that recover a file, by its first bytes
+    b"#ROSBAG V2": "rosbag reindex {file}",
+    b"\x89MCAP0\r\n": "mcap recover {file} -o {recovered}",
+    b"SQLite format 3": "sqlite3 {file} .recover | sqlite3 {recovered}",
+}
+LONGEST_MAGIC: Final = max(map(len, RECOVERED))
 STATIC: Final = "/tf_static"  # topic of the transforms between frames that are fixed to the vehicle
 BODIES: Final = ("base_link", "base_footprint")  # frames of a vehicle whose odometry names none
 LEVEL: Final = 0.98  # least cosine of a level sensor's z axis and the vehicle's
@@ -155,6 +168,8 @@ def _twists(
     measured = [motion.twist for motion in odometry.values if motion.twist is not None]
     poses = np.array([motion.pose for motion in odometry.values if motion.pose is not None])
     whole = len(poses) == len(odometry.values)
+    if options.from_poses or not measured or imu is not None:  # these are in order of time here
+        check_clock(odometry.t, "odometry", path)
     if options.from_poses or not measured:
         if not whole:
             raise InputError(path, f"--from-poses: expected messages with a pose, found {odometry.name}")
@@ -170,6 +185,7 @@ def _twists(
             found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
             raise InputError(path, f"{odometry.name}: expected twists, {found}")
     if imu is not None:
+        check_clock(imu.t, "the IMU", path)
         return with_yaw_rate(t, twists, imu.t, np.array(imu.values))
     if np.isnan(twists[:, 2]).all():
         expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"
@@ -208,12 +224,31 @@ def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Ba
         reader = (rosbag1 if is_ros1(path) else rosbag2).Reader(path)
         reader.open()
     except Exception as error:
+        mended = "" if "support" in str(error) else way_to_mend(path)  # a newer bag is no damaged one
+        if mended:
+            raise InputError(path, f"{DAMAGED} ({error}): {mended}") from None
         expected = "expected a ROS bag: a file .bag, .mcap or .db3, or a folder with metadata.yaml"
         raise InputError(path, f"{expected} ({error}); --from says what else it is") from None
     try:
         yield Bag(path, reader, definitions, options.received, notes)
     finally:
         reader.close()
+
+
+def way_to_mend(path: Path) -> str:
+    """Return the command that mends a recording that was cut off or compressed, empty where none is known."""
+    if path.is_dir():
+        inside = (file for file in sorted(path.iterdir()) if file.is_file() and file.name != METADATA)
+        return next(filter(None, map(way_to_mend, inside)), "")
+    file, inner = quote(str(path)), quote(str(path.with_suffix("")))
+    recovered = quote(str(path.with_name(f"recovered{path.suffix}")))
+    places = {"file": file, "inner": inner, "recovered": recovered}
+    if path.suffix in DECOMPRESSED:
+        return f"{DECOMPRESSED[path.suffix].format(**places)} gives the bag, which is converted then"
+    with path.open("rb") as stream:
+        begin = stream.read(LONGEST_MAGIC)
+    commands = [command for magic, command in RECOVERED.items() if begin.startswith(magic)]
+    return f"{commands[0].format(**places)} saves what can be read" if commands else ""
 
 
 @dataclass(frozen=True)
@@ -262,7 +297,7 @@ class Bag:
     def _error(self, message: str) -> InputError:
         seconds = 1e-9 * (self.reader.end_time - self.reader.start_time)
         topics = [
-            f"{name} ({topic.msgtype}, {topic.msgcount} messages, {topic.msgcount / seconds:.3g} Hz)"
+            f"{name} ({topic.msgtype}, {topic.msgcount} messages, {rate(topic.msgcount, seconds)})"
             for name, topic in sorted(self.reader.topics.items())
             if topic.msgcount
         ]
@@ -277,11 +312,13 @@ class Bag:
         decode = store.deserialize_ros1 if is_ros1(self.path) else store.deserialize_cdr
         received, stamps, values = list[float](), list[float | None](), list[Any]()
         try:
-            for _, time, data in self.reader.messages(connections):
+            for time, data in self._messages(connections):
                 message = decode(data, kind)
                 values.append(take(message))
                 stamps.append(stamp_of(message))
                 received.append(1e-9 * time)
+        except InputError:
+            raise
         except MessageError as error:
             where = f"{option} {connections[0].topic} ({kind})"
             raise self._error(f"{where}: {error}; supported is what has {SUPPORTED[option]}") from None
@@ -289,6 +326,14 @@ class Bag:
             where = f"message {len(values) + 1} of {connections[0].topic} ({kind})"
             raise InputError(self.path, f"{where}: expected one that can be read ({error})") from None
         return received, stamps, values
+
+    def _messages(self, connections: list[Any]) -> Iterator[tuple[int, bytes]]:
+        """Yield the time of receipt (ns) and the bytes of each message; a damaged bag is an InputError."""
+        try:
+            for _, time, data in self.reader.messages(connections):
+                yield time, data
+        except Exception as error:
+            raise InputError(self.path, f"{DAMAGED} ({error}): {way_to_mend(self.path)}") from None
 
     def _store(self, connection: Any) -> Any:
         """Return the types of a topic: those of the bag, or else those handed over and those of ROS."""
@@ -309,7 +354,7 @@ class Bag:
 
 def is_ros1(path: Path) -> bool:
     """Return whether a bag is one of rosbag1: a file. A folder is a bag of rosbag2, whatever its name."""
-    return path.suffix == ".bag" and not path.is_dir()
+    return path.name.endswith((".bag", ".bag.active")) and not path.is_dir()
 
 
 def _types_of(connection: Any, typesys: Any) -> dict[str, Any]:

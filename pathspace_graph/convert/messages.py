@@ -51,7 +51,7 @@ class Points(NamedTuple):
         covariances = np.full((len(placed), 2, 2), np.nan) if covariances is None else covariances
         return cls(placed, np.array(covariances, float).reshape(-1, 2, 2), np.array(labels, dtype=int))
 
-    def where(self, chosen: BoolArray) -> "Points":
+    def where(self, chosen: BoolArray | slice) -> "Points":
         return Points(self.points[chosen], self.covariances[chosen], self.labels[chosen])
 
     def equals(self, other: "Points") -> bool:

@@ -20,10 +20,13 @@ from .messages import Points, points_of, stamp_of, twist_of
 from .settings import Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
+MAX_DISORDER: Final = 2.0  # largest fall of stamps (s) from one message to the next of one clock
+SHORTEST: Final = 1e-6  # time (s) in which nothing has a rate; a bag of one message has 1 ns
+PAUSE: Final = 1.0  # time (s) that is counted where a clock was reset
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
-SHARED_STAMP: Final = "messages with detections have the stamp of another one, and are one cycle with it"
+SHARED: Final = "messages with detections are at most 1 ms after another one, and are one cycle with it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,29 +55,83 @@ def twists_between(t: Array, poses: Array) -> Array:
     return twists_of(moves) / np.diff(t)[:, None]
 
 
-def windowed(record: Recording, window: Window) -> Recording:
+def rate(count: int, seconds: float) -> str:
+    """Return in words how often something came in a time (s), which may be none."""
+    return f"{count / seconds:.3g} Hz" if count > 1 and seconds > SHORTEST else "an unknown rate"
+
+
+def clock_falls(t: Array) -> Array:
+    """Return by how much each stamp (n,) in s falls where the clock was reset; elsewhere 0.
+
+    Two messages before it and two from it on agree, unlike those of a stray stamp. Messages out of order fall
+    by less than `MAX_DISORDER`.
+    """
+    falls, known = np.zeros(len(t)), np.flatnonzero(np.isfinite(t))
+    of_known = t[known]
+    lowest_before = np.minimum(of_known[:-3], of_known[1:-2])
+    highest_after = np.maximum(of_known[2:-1], of_known[3:])
+    is_reset = lowest_before - highest_after > MAX_DISORDER
+    falls[known[2:-1]] = np.where(is_reset, of_known[1:-2] - of_known[2:-1], 0.0)
+    return falls
+
+
+def elapsed(t: Array) -> Array:
+    """Return stamps (n,) in s of a clock that goes on by `PAUSE` where this one falls."""
+    falls = clock_falls(t)
+    return np.asarray(t + np.cumsum(falls + PAUSE * (falls > 0.0)))
+
+
+def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None, begin: float = 0.0) -> None:
+    """Raise an InputError where stamps (n,) in s fall back between `chosen` messages, with a way out.
+
+    The options `--start` and `--end` count from `begin` (s) on, as `elapsed` does.
+    """
+    counted = np.flatnonzero(np.ones(len(t), bool) if chosen is None else chosen)
+    falls = clock_falls(t[counted])
+    if not falls.any():
+        return
+    inside = int(np.argmax(falls > 0.0))
+    before, at = counted[inside - 1], counted[inside]
+    cut = elapsed(t)[before] - begin + 0.5 * PAUSE
+    fall = f"the stamps fall back by {t[before] - t[at]:.3g} s at message {at + 1}"
+    found = f"found that {fall}, from {t[before]:.12g} s to {t[at]:.12g} s: was the clock reset?"
+    parts = f"--end {cut:.1f} takes what is before, --start {cut:.1f} what is after it"
+    way_out = f"{parts}, and --received the times at which the messages of a bag were received"
+    raise InputError(file, f"expected {what} by one clock, {found} {way_out}")
+
+
+def windowed(record: Recording, window: Window, file: Path) -> Recording:
     """Return the part of a record that counts; a later beginning, where the map begins, has no truth."""
-    if window == Window():
-        return record
-    scans, most, notes = record.scans, window.range_max, record.notes
-    if most is not None:
-        with np.errstate(over="ignore"):
-            near = [np.hypot(*scan.points.T) <= most for scan in scans]
-        left_out = sum(int((~one).sum()) for one in near)
-        notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
-        scans = [scan.where(one) for scan, one in zip(scans, near, strict=True)]
-    scan_t, begin = record.scan_t + window.time_offset, float(np.nanmin(record.t, initial=np.inf))
+    notes, record = record.notes, _near(record, window.range_max, record.notes)
+    scan_t = record.scan_t + window.time_offset
+    clocks = elapsed(record.t), elapsed(scan_t)
+    begin = float(np.nanmin(clocks[0], initial=np.inf))
     is_cut = window.start > 0.0 or window.end < np.inf  # else stamps that are not finite stay to be counted
     kept, seen = (
         (t >= begin + window.start) & (t <= begin + window.end) if is_cut else np.ones(len(t), bool)
-        for t in (record.t, scan_t)
+        for t in clocks
     )
+    check_clock(record.t, "odometry", file, kept, begin)
+    check_clock(scan_t, "detections", file, seen, begin)
     notes["odometry samples outside --start and --end were left out"] += int((~kept).sum())
     notes["messages with detections outside --start and --end were left out"] += int((~seen).sum())
-    scans = [scan for scan, one in zip(scans, seen.tolist(), strict=True) if one]
-    truth = None if record.truth is None or window.start else replace(record.truth, associations=None)
+    scans = [scan for scan, one in zip(record.scans, seen.tolist(), strict=True) if one]
+    truth = record.truth
+    if truth is not None and window != Window():
+        truth = None if window.start else replace(truth, associations=None)
     t, twists = record.t[kept], record.twists[kept]
     return replace(record, t=t, twists=twists, scan_t=scan_t[seen], scans=scans, truth=truth)
+
+
+def _near(record: Recording, most: float | None, notes: Counter[str]) -> Recording:
+    """Return a record without detections farther than `most` from the sensor (m), if it is given."""
+    if most is None:
+        return record
+    with np.errstate(over="ignore"):
+        near = [np.hypot(*scan.points.T) <= most for scan in record.scans]
+    left_out = sum(int((~one).sum()) for one in near)
+    notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
+    return replace(record, scans=[scan.where(one) for scan, one in zip(record.scans, near, strict=True)])
 
 
 def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) -> Log:
@@ -110,14 +167,29 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     notes["odometry samples were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
     t, twists = t[order], twists[order]
     last = np.append(np.diff(t) > 0, True)  # of samples with one stamp the last one counts
+    _check_lost(t, twists, last, file)
     notes["odometry samples had the stamp of another one, and were left out"] += int((~last).sum())
     return Odometry(t[last], twists[last] * frames.flip)
 
 
+def _why(notes: Counter[str], what: str = "detections") -> list[str]:
+    return [f"{number} {text}" for text, number in notes.items() if number and what in text]
+
+
+def _check_lost(t: Array, twists: Array, last: BoolArray, file: Path) -> None:
+    """Raise an InputError where most samples would be lost, as they differ but share stamps (n,) in s."""
+    lost = ~last[:-1] & (twists[1:] != twists[:-1]).any(axis=1)
+    if 2 * lost.sum() > len(t):
+        found = f"found the stamp of another one in {lost.sum()} of {len(t)}"
+        whole = ": are these whole seconds (--columns t=SECONDS+NANOSECONDS)?" * bool(
+            (t == np.floor(t)).all()
+        )
+        raise InputError(file, f"expected odometry samples with stamps of their own, {found}{whole}")
+
+
 def _check_stamps(t: Array, what: str, file: Path, notes: Counter[str]) -> None:
     if len(t) == 0:
-        why = [f"{number} {text}" for text, number in notes.items() if number and what in text]
-        raise InputError(file, "; ".join([f"expected {what} with stamps, found none", *why]))
+        raise InputError(file, "; ".join([f"expected {what} with stamps, found none", *_why(notes, what)]))
     worst = float(np.abs(t).max())
     if worst > MAX_STAMP:
         raise InputError(file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}")
@@ -131,6 +203,7 @@ def _cycles(
     notes["messages with detections were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
     begin, end = float(odometry.t[0]), float(odometry.t[-1]) + logs.MAX_HOLD
     found: dict[float, list[Points]] = {}
+    cycle = -np.inf
     for index in np.argsort(t, kind="stable"):
         points = usable(record.scans[index], notes)
         if not len(points.labels):
@@ -139,11 +212,13 @@ def _cycles(
         if not begin <= t[index] <= end:
             notes[OUTSIDE] += 1
             continue
-        scans = found.setdefault(float(t[index]), [])
+        if not logs.is_one_cycle(t[index], cycle):
+            cycle = float(t[index])
+        scans = found.setdefault(cycle, [])
         if any(map(points.equals, scans)):
             notes["messages with detections were repetitions, and were left out"] += 1
             continue
-        notes[SHARED_STAMP] += bool(scans)
+        notes[SHARED] += bool(scans)
         scans.append(points)
     if not found and notes[OUTSIDE]:
         span = f"{begin:.9g} s to {end - logs.MAX_HOLD:.9g} s"
@@ -151,7 +226,8 @@ def _cycles(
         expected = f"expected detections in the time of the odometry, {span}"
         raise InputError(file, f"{expected}, found them {stamps}")
     if not found:
-        raise InputError(file, f"expected detections that can be used, found {len(t)} messages without any")
+        expected = f"expected detections that can be used, found {len(t)} messages without any"
+        raise InputError(file, "; ".join([expected, *_why(notes)]))
     joined = {stamp: Points(*map(np.concatenate, zip(*scans, strict=True))) for stamp, scans in found.items()}
     return tuple(in_vehicle_frame(stamp, points, frames, noise, notes) for stamp, points in joined.items())
 

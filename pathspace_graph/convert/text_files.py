@@ -1,8 +1,11 @@
 """Text files: CSV with columns of any names and units, and JSON lines."""
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import pairwise
 from math import pi
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +15,15 @@ import numpy as np
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import covariances_of
-from pathspace_graph.io.parsing import MAX_STAMP, Table, read_table, read_text, shown
+from pathspace_graph.io.parsing import (
+    DELIMITERS,
+    MAX_STAMP,
+    Table,
+    is_number,
+    read_table,
+    read_text,
+    shown,
+)
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import Points
@@ -38,7 +49,11 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # units of each quantity, i
 }
 MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
 LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
+_BEFORE_ZONE: Final = re.compile(r"\s+(?=(?:Z|[+-]\d\d(?::?\d\d)?)$)")  # blanks before Z or an offset
+_OTHER: Final = {"range": "bearing", "bearing": "range"}
 UNSTATED: Final = ((np.nan, np.nan), (np.nan, np.nan))  # covariance of a detection that states none
+MANY_ROWS: Final = 20  # number of rows whose nanoseconds tell that they are some
+LEAST_NANOSECONDS: Final = 1e6  # which the fractions of some seconds reach
 MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong unit of time
 MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong unit of time
 
@@ -49,11 +64,12 @@ def read_csv(
     """Return what two CSV files have of a drive; an InputError names file, row and column.
 
     Quantities are in columns of their own names, unless `columns` says `vx=speed`, `y=-cone_y` or
-    `odometry.t=stamp`, and in SI units, unless `units` says `length=mm angle=deg time=ns`.
+    `odometry.t=stamp`, and in SI units, unless `units` says `length=mm angle=deg time=ns`. Stamps may be ISO
+    8601 dates, or seconds and nanoseconds in two columns (`t=sec+nsec`).
     """
     named, used = _named(columns), _units(units)
     twists, found = (
-        _File(kind, read_table(file, ()), named, used)
+        _File(kind, read_table(file, (), delimiters=DELIMITERS), named, used)
         for kind, file in ((ODOMETRY, odometry), (DETECTIONS, detections))
     )
     t = twists.stamps()
@@ -108,36 +124,84 @@ class _File:
         """Return whether the file has the column of a quantity; one that was named must be there."""
         return (self.kind, key) in self.named or key in self.table.columns
 
-    def column(self, key: str) -> str:
-        column = self.named.get((self.kind, key), key).removeprefix("-")
+    def column(self, key: str, column: str = "") -> str:
+        """Return the column of a quantity, which must be there; it may be one of several `column`s."""
+        column = column or self.named.get((self.kind, key), key).removeprefix("-")
         if column not in self.table.columns:
-            expected = f"expected a column '{column}' for {key} (--columns {key}=NAME)"
+            otherwise = f", or {key}=SECONDS+NANOSECONDS" * (key == "t")
+            expected = f"expected a column '{column}' for {key} (--columns {key}=NAME{otherwise})"
             found = f"found the columns {', '.join(self.table.columns)}"
             raise InputError(self.table.file, f"{expected}, {found}", 1)
         return column
 
     def numbers(self, key: str, power: int = 1) -> Array:
-        """Return a column (rows,) in the SI unit, or in its square where `power` is 2."""
+        """Return a column (rows,) in the SI unit or, for `power` 2, its square; NaN where it is missing."""
         quantity = QUANTITIES[self.kind][key]
         sign = -1.0 if self.named.get((self.kind, key), "").startswith("-") else 1.0
         factor = sign * UNITS[quantity][self.units[quantity]] ** power
-        return np.asarray(factor * self.table.numbers(self.column(key), LARGEST))
+        return np.asarray(factor * self.table.numbers(self.column(key), LARGEST, missing=True))
 
     def stamps(self) -> Array:
-        """Return the stamps (rows,) in s, whose unit has to be plausible."""
-        t, unit, name = self.numbers("t"), self.units["time"], self.column("t")
+        """Return the stamps (rows,) in s: numbers, dates, or seconds and nanoseconds in two columns."""
+        stated, unit = self.named.get((self.kind, "t"), "t"), self.units["time"]
+        if "+" in stated and stated not in self.table.columns:
+            return self._checked(self._in_two_columns(*stated.split("+", 1)), "s")
+        name = self.column("t")
+        if seconds_of_date(self.table.columns[name][0]) is not None:
+            return self._checked(self._dates(name), "s")
+        return self._checked(UNITS["time"][unit] * self.table.numbers(name, LARGEST), unit)
+
+    def _in_two_columns(self, whole: str, fraction: str) -> Array:
+        """Return the stamps (rows,) in s of columns with seconds and with nanoseconds."""
+        seconds, nanoseconds = (
+            self.table.numbers(self.column("t", name), LARGEST) for name in (whole, fraction)
+        )
+        self.table.require(
+            (nanoseconds >= 0.0) & (nanoseconds < 1e9),
+            f"expected nanoseconds from 0 to 999999999 in column '{fraction}', found others",
+        )
+        if len(seconds) >= MANY_ROWS and 0.0 < nanoseconds.max() < LEAST_NANOSECONDS:
+            found = f"found at most {nanoseconds.max():.0f}: is their unit another one?"
+            raise InputError(self.table.file, f"expected nanoseconds in column '{fraction}', {found}")
+        return np.asarray(seconds + 1e-9 * nanoseconds)
+
+    def _dates(self, name: str) -> Array:
+        seconds = [seconds_of_date(text) for text in self.table.columns[name]]
+        good = np.array([one is not None for one in seconds])
+        self.table.require(good, f"expected a date by ISO 8601 in column '{name}', as in the rows before")
+        return np.array(seconds, dtype=float)
+
+    def _checked(self, t: Array, unit: str) -> Array:
+        """Return stamps (rows,) in s, which must be plausible where they were in this unit."""
+        name = self.named.get((self.kind, "t"), "t")
         self.table.require(
             np.abs(t) <= MAX_STAMP,
             f"expected stamps of at most {MAX_STAMP:g} s in column '{name}', found more: is their unit not "
             f"{unit} (--units time=ns)?",
         )
-        stamps = np.unique(t)
+        stamps, expected = np.unique(t), f"expected stamps in {unit} in column '{name}'"
         period = float(np.ptp(stamps)) / max(len(stamps) - 1, 1)
         if len(stamps) > 1 and not MIN_PERIOD < period < MAX_PERIOD:
-            expected = f"expected stamps in {unit} in column '{name}'"
             found = f"found them {period:.3g} s apart: is their unit another one?"
             raise InputError(self.table.file, f"{expected}, {found}")
+        if np.ptp(stamps) <= 1.0 and (np.diff(t) < -0.5).sum() >= 2:
+            found = (
+                "found only the fraction of each second: --columns t=SECONDS+NANOSECONDS reads two columns"
+            )
+            raise InputError(self.table.file, f"{expected}, {found}")
         return t
+
+
+def seconds_of_date(text: str) -> float | None:
+    """Return the time (s) since 1970 of a date with a time by ISO 8601, UTC without an offset; else None."""
+    text = _BEFORE_ZONE.sub("", text.strip().upper().replace("UTC", "Z"))
+    if is_number(text):
+        return None
+    try:
+        date = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
 
 
 def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
@@ -148,27 +212,35 @@ def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
         covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
     if file.has("label"):
         labels = rule.of_all(np.array(file.table.columns[file.column("label")]))
-    cycles: dict[float, list[int]] = {}
-    for row, stamp in enumerate(t.tolist()):
-        cycles.setdefault(stamp, []).append(row)
+    starts = np.flatnonzero(np.diff(t, prepend=np.nan))
     detections = Points.of(points, labels, covariances)
-    return np.array([*cycles]), [detections.where(np.array(rows)) for rows in cycles.values()]
+    spans = [slice(*span) for span in pairwise([*starts.tolist(), len(t)])]
+    return t[starts], [detections.where(span) for span in spans]
 
 
 def _points(file: _File) -> Array:
     if file.has("x") and (DETECTIONS, "range") not in file.named:
         return np.column_stack([file.numbers("x"), file.numbers("y")])
-    if not file.has("range"):
-        file.column("x")  # raises: neither x and y nor range and bearing are there
+    if not (file.has("range") and file.has("bearing")):
+        raise _without_place(file)
     ranges, bearings = file.numbers("range"), file.numbers("bearing")
     name, unit = file.column("bearing"), file.units["angle"]
     file.table.require(
-        np.abs(bearings) <= MAX_BEARING,
+        ~(np.abs(bearings) > MAX_BEARING),
         f"expected bearings of at most a whole turn in column '{name}', found more: is their unit not {unit} "
         "(--units angle=deg)?",
     )
-    file.table.require(ranges >= 0.0, f"expected ranges of at least 0 in column '{file.column('range')}'")
+    file.table.require(~(ranges < 0.0), f"expected ranges of at least 0 in column '{file.column('range')}'")
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+
+
+def _without_place(file: _File) -> InputError:
+    """Return the error of detections without x and y, and without range and bearing."""
+    polar = next((key for key in ("range", "bearing") if not file.has(key) and file.has(_OTHER[key])), "")
+    either = f"'{polar}' beside {_OTHER[polar]}, or x and y" if polar else "'x' and y, or range and bearing"
+    expected = f"expected a column {either} (--columns {polar or 'x'}=NAME)"
+    found = f"found the columns {', '.join(file.table.columns)}"
+    return InputError(file.table.file, f"{expected}, {found}", 1)
 
 
 def read_json_lines(file: Path, rule: LabelRule) -> Recording:
@@ -202,12 +274,11 @@ def read_json_lines(file: Path, rule: LabelRule) -> Recording:
 def _points_of_objects(objects: list[dict[str, Any]], rule: LabelRule) -> Points:
     points, covariances, labels = [], [], []
     for one in objects:
-        if "range" in one:
-            r, bearing = float(one["range"]), float(one["bearing"])
-            place = r * np.cos(bearing), r * np.sin(bearing)
-        else:
-            place = one["x"], one["y"]
-        points.append(np.array(place, dtype=float))
+        is_polar = "range" in one or "bearing" in one
+        place = np.array(
+            [one[key] for key in (("range", "bearing") if is_polar else ("x", "y"))], dtype=float
+        )
+        points.append(place[0] * np.array([np.cos(place[1]), np.sin(place[1])]) if is_polar else place)
         covariances.append(np.array(one.get("covariance", UNSTATED), dtype=float).reshape(2, 2))
         labels.append(rule.of(one["label"]) if "label" in one else UNKNOWN)
     return Points.of(points, labels, covariances)

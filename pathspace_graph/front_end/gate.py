@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError, ReadingError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, read_log
+from pathspace_graph.io.log import (
+    DETECTIONS_FILE,
+    MIN_INTERVAL,
+    ODOMETRY_FILE,
+    ROUND_OFF,
+    Detections,
+    Log,
+    Odometry,
+    read_log,
+)
 from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.run import CycleResult, split_odometry
@@ -27,7 +36,6 @@ TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
 MAX_STAMP: Final = 1e11  # largest stamp, s: some three thousand years. Stamps in nanoseconds are larger
 UNITS: Final = "stamps are in seconds"  # hint where a stamp looks like one in milliseconds or nanoseconds
 STAMPS: Final = f"at most {MAX_STAMP:g} s ({UNITS})"
-MIN_INTERVAL: Final = 1e-3  # s from cycle to cycle: below, the odometry is too certain for doubles
 MAX_TWISTS: Final = 100_000
 MAX_DETECTIONS: Final = 500  # largest numbers of twists and detections in a cycle, which bound its time
 MIN_RANGE: Final = 0.01  # least distance of a detection from the vehicle, m
@@ -163,7 +171,7 @@ def _check_order(stamps: Array, t: float, newest: float | None, silence: float) 
     if len(stamps) and stamps[-1] > t:
         row = int(stamps.searchsorted(t, side="right"))
         raise ReadingError("odometry.t", "none later than the cycle", float(stamps[row]), row)
-    if newest is not None and t < newest + MIN_INTERVAL:
+    if newest is not None and t - newest < MIN_INTERVAL - ROUND_OFF:
         raise ReadingError("detections.t", f"at least {MIN_INTERVAL:g} s after the newest cycle", t)
     before = [] if newest is None else [newest]
     known = np.concatenate([before, stamps, [t]])

@@ -249,7 +249,7 @@ def _ray_noise(
 def _line(ranges: Array, sigma: Array) -> Array:
     """Return `a, b >= 0` with the least `sum ((a + b r) / sigma - 1)^2` for sigmas (k,) at ranges r (k,)."""
     columns = np.stack([np.ones(len(ranges)), ranges], axis=1) / sigma[:, None]
-    line = np.linalg.lstsq(columns, np.ones(len(sigma)))[0]
+    line = np.linalg.lstsq(columns, np.ones(len(sigma)), rcond=None)[0]
     if (line >= 0.0).all():
         return np.asarray(line)
     share = columns.sum(axis=0) / (columns**2).sum(axis=0)  # of either alone

@@ -20,7 +20,6 @@ from . import parsing as limits
 from .brief import Brief, pictures
 from .files import atomic_folder
 from .header import POSITIVE, Header, noise_sections, to_toml, toml_text
-from .manifest import verified
 from .parsing import Column, Table, read_table, write_table
 
 if TYPE_CHECKING:
@@ -69,6 +68,8 @@ _TRUE_ERRORS: Final = {
 SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
 SIGMA_DETECTIONS: Final = (0.05, 0.012, np.pi / 200.0)  # (m, m/m, rad) where nothing is known
 MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
+MIN_INTERVAL: Final = 1e-3  # s between perception cycles; below, the odometry is too certain for doubles
+ROUND_OFF: Final = 1e-6  # s, of the difference of two stamps: doubles resolve those since 1970 to 2.4e-7 s
 MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
 MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to double precision below
 
@@ -223,11 +224,6 @@ def read_log(folder: Path | str) -> Log:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
-    with verified(folder, *FILES):
-        return _read_log(folder)
-
-
-def _read_log(folder: Path) -> Log:
     header = Header(folder / LOG_FILE)
     odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
     sensor = [name for name in vars(SensorInfo()) if name in header.section("sensor")]
@@ -266,7 +262,7 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
         for name, values in _columns(log).items():
             write_table(target / name, COLUMNS[name], *values)
         if check:
-            _read_log(target)
+            read_log(target)
 
 
 def _read_odometry(table: Table) -> Odometry:
@@ -305,10 +301,21 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
 
 
 def cycles_of(t: Array, points: Array, covariances: Array, labels: IntArray) -> tuple[Detections, ...]:
-    """Return the perception cycles of detections (m,): neighbours with the same stamp (s) are one cycle."""
-    starts = np.flatnonzero(np.diff(t, prepend=-np.inf))
+    """Return the perception cycles of detections (m,) at stamps (s), see `is_one_cycle`."""
+    starts: list[int] = []
+    for row, stamp in enumerate(t.tolist()):
+        if not starts or not is_one_cycle(stamp, t[starts[-1]]):
+            starts.append(row)
     spans = [slice(a, b) for a, b in pairwise([*starts, len(t)])]
     return tuple(Detections(float(t[s.start]), points[s], covariances[s], labels[s]) for s in spans)
+
+
+def is_one_cycle(t: float, begin: float) -> bool:
+    """Return whether detections at t (s) belong to the cycle that begins at a stamp (s), and has that stamp.
+
+    Several cameras, and stamps that were rounded to milliseconds, differ by `MIN_INTERVAL` or less.
+    """
+    return abs(t - begin) <= MIN_INTERVAL + ROUND_OFF
 
 
 def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:

@@ -1,9 +1,8 @@
-"""The manifest of a folder: size and SHA-256 of each file as it was written, verified when a file is read."""
+"""The manifest of a folder: size and SHA-256 of each file as it was written, which `verify` checks."""
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,7 +13,6 @@ from .parsing import parse_json, read_text, shown
 FORMAT: Final = "pathspace-manifest/1"
 MANIFEST_FILE: Final = "manifest.json"
 _MARK: Final = "pathspace"  # held more than once, so that a damaged manifest isn't taken for another's
-_ACCEPT: Final = f" (removing {MANIFEST_FILE} accepts the files as they are)"
 _DIGEST: Final = "pathspace_digest"  # key of the manifest's own SHA-256, taken without this key
 
 
@@ -53,16 +51,8 @@ def read_manifest(folder: Path) -> dict[str, dict[str, Any]] | None:
     files = content.get("files") if isinstance(content, dict) else None
     # any other byte makes another text
     if not isinstance(files, dict) or text != _text(files):
-        raise InputError(file, "expected the manifest as it was written, found another content" + _ACCEPT)
+        raise InputError(file, "expected the manifest as it was written, found another content")
     return files
-
-
-def verify(folder: Path, names: Iterable[str]) -> None:
-    """Raise an InputError for the first of these files that differs from what the manifest lists."""
-    listed = read_manifest(folder) or {}
-    for name in names:
-        if name in listed and (folder / name).is_file():
-            _verify_file(folder / name, listed[name])
 
 
 def verify_all(folder: Path) -> int:
@@ -74,7 +64,7 @@ def verify_all(folder: Path) -> int:
     for name, entry in listed.items():
         file = folder / name
         if not file.is_file():
-            raise InputError(file, "expected a file that the manifest lists, found none" + _ACCEPT)
+            raise InputError(file, "expected a file that the manifest lists, found none")
         _verify_file(file, entry)
         if file.name == MANIFEST_FILE:
             count += verify_all(file.parent)
@@ -90,26 +80,9 @@ def _verify_file(file: Path, entry: Any) -> None:
         raise InputError(file, f"expected a readable file: {error.strerror}") from error
     if not good:
         expected = f"expected the file as it was written ({MANIFEST_FILE})"
-        raise InputError(file, f"{expected}, found another content{_ACCEPT}")
+        raise InputError(file, f"{expected}, found another content")
 
 
 def _digest(file: Path) -> str:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-@contextmanager
-def verified(folder: Path, *names: str) -> Iterator[None]:
-    """Verify these files after they were read; an error of their content comes first, as it names the row."""
-    try:
-        yield
-    except InputError as error:
-        try:
-            verify(folder, names)
-        except InputError as damage:
-            if damage.file != error.file:
-                raise damage from error
-            message = f"{error.message}; the file is not as it was written ({MANIFEST_FILE})"
-            raise InputError(error.file, message, error.row) from damage
-        raise
-    verify(folder, names)

@@ -5,6 +5,7 @@ import json
 import re
 import stat
 import tomllib
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -86,10 +87,14 @@ _ERRORS: Final = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeE
 
 
 def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> str:
-    """Return the text of a file in UTF-8 of at most `most` bytes; an InputError says what was expected."""
+    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark, of at most `most` bytes.
+
+    An InputError says what was `expected`.
+    """
     data = read_bytes(file, expected, most)
+    encoding = "utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig"
     try:
-        return data.decode("utf-8-sig")
+        return data.decode(encoding)
     except UnicodeDecodeError as error:
         raise InputError(file, "expected text in UTF-8", data.count(b"\n", 0, error.start) + 1) from None
 
@@ -176,6 +181,11 @@ def _row(mark: Any) -> int | None:
 # --- CSV -------------------------------------------------------------------------------------------------
 
 
+MISSING: Final = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})  # words for no number
+DELIMITERS: Final = ",;\t"
+_DECIMAL_COMMA: Final = re.compile(r"([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)")
+
+
 class Column(NamedTuple):
     largest: float = MAX_COORDINATE
     unit: str = ""
@@ -201,9 +211,14 @@ class Table:
         if not good.all():
             self.fail(int(np.argmin(good)), message)
 
-    def numbers(self, name: str, largest: float | None = None) -> Array:
-        """Return the column as finite numbers (rows,), at most as large as declared, or as `largest`."""
+    def numbers(self, name: str, largest: float | None = None, *, missing: bool = False) -> Array:
+        """Return the column as finite numbers (rows,), at most as large as declared, or as `largest`.
+
+        With `missing`, a number may be missing, as in `MISSING`, or not be finite; NaN stands for both.
+        """
         column, texts = self.declared.get(name, Column()), self.columns[name]
+        if missing:
+            texts = ["nan" if text.strip().lower() in MISSING else text for text in texts]
         most, unit = largest or column.largest, f" {column.unit}".rstrip()
         try:
             values = np.array(list(map(float, texts)), dtype=float)
@@ -211,10 +226,11 @@ class Table:
         except ValueError:
             good = False
         if not good:
-            self._refuse(name, [*map(_is_number, texts)], "a number")
-        self._refuse(name, np.isfinite(values), "a finite number")
-        self._refuse(name, np.abs(values) <= most, f"a number of at most {most:g}{unit} in size")
-        return values
+            self._refuse(name, [*map(is_number, texts)], "a number")
+        known = np.isfinite(values)
+        self._refuse(name, known | missing, "a finite number")
+        self._refuse(name, ~known | (np.abs(values) <= most), f"a number of at most {most:g}{unit} in size")
+        return np.where(known, values, np.nan)
 
     def _refuse(self, name: str, good: ArrayLike, expected: str) -> None:
         if not np.all(good):
@@ -228,16 +244,23 @@ class Table:
 
 
 def read_table(
-    file: Path, required: Mapping[str, Column] | Sequence[str], comment: str = "", most: int = MAX_FILE_BYTES
+    file: Path,
+    required: Mapping[str, Column] | Sequence[str],
+    comment: str = "",
+    most: int = MAX_FILE_BYTES,
+    delimiters: str = ",",
 ) -> Table:
     """Read a CSV file whose header holds at least the required columns; an InputError says what is wrong.
 
     Quotes, blanks around fields, empty lines, Windows line ends, a byte-order mark and a `comment` in front
-    of the header are tolerated.
+    of the header are tolerated. Of several `delimiters` it is the most frequent one in the header; where that
+    is no comma, numbers may have a decimal comma.
     """
     rows: list[list[str]] = []
     lines: list[int] = []
-    reader = csv.reader(StringIO(read_text(file, most=most), newline=""), skipinitialspace=True)
+    text = read_text(file, most=most)
+    delimiter = max(delimiters, key=text.lstrip().partition("\n")[0].count)
+    reader = csv.reader(StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
     try:
         for row in reader:
             if "".join(row).strip():
@@ -260,8 +283,16 @@ def read_table(
         if len(row) != width:
             raise InputError(file, f"expected {width} fields, found {len(row)}", line)
     columns = [list(column) for column in zip(*body, strict=True)] or [[] for _ in header]
+    if delimiter != ",":
+        columns = [[_with_point(text) for text in column] for column in columns]
     declared = required if isinstance(required, Mapping) else {}
     return Table(file, dict(zip(header, columns, strict=True)), lines[1:], declared)
+
+
+def _with_point(text: str) -> str:
+    """Return a number with a decimal point in place of a comma, and any other text as it is."""
+    number = _DECIMAL_COMMA.fullmatch(text.strip())
+    return f"{number[1]}.{number[2]}" if number else text
 
 
 def write_table(file: Path, names: Iterable[str], *values: ArrayLike) -> None:
@@ -278,7 +309,7 @@ def is_plain(text: str) -> bool:
     return text.isascii() and "_" not in text
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
     try:
         float(text)
     except ValueError:

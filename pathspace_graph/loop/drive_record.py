@@ -1,19 +1,22 @@
 """The drive as it was measured, its poses along the curves, and its batch when the loop closes."""
 
 import os
+import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from math import nan
-from multiprocessing import current_process
+from multiprocessing import current_process, resource_tracker
 from threading import Thread
 from typing import Any, Final, cast
 
 import numpy as np
 from joblib.externals import loky
+from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_trying, solve_lap
 from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
@@ -251,12 +254,28 @@ def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
     failed = cast("Future[Any]", loky.Future())
     for _ in range(2):
         try:
-            return cast("Future[Any]", _worker().submit(work, *arguments))
+            with _spared_by_interrupts():
+                return cast("Future[Any]", _worker().submit(work, *arguments))
         except Exception as error:  # it has died, or cannot be begun
             _worker.cache_clear()
             failure = error
     failed.set_exception(failure)
     return failed
+
+
+@contextmanager
+def _spared_by_interrupts() -> Iterator[None]:
+    """Let processes begin that Ctrl-C does not reach, lest each prints where it was; it waits meanwhile."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    for tracker in (resource_tracker, loky_tracker):
+        tracker.ensure_running()  # else it would be begun within, and let signals through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @cache

@@ -41,6 +41,7 @@ _EXPECTED = (
 )
 _TURNED = "static cones move as they would for a sensor that is turned by {angle}"
 _BY_READINGS = "--noise measured takes what is measured"
+_CUT = "check that the record has all of the detections; convert with"
 _CLASSES = "the classes of the detector were not turned into left and right"
 
 # cause, file, columns, figure, likely cause and advice of each mistake, with places for its numbers
@@ -62,6 +63,12 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
     "late": ("clocks", DETECTIONS_FILE, _T, _EXPECTED,
         "the detections are stamped about {seconds:g} s too {way}",
         "stamp odometry and detections when they are measured, by one clock"),
+    "detections end early": ("gaps", DETECTIONS_FILE, _T,
+        "the last detection is {seconds:.3g} s before the last odometry",
+        "the detector or its record stopped before the drive ended", _CUT + " --end leaves the rest out"),
+    "detections begin late": ("gaps", DETECTIONS_FILE, _T,
+        "the first detection is {seconds:.3g} s after the first odometry",
+        "the detector or its record started after the drive began", _CUT + " --start leaves the rest out"),
     "unit of positions": ("positions", DETECTIONS_FILE, _XY, "detections are {typical:.4g} m away as a rule",
         "the positions {what}", "multiply x and y by {factor:g}"),
     "too fast": ("speeds", ODOMETRY_FILE, _V, "the speed is more than {speed:.4g} m/s in a tenth of the rows",

@@ -28,6 +28,8 @@ LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is
 OVERLAP: Final = 0.5  # share of its detections that another cycle sees, from which they are compared
 SHORTEST_STEP: Final = 2e-4  # shortest usual time between rows (s)
 LONGEST_STEP: Final = 5.0  # longest usual time between rows (s)
+WITHOUT_DETECTIONS: Final = 10.0  # time of driving before the first detection or after the last one (s)
+DRIVING: Final = 0.1  # share of the largest speed from which a vehicle drives
 FARTHEST: Final = 120.0  # usual greatest range of a detector of cones (m)
 FAR: Final = 20.0  # range within which cones decide between two units that both give possible positions (m)
 NEAREST: Final = 0.05  # usual least range of cones (m)
@@ -83,13 +85,14 @@ def _hints(log: Log) -> list[Hint]:
     of_clocks = one_clock(log)
     if of_clocks:
         return found + of_clocks
+    of_ends = ends_apart(log)
     log, of_positions = positions_in_metres(log)
     found += of_positions
     pairs = hypotheses.pairs_of(log.cycles)
     if pairs is None:
-        return found + beyond_any_vehicle(log.odometry)
+        return of_ends + found + beyond_any_vehicle(log.odometry)
     found += _by_motion(Trials(log, telling_pairs(log, pairs)))
-    return found or noise_hints(log)
+    return of_ends + (found or noise_hints(log))
 
 
 # --- figures that tell units by themselves ---------------------------------------------------------------
@@ -129,6 +132,21 @@ def one_clock(log: Log) -> list[Hint]:
     begin, end = log.cycles[0].t, log.cycles[-1].t
     apart = begin > last or end < first
     return [told("two clocks", begin=begin, end=end, first=first, last=last)] if apart else []
+
+
+def ends_apart(log: Log) -> list[Hint]:
+    """Return a hint where the vehicle drives for long before the first detection, or after the last one."""
+    if not log.cycles:
+        return []
+    t, speed = log.odometry.t, np.hypot(log.odometry.twist[:, 0], log.odometry.twist[:, 1])
+    driven = t[speed > DRIVING * speed.max()]
+    begin, end = log.cycles[0].t, log.cycles[-1].t
+    found = []
+    if driven.size and begin - driven[0] > WITHOUT_DETECTIONS:
+        found.append(told("detections begin late", seconds=begin - t[0]))
+    if driven.size and driven[-1] - end > WITHOUT_DETECTIONS:
+        found.append(told("detections end early", seconds=t[-1] - end))
+    return found
 
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
@@ -313,6 +331,10 @@ def camera(pairs: Pairs) -> list[Hint]:
 
 
 NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
+# causes for which a log can be refused: the size of its numbers. Labels and frames never are
+REFUSABLE: Final = frozenset(
+    {"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"}
+)
 SHOWN_WORDS: Final = 3  # most foreign labels that are shown
 
 
@@ -322,7 +344,9 @@ def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[H
         log = read_usable_log(folder, limits)
     except InputError as error:
         of_data = error.file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
-        causes = because(refused_hints(folder)) if of_data else ""
+        causes = (
+            because([hint for hint in refused_hints(folder) if hint.cause in REFUSABLE]) if of_data else ""
+        )
         if not causes:
             raise
         raise InputError(error.file, f"{error.message}; {causes}", error.row) from error

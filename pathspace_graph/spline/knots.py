@@ -136,7 +136,7 @@ def _normal_solution(normal: Array, right: Array) -> Array:
     try:
         factor = cho_factor(normal, check_finite=False)
     except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.lstsq(normal, right)[0])
+        return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0])
     return np.asarray(cho_solve(factor, right, check_finite=False))
 
 

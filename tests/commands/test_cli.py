@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from dataclasses import fields, replace
@@ -12,12 +13,13 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline as ScipyBSpline
 
+from pathspace_graph import __main__ as program
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.batch.system import BatchSystem
 from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import estimate as commands_estimate
 from pathspace_graph.commands.options import one_line
-from pathspace_graph.io.log import Detections, Log, read_log, write_log
+from pathspace_graph.io.log import Detections, Log, Odometry, read_log, write_log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
@@ -65,7 +67,9 @@ def test_a_batch_that_is_late_in_a_vehicle_is_told(
 def beginning_of(log_folder: Path, out: Path, cycles: int = 20) -> Path:
     """A folder with the first cycles of a log; it knows no truth."""
     log = read_log(log_folder)
-    write_log(replace(log, cycles=log.cycles[:cycles], truth=None), out)
+    odometry, seen = log.odometry, log.odometry.t <= log.cycles[cycles].t
+    odometry = Odometry(odometry.t[seen], odometry.twist[seen])
+    write_log(replace(log, odometry=odometry, cycles=log.cycles[:cycles], truth=None), out)
     return out
 
 
@@ -282,7 +286,7 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png", "manifest.json"}
     assert read_map(tmp_path / "pathspace-demo" / "map").boundaries
     printed = capsys.readouterr().out
-    assert "rmse" in printed
+    assert "rmse [m]" in printed
     assert "pathspace-demo" in printed
 
 
@@ -304,6 +308,33 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
         (["online", "LOG", "--out", "MAP", "--no-such-option", "1"], "--no-such-option"),
         (["online", "LOG", "--out", "MAP", "--estimatr", "ckf"], "ckf, the nearest is --estimator (see"),
         (["online", "LOG", "--out", "MAP", "--estimator", "magic"], "fixed-lag"),
+        (["online", "LOG", "--out", "MAP", "--estimator", "magic"], "landmark-fixed-lag), found 'magic'\n"),
+        (
+            ["online", "LOG", "--out", "MAP", "--scale", "big"],
+            "graph: --scale: expected a number, found 'big' (see",
+        ),
+        (
+            ["online", "LOG", "--out", "MAP", "--max_poses=x"],
+            "--max-poses: expected a whole number, found 'x' (see",
+        ),
+        (["online", "LOG", "--out"], "graph: --out: expected a path, found none (see"),
+        (
+            ["online", "LOG", "--out", "MAP", "--noise", "x"],
+            "--noise: expected one of measured, stated, found 'x'",
+        ),
+        (
+            ["convert", "BAG", "--out", "LOG", "--sigma-odometry", "1", "2"],
+            "graph: --sigma-odometry: expected 3 numbers, found '1 2' (see",
+        ),
+        (
+            ["convert", "BAG", "--out", "LOG", "--mounting", "1", "-2", "a"],
+            "graph: --mounting: expected 3 numbers, found '1 -2 a' (see",
+        ),
+        (
+            ["scale", "--out", "D", "--estimators", "foo"],
+            "graph: --estimators: expected a known online estimator",
+        ),
+        (["zzz"], "verify), found 'zzz'\n"),
         (["online", "LOG", "--out", "MAP"], "LOG: expected a log folder"),
         (
             ["online", "LOG", "--out", "MAP", "--estimator", "ckf", "--save", "S"],
@@ -357,6 +388,18 @@ def test_the_output_is_checked_before_the_work(
     assert main(["online", str(log_folder), "--out", str(tmp_path / "thesis.tex" / "map")]) == 2
     assert capsys.readouterr().err.count("\n") == 2
     assert names(tmp_path) == {"thesis.tex"}
+
+
+def test_an_interrupt_before_the_command_line_is_there_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(program, "import_module", interrupt)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    assert program.main() == 130
+    assert capsys.readouterr().err == "pathspace-graph: interrupted\n"
 
 
 def test_an_interrupt_leaves_nothing_half_written(

@@ -382,7 +382,7 @@ def test_disorder_repetitions_and_nonsense_are_told_and_left_out(
         "1 messages without any detection",
         "2 messages with detections outside the time",
         "1 messages with detections were repetitions",
-        "1 messages with detections have the stamp of another one",
+        "1 messages with detections are at most 1 ms after another one",
         "3 detections had no covariance",
     ):
         assert line in said
@@ -408,6 +408,81 @@ def test_clocks_that_differ_are_told_and_mended_by_the_time_of_receipt(
     bag = write_bag(tmp_path, "rosbag1", make)
     assert "do both have the same clock?" in refused(bag, tmp_path / "log", capsys, *TOPICS)
     assert len(convert(bag, tmp_path / "log", "--received").cycles) == 1
+
+
+MENDED = {
+    "rosbag1": "rosbag reindex {file} saves",
+    "mcap": "mcap recover {file} -o {folder}/recovered.mcap saves",
+    "sqlite3": "sqlite3 {file} .recover | sqlite3 {folder}/recovered.db3 saves",
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.99])
+@pytest.mark.parametrize("folder", [False, True])
+def test_a_recording_that_was_cut_off_is_refused_with_the_command_that_mends_it(
+    kind: Kind, share: float, folder: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make(messages: Messages) -> list[Written]:
+        return [(0.01 * k, "/odom", messages.odometry(0.01 * k, TWIST)) for k in range(100)]
+
+    bag = write_bag(tmp_path, kind, make)
+    file = next(one for one in (bag, *bag.glob("*.*")) if one.suffix in (".bag", ".mcap", ".db3"))
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    said = refused(bag if folder else file, tmp_path / "log", capsys, *TOPICS)
+    assert "cut off" in said
+    assert MENDED[kind].format(file=file, folder=file.parent) in said
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("a b.mcap.zstd", "zstd -d '{folder}/a b.mcap.zstd' -o '{folder}/a b.mcap' gives the bag"),
+        ("d.db3.zst", "zstd -d {folder}/d.db3.zst -o {folder}/d.db3 gives the bag"),
+        ("d.bag.gz", "gunzip -k {folder}/d.bag.gz gives the bag"),
+        ("d.bag.active", "rosbag reindex {folder}/d.bag.active saves"),
+    ],
+)
+def test_a_file_that_is_compressed_or_was_not_finished_is_refused_with_a_command(
+    name: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
+    for source in (tmp_path / name, tmp_path):
+        said = refused(source, tmp_path.parent / "log", capsys, *TOPICS)
+        assert command.format(folder=tmp_path) in said
+
+
+def test_a_bag_of_one_moment_is_told_without_a_rate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path, "mcap", lambda messages: [(0.0, "/odom", messages.odometry(0.0, TWIST))])
+    said = refused(bag, tmp_path / "log", capsys, *TOPICS)
+    assert "/odom (nav_msgs/msg/Odometry, 1 messages, an unknown rate)" in said
+
+
+def test_a_bag_that_was_indexed_again_is_read_under_its_name(drive: Log, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, "rosbag1", of_log(drive, Messages.cloud_of))
+    log = convert(bag.rename(tmp_path / "drive.bag.active"), tmp_path / "log")
+    assert len(log.cycles) == len(drive.cycles)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("more", [(), ("--from-poses",), ("--imu", "/imu")])
+def test_a_bag_that_was_played_in_a_loop_is_refused_until_the_times_of_receipt_are_taken(
+    kind: Kind, more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make(messages: Messages) -> list[Written]:
+        written: list[Written] = []
+        for k in range(60):
+            t, stamp = 0.1 * k, 0.1 * (k % 30)
+            written.append((t, "/odom", messages.odometry(stamp, TWIST, (t, 0.0, 0.0))))
+            written += [(t, "/imu", messages.imu(stamp, 0.1)), one_cone(messages, stamp, written=t)]
+        return written
+
+    bag = write_bag(tmp_path, kind, make)
+    said = refused(bag, tmp_path / "log", capsys, *TOPICS, *more)
+    assert "the stamps fall back by 2.9 s at message 31" in said
+    assert len(convert(bag, tmp_path / "log", "--received", *more).odometry.t) in (59, 60)
 
 
 def test_a_sensor_of_another_frame_is_told_until_its_mounting_is_stated(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,15 @@ import pytest
 
 from pathspace_graph.convert.messages import Points
 from pathspace_graph.convert.recording import (
+    SHARED,
     Recording,
     positive_definite,
     to_log,
     twists_between,
     twists_of,
+    windowed,
 )
-from pathspace_graph.convert.settings import Frames, NoiseSettings
+from pathspace_graph.convert.settings import Frames, NoiseSettings, Window
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import compose, se2_exp
 from pathspace_graph.io.log import ray_covariances
@@ -103,3 +106,88 @@ def test_twists_lead_from_pose_to_pose() -> None:
         poses.append(compose(poses[-1], move))
     np.testing.assert_allclose(twists_between(t, np.array(poses)), twists, atol=1e-9)
     np.testing.assert_allclose(twists_of(se2_exp(twists)), twists, atol=1e-9)
+
+
+# --- clocks ----------------------------------------------------------------------------------------------
+
+
+def driven_at(t: np.ndarray, scan_t: np.ndarray) -> Recording:
+    """A record with these stamps (s), whose k-th message has a speed of k and a cone at k + 2."""
+    speeds = np.outer(np.arange(len(t)), [1.0, 0.0, 0.0])
+    return Recording(t, speeds, scan_t, [one(k + 2.0, 1.0) for k in range(len(scan_t))], {})
+
+
+ONCE = np.arange(0.0, 24.01, 0.5)
+SEEN = np.arange(0.25, 24.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("t", "scan_t", "expected"),
+    [
+        (
+            np.append(ONCE, ONCE),
+            np.append(SEEN, SEEN),
+            "odometry by one clock, found that the stamps fall back by 24 s at message 50, from 24 s to 0 s",
+        ),
+        (
+            np.append(10.0 + ONCE, ONCE[:11]),
+            SEEN,
+            "odometry by one clock, found that the stamps fall back by 34 s at message 50, from 34 s to 0 s",
+        ),
+        (
+            ONCE,
+            np.append(SEEN[:20], SEEN[5:]),
+            "detections by one clock, found that the stamps fall back by 7 s at message 21, from 9.75",
+        ),
+    ],
+)
+def test_a_clock_that_falls_back_is_refused_with_the_message(
+    t: np.ndarray, scan_t: np.ndarray, expected: str
+) -> None:
+    with pytest.raises(InputError, match=re.escape(expected)) as error:
+        windowed(driven_at(t, scan_t), Window(), FILE)
+    assert "--start" in str(error.value) and "--end" in str(error.value) and "--received" in str(error.value)
+
+
+def test_the_way_out_takes_what_is_before_or_after_the_fall() -> None:
+    """Both drives have the same stamps, and the cut is told: it lies in a pause of 1 s, half way."""
+    source = driven_at(np.append(ONCE, ONCE), np.append(SEEN, SEEN))
+    with pytest.raises(InputError, match=r"--end 24\.5 .* --start 24\.5 "):
+        windowed(source, Window(), FILE)
+    first, second = windowed(source, Window(end=24.5), FILE), windowed(source, Window(start=24.5), FILE)
+    for part, begin in ((first, 0), (second, len(ONCE))):
+        np.testing.assert_array_equal(part.t, ONCE)
+        np.testing.assert_array_equal(part.scan_t, SEEN)
+        assert part.twists[0, 0] == begin
+    with pytest.raises(InputError, match="at message 50"):
+        windowed(source, Window(start=3.0), FILE)
+
+
+def test_a_drive_before_a_clock_was_set_later_is_cut_off_by_its_stamps() -> None:
+    late = windowed(driven_at(np.append(100.0 + ONCE, ONCE), 100.0 + SEEN), Window(end=20.0), FILE)
+    np.testing.assert_array_equal(late.t, 100.0 + ONCE[ONCE <= 20.0])
+
+
+@pytest.mark.parametrize(
+    ("t", "disordered"),
+    [
+        (ONCE[[*range(10), 13, 12, 11, 10, *range(14, 49)]], 3),  # by 1.5 s at the most
+        (ONCE[::-1], 48),  # the newest first
+        (np.insert(ONCE, 20, 500.0), 1),  # one stray stamp
+        (np.insert(ONCE, 20, 0.1), 1),
+    ],
+)
+def test_messages_that_are_out_of_order_are_sorted(t: np.ndarray, disordered: int) -> None:
+    source = windowed(driven_at(t, SEEN), Window(), FILE)
+    log = to_log(source, Frames(), NoiseSettings(), FILE)
+    np.testing.assert_array_equal(log.odometry.t, np.sort(t))
+    assert source.notes["odometry samples were out of order, and were sorted"] == disordered
+
+
+def test_detections_at_most_a_millisecond_apart_are_one_cycle() -> None:
+    """Three sensors: the third one is 1.2 ms late, and is a cycle of its own."""
+    source = driven_at(ONCE, np.array([4.2, 4.2012, 4.2002, 4.2]))
+    log = to_log(source, Frames(), NoiseSettings(), FILE)
+    assert [cycle.t for cycle in log.cycles] == [4.2, 4.2012]
+    assert [cycle.points_vehicle[:, 0].tolist() for cycle in log.cycles] == [[2.0, 5.0, 4.0], [3.0]]
+    assert source.notes[SHARED] == 2

@@ -97,6 +97,143 @@ def test_rows_in_any_order_are_cycles_in_order_of_time(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.odometry.t, [0.0, 1.0])
 
 
+# --- as other tools export it ----------------------------------------------------------------------------
+
+BEGIN = 1_714_557_600  # 2024-05-01 10:00:00 UTC, s since 1970
+NANOSECONDS = [0, 500_000_000, 20_000_000, 999_000_000]
+STAMPS = [BEGIN, BEGIN + 0.5, BEGIN + 1.02, BEGIN + 1.999]
+COLUMNS = "sec,nsec,vx,wz\n", "sec,nsec,x,y,label\n"
+
+
+def in_two_columns(fractions: list[int] = NANOSECONDS) -> tuple[str, str]:
+    stamps = [f"{BEGIN + k // 2},{fraction}" for k, fraction in enumerate(fractions)]
+    odometry = "".join(f"{stamp},{k},0.1\n" for k, stamp in enumerate(stamps))
+    detections = "".join(
+        f"{stamp},{4 + k},1.5,left\n{stamp},{4 + k},-1.5,right\n" for k, stamp in enumerate(stamps)
+    )
+    return COLUMNS[0] + odometry, COLUMNS[1] + detections
+
+
+def test_stamps_in_two_columns_are_seconds_and_nanoseconds(tmp_path: Path) -> None:
+    log = convert(write(tmp_path, *in_two_columns()), "--columns", "t=sec+nsec")
+    np.testing.assert_allclose(log.odometry.t, STAMPS, rtol=0.0, atol=3e-7)
+    np.testing.assert_allclose([cycle.t for cycle in log.cycles], STAMPS, rtol=0.0, atol=3e-7)
+    assert [len(cycle.labels) for cycle in log.cycles] == [2, 2, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ("t=sec", "stamps of their own, found the stamp of another one in 45 of 60: are these whole seconds"),
+        ("t=nsec", "found only the fraction of each second: --columns t=SECONDS+NANOSECONDS"),
+        ("t=nsec+sec", "expected nanoseconds from 0 to 999999999 in column 'sec'"),
+        ("t=sec+nanosec", "expected a column 'nanosec' for t"),
+        ("t=sec+usec", "expected nanoseconds in column 'usec', found at most 750000"),
+        ("vx=vx", "expected a column 't' for t (--columns t=NAME, or t=SECONDS+NANOSECONDS)"),
+    ],
+)
+def test_a_wrong_choice_of_the_stamps_is_refused(
+    columns: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Four samples in each of 15 seconds; of whole seconds, all but one of each second would be lost."""
+    times = [f"{BEGIN + k // 4},{250_000_000 * (k % 4)},{250_000 * (k % 4)}" for k in range(60)]
+    odometry = "".join(f"{t},{1 + 0.01 * k},0\n" for k, t in enumerate(times))
+    detections = "".join(f"{t},4,1\n" for t in times)
+    folder = write(tmp_path, f"sec,nsec,usec,vx,wz\n{odometry}", f"sec,nsec,usec,x,y\n{detections}")
+    units = ["--units", "time=ns"] if columns == "t=nsec" else []
+    assert said in refused(folder, capsys, "--columns", columns, *units)
+
+
+def test_an_odometry_that_is_repeated_beside_each_detection_counts_once(tmp_path: Path) -> None:
+    table = "t,vx,wz,x,y\n" + "".join(f"{0.1 * (k // 4)},{k // 4},0,{4 + k},1\n" for k in range(40))
+    log = convert(write(tmp_path, table, table))
+    np.testing.assert_array_equal(log.odometry.twist[:, 0], np.arange(10.0))
+
+
+@pytest.mark.parametrize(
+    "dates",
+    [
+        [
+            "2024-05-01T10:00:00Z",
+            "2024-05-01T10:00:00.5Z",
+            "2024-05-01T10:00:01.020Z",
+            "2024-05-01T10:00:01.999000Z",
+        ],
+        [
+            "2024-05-01 10:00:00",
+            "2024-05-01 10:00:00.500",
+            "2024-05-01 10:00:01.02",
+            "2024-05-01 10:00:01.999000000",
+        ],
+        [
+            "2024-05-01T12:00:00+02:00",
+            "2024-05-01T12:00:00.5+02:00",
+            "2024-05-01T12:00:01.02+0200",
+            "2024-05-01T12:00:01.999+02",
+        ],
+        [
+            "2024-05-01 05:00:00 -05:00",
+            "2024-05-01 05:00:00.5 -0500",
+            "2024-05-01 10:00:01.02 UTC",
+            "2024-05-01t10:00:01,999z",
+        ],
+    ],
+)
+def test_stamps_may_be_dates(dates: list[str], tmp_path: Path) -> None:
+    odometry = "t;vx;wz\n" + "".join(f"{date};1;0\n" for date in dates)
+    detections = "t;x;y\n" + "".join(f"{date};4;1\n" for date in dates)
+    log = convert(write(tmp_path, odometry, detections))
+    np.testing.assert_allclose(log.odometry.t, STAMPS, rtol=0.0, atol=3e-7)
+    np.testing.assert_allclose([cycle.t for cycle in log.cycles], STAMPS, rtol=0.0, atol=3e-7)
+
+
+def test_a_date_that_is_none_is_named_with_its_row(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odometry = "t,vx,wz\n2024-05-01T10:00:00Z,1,0\n2024-13-01T10:00:00Z,1,0\n"
+    said = refused(write(tmp_path, odometry, GOOD_DETECTIONS), capsys)
+    assert "odometry.csv, row 3: expected a date by ISO 8601 in column 't'" in said
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize(
+    ("delimiter", "point"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")]
+)
+def test_the_delimiter_is_found(delimiter: str, point: str, encoding: str, tmp_path: Path) -> None:
+    odometry = "t,vx,wz\n0.0,1.5,-0.25\n0.5,-2.5e-1,1\n"
+    detections = "t,x,y,label,note\n0.25,4.125,-.5,left,a b\n"
+    for name, text in (("odometry", odometry), ("detections", detections)):
+        exported = text.replace(",", delimiter).replace(".", point)
+        (tmp_path / f"{name}.csv").write_bytes(exported.encode(encoding))
+    log = convert(tmp_path)
+    np.testing.assert_array_equal(log.odometry.t, [0.0, 0.5])
+    np.testing.assert_array_equal(log.odometry.twist, [[1.5, 0.0, -0.25], [-0.25, 0.0, 1.0]])
+    np.testing.assert_array_equal(log.cycles[0].points_vehicle, [[4.125, -0.5]])
+
+
+@pytest.mark.parametrize("missing", ["", "nan", "NaN", "inf", "null", "None", "N/A", " "])
+@pytest.mark.parametrize("header", ["t,x,y", "t,range,bearing", "t,y,x"])
+def test_a_missing_detection_is_left_out_and_counted(
+    missing: str, header: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    detections = f"{header}\n0.1,4,1\n0.1,{missing},1\n0.3,4,{missing}\n0.3,5,1\n"
+    log = convert(write(tmp_path, GOOD_ODOMETRY, detections))
+    assert [len(cycle.labels) for cycle in log.cycles] == [1, 1]
+    assert "2 detections that are not finite were left out" in capsys.readouterr().out
+
+
+def test_a_missing_twist_is_left_out_and_a_missing_covariance_assumed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odometry = "t,vx,wz\n0,1,0\n0.2,,0\n0.4,1,nan\n1,2,0\n"
+    detections = "t,x,y,xx,xy,yy\n0.1,4,1,0.1,0,0.1\n0.1,5,1,,,\n"
+    log = convert(write(tmp_path, odometry, detections))
+    np.testing.assert_array_equal(log.odometry.twist[:, 0], [1.0, 2.0])
+    said = capsys.readouterr().out
+    assert "2 odometry samples that are not finite were left out" in said
+    assert "1 detections had no covariance that can be used" in said
+
+
 GOOD_ODOMETRY = "t,vx,wz\n0,1,0\n1,1,0\n"
 GOOD_DETECTIONS = "t,x,y,label\n0.1,4,1,left\n0.3,4,1,left\n"
 
@@ -110,7 +247,11 @@ GOOD_DETECTIONS = "t,x,y,label\n0.1,4,1,left\n0.3,4,1,left\n"
         (GOOD_ODOMETRY, "t,x,z\n0,1,0\n", [], "expected a column 'y' for y"),
         (GOOD_ODOMETRY, "t,z\n0,1\n", [], "detections.csv, row 1: expected a column 'x'"),
         (GOOD_ODOMETRY, "t,x,y\n0,1,a\n", [], "csv, row 2: expected a number in column 'y', found 'a'"),
-        (GOOD_ODOMETRY, "t,x,y\n0,1,\n", [], "row 2: expected a number in column 'y', found ''"),
+        (GOOD_ODOMETRY, "t,x,y\n0,1,\n", [], "can be used, found 1 messages without any; 1 detections that"),
+        ("t,vx,wz\n,1,0\n", GOOD_DETECTIONS, [], "row 2: expected a number in column 't', found ''"),
+        (GOOD_ODOMETRY, "t,bearing\n0.1,1\n", [], "expected a column 'range' beside bearing, or x and y"),
+        (GOOD_ODOMETRY, "t,b\n0.1,1\n", ["--columns", "bearing=b"], "expected a column 'range' beside"),
+        (GOOD_ODOMETRY, "t,range\n0.1,1\n", [], "expected a column 'bearing' beside range, or x and y"),
         (GOOD_ODOMETRY, "t,x,y,xx\n0,1,1,1\n", [], "expected a column 'xy'"),
         (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "speed=v"], "expected one of t, vx, vy, wz, x"),
         (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "vx"], "--columns: expected QUANTITY=COLUMN"),
@@ -189,3 +330,21 @@ def test_a_bad_line_is_named(line: str, tmp_path: Path, capsys: pytest.CaptureFi
     told = capsys.readouterr().err
     assert "drive.jsonl" in told and "6" in told and told.count("\n") == 1
     assert not (tmp_path / "log").exists()
+
+
+def test_a_line_with_one_cycle_has_no_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "drive.jsonl"
+    file.write_text('{"t": 1, "twist": [1, 0, 0], "detections": [{"x": 4, "y": 1}]}\n')
+    assert main(["convert", str(file), "--from", "jsonl", "--out", str(tmp_path / "log")]) == 0
+    said = capsys.readouterr().out
+    assert "odometry at an unknown rate, up to 1 m/s" in said
+    assert "Hz" not in said
+
+
+def test_a_line_with_a_bearing_alone_names_the_range(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "drive.jsonl"
+    file.write_text('{"t": 1, "twist": [1, 0, 0], "detections": [{"bearing": 0.1}]}\n')
+    assert main(["convert", str(file), "--from", "jsonl", "--out", str(tmp_path / "log")]) == 2
+    assert "(KeyError: 'range')" in capsys.readouterr().err

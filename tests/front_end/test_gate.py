@@ -17,7 +17,8 @@ from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.front_end import gate
 from pathspace_graph.front_end.gate import Admitted, Gate, Newest, read_usable_log
-from pathspace_graph.io.log import Detections, Odometry, write_log
+from pathspace_graph.io.log import Detections, Log, Odometry, write_log
+from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.online import LimitSettings
 
 from ..scenes.drives import ahead, corridor, exact_log
@@ -27,6 +28,9 @@ LIMITS = LimitSettings()
 NEWEST = Newest(1.0, np.array([4.0, 0.1, 0.2]))
 STAMPS = np.array([1.0, 1.02, 1.06])
 TWISTS = np.array([[5.0, 0.0, 0.1], [6.0, 0.0, 0.2], [7.0, 0.0, 0.3]])
+
+
+NONE = Odometry(np.zeros(0), np.zeros((0, 3)))
 
 
 def odometry(stamps: Any = STAMPS, twists: Any = TWISTS) -> Odometry:
@@ -374,7 +378,6 @@ def test_refused_cycles_are_counted_until_one_is_used() -> None:
 # --- late cycles -----------------------------------------------------------------------------------------
 
 WINDOW = (0.5, 0.7, 1.0)
-NONE = Odometry(np.zeros(0), np.zeros((0, 3)))
 
 
 def test_a_late_cycle_inside_the_window_is_used_without_its_twists() -> None:
@@ -421,3 +424,43 @@ def test_a_log_that_cannot_be_used_is_named_with_the_row_and_the_stamp(tmp_path:
     write_log(replace(log, cycles=late, odometry=Odometry(stamps, log.odometry.twist)), tmp_path / "gap")
     with pytest.raises(InputError, match=r"odometry\.csv, row 50: .* at most 30 s after"):
         read_usable_log(tmp_path / "gap", LIMITS)
+
+
+def from_two_cameras(log: Log, seconds: float, resolution: float = 0.0) -> Log:
+    """The same drive since 1970, whose right cones are seen so much later than the left ones."""
+    cycles = []
+    for cycle in log.cycles[:-1]:
+        for late, label in ((0.0, LEFT), (seconds, RIGHT)):
+            t = EPOCH + cycle.t + late
+            stamp = round(t / resolution) * resolution if resolution else t
+            cycles.append(replace(cycle.where(cycle.labels == label), t=stamp))
+    return replace(log, odometry=replace(log.odometry, t=EPOCH + log.odometry.t), cycles=tuple(cycles))
+
+
+EPOCH = 1_700_000_000.0
+
+
+@pytest.mark.parametrize(
+    ("seconds", "resolution", "of_each"),
+    [
+        *((0.0, 0.0, 1), (2e-4, 0.0, 1), (5e-4, 0.0, 1), (5e-4, 1e-3, 1), (1e-3, 0.0, 1), (1e-3, 1e-3, 1)),
+        *((1.1e-3, 0.0, 2), (2e-3, 1e-3, 2), (3e-3, 0.0, 2)),
+    ],
+)
+def test_messages_of_two_cameras_are_one_cycle_or_each_is_used_at_its_time(
+    seconds: float, resolution: float, of_each: int, tmp_path: Path
+) -> None:
+    log = exact_log(ahead(8.0, 2.0), *corridor(40.0))
+    write_log(from_two_cameras(log, seconds, resolution), tmp_path / "log")
+    read = read_usable_log(tmp_path / "log", LIMITS)
+    assert len(read.cycles) == of_each * (len(log.cycles) - 1)
+    if of_each == 1:
+        for cycle, exact in zip(read.cycles, log.cycles[:-1], strict=True):
+            assert abs(cycle.t - EPOCH - exact.t) < 6e-4
+            assert sorted(cycle.points_vehicle.tolist()) == sorted(exact.points_vehicle.tolist())
+
+
+def test_a_detector_with_stamps_in_milliseconds_may_give_a_cycle_in_each() -> None:
+    """4.201 - 4.2 is less than 0.001 in doubles."""
+    assert 4.201 - 4.2 < 1e-3
+    assert Gate(LIMITS).admit(NONE, detections(4.201), Newest(4.2)).refused == 0

@@ -11,7 +11,7 @@ import pytest
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.files import atomic_folder, write_manifest
-from pathspace_graph.io.manifest import MANIFEST_FILE, read_manifest, verified, verify, verify_all
+from pathspace_graph.io.manifest import MANIFEST_FILE, read_manifest, verify_all
 
 
 @pytest.fixture
@@ -47,30 +47,18 @@ def test_what_has_changed_or_is_missing_is_named(folder: Path, name: str) -> Non
     assert missing.value.file in (file, folder / "map")
 
 
-def test_only_what_is_read_is_verified(folder: Path) -> None:
-    (folder / "figures" / "a.png").write_bytes(b"b")
-    verify(folder, ["marker", "unlisted"])
-    with pytest.raises(InputError, match="as it was written") as changed:
-        verify(folder, ["marker", "figures/a.png"])
-    assert changed.value.file == folder / "figures" / "a.png"
-    (folder / "marker").unlink()
-    verify(folder, ["marker"])
-
-
 def test_what_a_user_adds_is_left_alone(folder: Path) -> None:
     (folder / "notes.txt").write_text("mine")
     (folder / ".hidden").write_text("mine")
-    verify(folder, ["notes.txt", ".hidden"])
     assert verify_all(folder) == 4
     (folder / "marker").write_text("mine")
     with pytest.raises(InputError, match="as it was written"):
         verify_all(folder)
 
 
-def test_a_folder_without_a_manifest_is_read_as_before(folder: Path) -> None:
+def test_a_folder_without_a_manifest_cannot_be_verified(folder: Path) -> None:
     (folder / MANIFEST_FILE).unlink()
     (folder / "marker").write_text("2")
-    verify(folder, ["marker"])
     with pytest.raises(InputError, match=r"manifest\.json.*found none"):
         verify_all(folder)
 
@@ -80,7 +68,6 @@ def test_the_manifest_of_another_program_is_left_alone(folder: Path) -> None:
     (folder / MANIFEST_FILE).write_text(other)
     (folder / "marker").write_text("2")
     assert read_manifest(folder) is None
-    verify(folder, ["marker"])
     assert (folder / MANIFEST_FILE).read_text() == other
 
 
@@ -91,23 +78,6 @@ def test_a_manifest_that_was_written_anew_holds_for_what_is_there_now(folder: Pa
     (folder / "marker").write_text("1")  # as it was at first
     with pytest.raises(InputError, match="as it was written"):
         verify_all(folder)
-
-
-def test_an_error_of_the_content_keeps_its_row_and_says_that_the_file_has_changed(folder: Path) -> None:
-    wrong = InputError(folder / "marker", "expected a number", 3)
-    with pytest.raises(InputError, match=r"row 3: expected a number$"), verified(folder, "marker"):
-        raise wrong
-    (folder / "marker").write_text("2")
-    with pytest.raises(InputError, match=r"row 3: expected a number; .* not as it was written"):  # noqa: SIM117
-        with verified(folder, "marker"):
-            raise wrong
-
-
-def test_the_cause_is_named_where_another_file_has_changed(folder: Path) -> None:
-    (folder / "marker").write_text("2")
-    with pytest.raises(InputError) as caught, verified(folder, "marker", "other"):
-        raise InputError(folder / "other", "expected something that fits the marker")
-    assert caught.value.file == folder / "marker"
 
 
 def test_the_command_says_how_many_files_are_good_and_which_is_not(

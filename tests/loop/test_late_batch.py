@@ -262,6 +262,16 @@ def test_a_process_that_was_given_up_does_not_block_the_next_batch() -> None:
     assert drive_record._submit(sum, [1, 2]).result(120.0) == 3
 
 
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="Windows")
+def test_an_interrupt_does_not_reach_the_process_of_the_batch_and_reaches_this_one() -> None:
+    """Ctrl-C goes to all processes of a terminal; one that is still importing would print where it was."""
+    if drive_record._worker.cache_info().currsize:
+        drive_record._end_worker()
+    blocked = drive_record._submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(120.0)
+    assert signal.SIGINT in blocked
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
 @pytest.mark.parametrize("error", [ValueError("a\nb"), np.linalg.LinAlgError("c"), KeyError(3)])
 def test_what_fails_in_the_process_is_a_notice(error: Exception, sent: list[Slow], stem: Stem) -> None:
     mapper, notices = stem.mapper(), []

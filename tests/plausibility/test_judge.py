@@ -199,3 +199,27 @@ def test_files_of_different_clocks_are_told() -> None:
 def test_every_kind_of_good_log_has_settings_of_its_own() -> None:
     kinds = [(kind.overrides, kind.road, kind.edit) for kind in GOOD.values()]
     assert all(kinds.count(kind) == 1 for kind in kinds)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "said"),
+    [
+        (0.0, 8.0, ["the last detection is {end} s before the last odometry"]),
+        (12.0, 99.0, ["the first detection is 12 s after the first odometry"]),
+        (0.0, 99.0, []),
+    ],
+)
+def test_detections_that_do_not_last_for_the_drive_are_told(
+    first: float, last: float, said: list[str]
+) -> None:
+    """The lap takes half a minute; a vehicle that stands meanwhile needs no detections."""
+    log = short_drive()
+    end = float(log.odometry.t[-1])
+    cycles = tuple(cycle for cycle in log.cycles if first <= cycle.t <= last)
+    short = replace(log, cycles=cycles)
+    assert [hint.found for hint in hints(short)] == [
+        one.format(end=f"{end - cycles[-1].t:.3g}") for one in said
+    ]
+    drives = (log.odometry.t >= first) & (log.odometry.t <= last)
+    parked = replace(log.odometry, twist=log.odometry.twist * drives[:, None])
+    assert [hint for hint in hints(replace(short, odometry=parked)) if hint.cause == "gaps"] == []

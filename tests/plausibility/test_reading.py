@@ -12,7 +12,7 @@ import pytest
 from pathspace_graph import hints
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.log import Log, write_log
+from pathspace_graph.io.log import Log, Odometry, write_log
 from pathspace_graph.plausibility.judge import read_plausible_log, refused_hints
 from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.mistakes import MISTAKES
@@ -67,6 +67,18 @@ def test_a_refusal_without_a_likely_cause_is_as_it_was(tmp_path: Path) -> None:
     assert refused_hints(folder) == []
 
 
+def test_a_refusal_of_a_stamp_does_not_blame_the_labels(tmp_path: Path) -> None:
+    """All cones are left here, which would be told were the log not refused for a gap of a minute."""
+    log = MISTAKES["all labels left"](short_drive())
+    assert [hint.cause for hint in hints(log)] == ["labels"]
+    cycles = tuple(replace(cycle, t=cycle.t + 60.0 * (cycle.t > 5.0)) for cycle in log.cycles)
+    t = log.odometry.t + 60.0 * (log.odometry.t > 5.0)
+    folder = written(replace(log, cycles=cycles, odometry=replace(log.odometry, t=t)), tmp_path / "log")
+    with pytest.raises(InputError, match="at most 30 s after") as error:
+        read_plausible_log(folder, LimitSettings())
+    assert "label" not in str(error.value)
+
+
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
 def test_a_log_in_memory_with_what_no_file_may_have_is_judged_as_its_files_are(
     wrong: float, tmp_path: Path
@@ -88,7 +100,9 @@ def test_a_hint_is_told_and_the_log_is_mapped(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = MISTAKES["positions in centimetres"](short_drive())
-    short = Log(log.odometry, log.cycles[:60], log.odometry_sigma)
+    t, twist = log.odometry.t, log.odometry.twist
+    shown = t <= log.cycles[60].t
+    short = Log(Odometry(t[shown], twist[shown]), log.cycles[:60], log.odometry_sigma)
     folder, out = written(short, tmp_path / "log"), tmp_path / "map"
     assert main([command, str(folder), "--out", str(out)]) in (0, 3)
     lines = capsys.readouterr().err.splitlines()

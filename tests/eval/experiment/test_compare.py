@@ -58,7 +58,7 @@ def logs(folder: Path) -> list[NamedLog]:
 def test_estimators_are_those_named_or_all_that_are_known() -> None:
     assert choose(()) == ("rings", "gaps", "broken", "rings-batch")
     assert choose(("gaps", "rings", "gaps")) == ("gaps", "rings")
-    with pytest.raises(SettingsError, match="a known estimator, found 'nothing', the nearest is 'rings'"):
+    with pytest.raises(SettingsError, match="a known estimator, found 'nothing'$"):
         choose(("nothing",))
     assert choose_reference(None, ("gaps", "rings")) == "gaps"
     assert choose_reference(None, ("gaps", registry.DEFAULT)) == registry.DEFAULT
