@@ -6,7 +6,7 @@ nothing is seen of the motion, as between walls, both fit alike, and the odometr
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -24,7 +24,7 @@ CHANCE: Final = 4.5  # gain from which points of a line do not fit by chance, si
 NOWHERE: Final = np.full((1, 2), 1e6)  # a point that is near none, so that no cycle is empty
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _Cycle:
     t: float
     points: Array  # (n, 2) corrected detections, vehicle frame, and `NOWHERE`
@@ -55,7 +55,7 @@ class Standstill:
 
     def believe(self, pose: Array) -> None:
         """Note the pose (3,) of the newest cycle that is believed."""
-        self._cycles[0].pose = pose
+        self._cycles[0] = replace(self._cycles[0], pose=pose)
 
     def place(self, limit: float) -> Array | None:
         """Return the pose (3,) at which the vehicle stands, or None where it may be moving.
@@ -78,7 +78,7 @@ class Standstill:
         first = 1 + int(likelier.argmax())
         pose = self._cycles[first].pose
         for k in range(first):
-            self._cycles[k].pose = pose
+            self._cycles[k] = replace(self._cycles[k], pose=pose)
         return pose
 
     def _gains(self, points: Array, covariances: Array, by_odometry: Array) -> Array:
