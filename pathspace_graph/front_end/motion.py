@@ -16,6 +16,7 @@ from pathspace_graph.settings.online import MotionSettings
 from . import scan_matching as scans
 from .gate import Newest
 from .scan_matching import REACHES_CHECK, Difference, Match, RecentDetections, SensorErrors, by_errors
+from .standstill import Standstill
 
 NO_CALIBRATION: Final = np.zeros((3, 2))  # derivative of a motion that is not by odometry
 DOUBT_AGAIN: Final = 3.8  # contradiction of an odometry that was contradicted not long ago, sigmas
@@ -38,6 +39,7 @@ REST: Final = 1.0  # time of standing from which the mean yaw rate measures the 
 REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest, m/s, m/s, rad/s, but for noise
 REST_SIGMAS: Final = 3.0  # standard deviations of the mean that count as its noise
 SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # m, m, rad, of a motion at rest from cycle to cycle
+SIGMAS_STANDS: Final = (0.02, 0.02, 0.002)  # of one that the detections alone tell
 Seen = tuple[Array, Array]  # corrected detections (m, 2), vehicle frame, and variances (m,) of a coordinate
 
 
@@ -62,12 +64,14 @@ class MotionCheck:
         self._matched: BoolArray | None = None  # by the check of the newest cycle, where it agrees
         self._doubted_at = -np.inf  # the odometry was contradicted last at this stamp (s)
         self._rest = Rest(sigma)
+        self._standstill = Standstill()
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
 
     def set_noise(self, sigma: Array) -> None:
         """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten."""
         self.sigma = self._rest.sigma = sigma
         self._recent, self.errors = RecentDetections(), SensorErrors(self.settings)
+        self._standstill = Standstill()
 
     def update(
         self, odometry: Odometry, detections: Detections, may_doubt: bool | None = True
@@ -85,7 +89,9 @@ class MotionCheck:
         self._recent.correct(self.errors.mean)
         self._limit = DOUBT_AGAIN if t - self._doubted_at < DISTRUST else self.settings.doubt
         self._matched = None
-        motion = self._checked(motion, t, seen, may_doubt)
+        self._standstill.add(t, points, self._excess * covariances, motion.odometry.delta)
+        standing = self._standing(motion) if may_doubt else None
+        motion = standing or self._checked(motion, t, seen, may_doubt)
         if motion.doubted:
             self._doubted_at = t
         if not motion.fault and self._rest.update(odometry, t):
@@ -98,6 +104,7 @@ class MotionCheck:
         if motion.fault:
             columns = by_errors(measured, motion.odometry.twist)  # by the twist that is believed
         self._recent.add(t, measured, columns, self.pose)
+        self._standstill.believe(self.pose)
         if self._t is not None and t > self._t:
             self._velocity = motion.odometry.delta / (t - self._t)
             self.errors.follow(self._velocity, t - self._t)
@@ -137,6 +144,16 @@ class MotionCheck:
             self._rest.end()
             return motion
         return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(t))
+
+    def _standing(self, motion: MeasuredMotion) -> MeasuredMotion | None:
+        """Return the motion back to where the vehicle stands, if the cones clearly say that it does."""
+        place = self._standstill.place(self.settings.doubt)
+        if place is None:
+            return None
+        back = relative(self.pose, place)
+        covariance = np.diag(SIGMAS_STANDS) ** 2 + np.outer(back, back) * BEFORE**2
+        standing = integrated_odometry(back, covariance, NO_CALIBRATION)
+        return MeasuredMotion(standing, np.zeros((1, 3)), not motion.missing, motion.missing, motion.stuck)
 
     def _checked(
         self, motion: MeasuredMotion, t: float, seen: Seen, may_doubt: bool | None

@@ -1,0 +1,180 @@
+"""Rest by cones: false travel of a standing vehicle is not believed, and no motion is taken for a rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.front_end.motion import MotionCheck
+from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.labels import LEFT
+from pathspace_graph.mapping.motion import MeasuredMotion
+from pathspace_graph.settings.online import MotionSettings
+
+Array = NDArray[np.float64]
+PERIOD = 0.1
+"""Time between two cycles, s."""
+TWIST_SIGMA = np.array([0.05, 0.03, 0.01])
+SEEDS = range(4)
+
+
+def ray_noise(ranges: Array) -> tuple[Array, Array]:
+    """Standard deviations (m,) along and across the ray, m: those of a camera, which grow with the range."""
+    return 0.03 + 0.03 * ranges, 0.02 + 0.008 * ranges
+
+
+def see(t: float, points: Array, rng: np.random.Generator) -> Detections:
+    """Detections of points (m, 2), vehicle frame, with their noise stated."""
+    ranges = np.hypot(*points.T)
+    ray = points / ranges[:, None]
+    left = np.column_stack([-ray[:, 1], ray[:, 0]])
+    along, across = ray_noise(ranges)
+    noise = rng.standard_normal((2, len(points)))
+    measured = points + (along * noise[0])[:, None] * ray + (across * noise[1])[:, None] * left
+    covariances = np.einsum("m,mi,mj->mij", along**2, ray, ray) + np.einsum(
+        "m,mi,mj->mij", across**2, left, left
+    )
+    return Detections(t, measured, covariances, np.full(len(points), LEFT))
+
+
+def rows(rng: np.random.Generator, spacing: float = 4.0) -> Array:
+    """Cones (n, 2) of both rows of a straight road along x, beside their regular places."""
+    x = np.arange(-4.0, 60.0, spacing)
+    cones = np.concatenate([np.column_stack([x, np.full(len(x), side)]) for side in (-1.8, 1.8)])
+    return cones + rng.uniform(-0.5, 0.5, cones.shape)
+
+
+def motions(
+    true: Array,
+    told: Array,
+    seed: int,
+    cones: Array | None = None,
+    nearest: float = 1.0,
+    farthest: float = 15.0,
+    check: MotionCheck | None = None,
+) -> list[MeasuredMotion]:
+    """Motions of a drive along x by true and told speeds (k,), one a cycle; a tenth of the cones is lost."""
+    rng = np.random.default_rng(seed)
+    cones = rows(rng) if cones is None else cones
+    check = check or MotionCheck(TWIST_SIGMA, MotionSettings())
+    found, place = [], 0.0
+    for k, (speed, reading) in enumerate(zip(true, told, strict=True)):
+        t = PERIOD * (k + 1)
+        place += PERIOD * speed
+        points = cones - [place, 0.0]
+        ranges = np.hypot(*points.T)
+        seen = (
+            (points[:, 0] > 0.0) & (ranges > nearest) & (ranges < farthest) & (rng.random(len(points)) < 0.9)
+        )
+        stamps = t - PERIOD + 0.02 * np.arange(5)
+        twists = np.array([reading, 0.0, 0.0]) + TWIST_SIGMA * rng.standard_normal((5, 3))
+        found.append(check.update(Odometry(stamps, twists), see(t, points[seen], rng)))
+    return found
+
+
+def is_rest(motion: MeasuredMotion) -> bool:
+    return motion.doubted and motion.rests
+
+
+def travelled(found: list[MeasuredMotion]) -> float:
+    return float(sum(motion.odometry.delta[0] for motion in found))
+
+
+BRAKES = np.concatenate([np.full(20, 3.0), np.linspace(2.7, 0.3, 9)])
+"""Speeds of a vehicle that drives for 2 s and brakes, m/s."""
+
+
+@pytest.mark.parametrize("creep", [0.4, 0.8, 1.3])
+def test_false_travel_of_three_seconds_is_hardly_believed(creep: float) -> None:
+    stands = np.zeros(30)
+    for seed in SEEDS:
+        true = np.concatenate([BRAKES, stands])
+        found = motions(true, np.concatenate([BRAKES, stands + creep]), seed)
+        off = travelled(found) - PERIOD * true.sum()
+        assert abs(off) < 0.3, f"seed {seed}: {off:.2f} m"
+        last = found[-10:]
+        assert sum(is_rest(motion) for motion in last) >= 8
+        assert all(
+            motion.fault == "the detections contradict the odometry" for motion in last if is_rest(motion)
+        )
+        assert last[-1].odometry.covariance[0, 0] < 0.05**2
+
+
+def test_a_rest_that_the_odometry_measures_is_no_fault() -> None:
+    for seed in SEEDS:
+        true = np.concatenate([BRAKES, np.zeros(30)])
+        assert not any(motion.fault for motion in motions(true, true, seed))
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0])
+@pytest.mark.parametrize(("nearest", "farthest"), [(1.0, 15.0), (10.0, 15.0), (1.0, 6.0)])
+def test_slow_driving_is_no_rest(speed: float, nearest: float, farthest: float) -> None:
+    """Also where only far cones are seen, or few: two or three of them within 6 m."""
+    for seed in SEEDS:
+        true = np.full(40, speed)
+        found = motions(true, true, seed, nearest=nearest, farthest=farthest)
+        assert not any(is_rest(motion) for motion in found)
+        assert travelled(found) == pytest.approx(PERIOD * true.sum(), abs=0.3)
+
+
+@pytest.mark.parametrize("slip", [1.5, 2.5])
+def test_wheels_that_slip_are_no_rest(slip: float) -> None:
+    for seed in SEEDS:
+        true = np.full(40, 1.0)
+        assert not any(is_rest(motion) for motion in motions(true, slip * true, seed))
+
+
+def test_a_vehicle_that_leaves_during_false_travel_is_believed_at_once() -> None:
+    for seed in SEEDS:
+        true = np.concatenate([BRAKES, np.zeros(15), np.full(10, 2.0)])
+        found = motions(true, np.concatenate([BRAKES, np.full(15, 0.8), np.full(10, 2.0)]), seed)
+        assert is_rest(found[-11])
+        assert not any(is_rest(motion) for motion in found[-8:])
+        assert travelled(found[-10:]) == pytest.approx(2.0, abs=0.5)
+
+
+def test_cones_on_the_next_ones_of_their_row_are_no_rest() -> None:
+    """Each cycle moves a vehicle by the spacing of the cones; its odometry is 4 % too fast."""
+    cones = rows(np.random.default_rng(0), spacing=0.8)
+    cones[:, 0] = np.round(cones[:, 0] / 0.8) * 0.8
+    true = np.full(30, 8.0)
+    assert not any(is_rest(motion) for motion in motions(true, 1.04 * true, 0, cones))
+
+
+def test_between_walls_there_is_no_decision() -> None:
+    """Points of two straight walls, at other places in each cycle, show nothing of a motion along them."""
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        check = MotionCheck(TWIST_SIGMA, MotionSettings())
+        found = []
+        for k in range(40):
+            t = PERIOD * (k + 1)
+            points = np.column_stack([rng.uniform(1.0, 12.0, 60), rng.choice([-1.8, 1.8], 60)])
+            twists = np.array([1.3, 0.0, 0.0]) + TWIST_SIGMA * rng.standard_normal((5, 3))
+            found.append(
+                check.update(Odometry(t - PERIOD + 0.02 * np.arange(5), twists), see(t, points, rng))
+            )
+        assert not any(is_rest(motion) for motion in found)
+
+
+def test_two_cones_decide_nothing() -> None:
+    true, cones = np.zeros(30), np.array([[5.0, 1.8], [8.0, -1.8]])
+    for seed in SEEDS:
+        assert not any(is_rest(motion) for motion in motions(true, true + 0.4, seed, cones))
+
+
+def test_detections_before_other_noise_are_not_compared() -> None:
+    """With the noise, the corrections of the detections change, here by a scale of 10 %."""
+    for seed in SEEDS:
+        check = MotionCheck(TWIST_SIGMA, MotionSettings())
+        cones, true = rows(np.random.default_rng(seed)), np.full(20, 0.5)
+        motions(true, true, seed, cones, check=check)
+        check.set_noise(TWIST_SIGMA)
+        later = motions(true, true, seed + 100, 1.1 * cones, check=check)
+        assert not any(is_rest(motion) for motion in later)
+
+
+def test_an_odometry_that_is_always_believed_is_believed_here() -> None:
+    true, check = np.zeros(20), MotionCheck(TWIST_SIGMA, MotionSettings(doubt=np.inf))
+    assert not any(motion.fault for motion in motions(true, true + 1.3, 0, check=check))
