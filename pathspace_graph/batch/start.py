@@ -276,7 +276,8 @@ def find_revisits(chain: LogOdometry, table: DetectionColumns, settings: MapperS
     def seen_in(cycles: IntArray) -> DetectionColumns:
         return table.where(np.flatnonzero(table.in_cycles(cycles)))
 
-    closing, poses = settings.closing, chain.dead_reckoned(chain.calibration_mean)
+    closing, reckoned = settings.closing, aligned_odometry(chain, ())
+    poses = reckoned.poses
     driven, revisits, due, lap = path_lengths(poses), list[Revisit](), closing.min_path, np.inf
     for newest in range(len(poses)):
         is_last = newest == len(poses) - 1 and driven[newest] > closing.min_path
@@ -288,7 +289,7 @@ def find_revisits(chain: LogOdometry, table: DetectionColumns, settings: MapperS
             revisit = _return_again(seen_in, so_far, lap, settings)
         else:
             due = driven[newest] + closing.check_interval
-            revisit = return_to_beginning(seen_in, so_far, settings)
+            revisit = return_to_beginning(seen_in, so_far, reckoned.covariances[newest], settings)
         if revisit is None:
             continue
         if not revisits:

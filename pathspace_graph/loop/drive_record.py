@@ -143,9 +143,9 @@ class DriveRecord:
 
         return seen_in
 
-    def return_to_beginning(self, calibration: Array, sensor: Array) -> Recurrence | None:
+    def return_to_beginning(self, covariance: Array, calibration: Array, sensor: Array) -> Recurrence | None:
         """Return the lap that has been driven, if the newest cones lie on those of the drive's beginning."""
-        revisit = return_to_beginning(self.seen_in(sensor), unwrap(self.poses), self.settings)
+        revisit = return_to_beginning(self.seen_in(sensor), unwrap(self.poses), covariance, self.settings)
         return None if revisit is None else self.recurrence_by(revisit, calibration)
 
     def recurrence_by(self, revisit: Revisit, calibration: Array) -> Recurrence:

@@ -308,7 +308,10 @@ class TrackLoop:
         self._return_tried = length + self.settings.closing.check_interval
         self._return_cycle = smoother.next_cycle + RETURN_CYCLES
         variables = smoother.variables
-        found = self.record.return_to_beginning(variables.calibration, variables.sensor)
+        if not near_start(self._path, variables.poses[-1], self.settings.closing):
+            return
+        covariance = smoother.newest_covariance()
+        found = self.record.return_to_beginning(covariance, variables.calibration, variables.sensor)
         if found is not None:
             self._close_by_batch(found)
 

@@ -48,14 +48,13 @@ NEWEST: Final = (10.0, 40.0)  # least and most of the newest path whose cones ar
 BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
 MIN_CONES: Final = 6  # least number of cones that tell a place
 MIN_SHARE: Final = 0.8  # least share of the cones that lie on earlier ones, by their information
-MISFIT: Final = 2.5  # most mean capped square of the cones: that of cones that agree is 2 at most
+MISFIT: Final = 2.0  # most mean capped square of the cones: that of cones that agree, in two dimensions
 ODDS: Final = 20.0  # least difference of cost to the next place: twice the logarithm of the odds
 ODDS_NEARBY: Final = 6.0  # the same where the place is known to a metre
 SIGHTINGS: Final = 3  # least number of detections of a cone
 BEGINNING: Final = 40.0  # length of the beginning of a drive that closes a lap (m)
 NEWEST_LAP: Final = 60.0  # length of the newest path that crosses the start, if a lap is closed (m)
 TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
-SIGMA_TURN: Final = 0.1  # its standard deviation (rad)
 SAME_ROAD: Final = 2.5  # largest distance of both passes across their road, by the cones (m)
 SAME_HEADING: Final = 0.5  # largest angle between both passes, by the cones (rad)
 LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES))
@@ -251,25 +250,28 @@ class Expected:
         return cls(radius, turn, np.diag(np.array(sigmas) ** -2.0))
 
     @classmethod
-    def after(cls, length: float, closing: ClosingSettings) -> Self:
-        """Expect a pose that has drifted for some length (m)."""
-        radius = closing.radius + closing.drift * length
-        return cls.within(radius, TURNED, (0.5 * radius, 0.5 * radius, SIGMA_TURN))
+    def after(cls, length: float, covariance: Array, closing: ClosingSettings) -> Self:
+        """Expect a pose with a covariance (3, 3) that has drifted for some length (m)."""
+        information = np.asarray(np.linalg.inv(closing.prior_scale**2 * covariance), np.float64)
+        return cls(closing.radius + closing.drift * length, TURNED, information)
 
 
 NEARBY: Final = Expected.within(4.0, 0.15, (1.0, 1.0, 0.05))
 """Where laps have been aligned already, or an open road has another one beside it."""
 
 
-def return_to_beginning(seen_in: SeenIn, poses: Array, settings: MapperSettings) -> Revisit | None:
+def return_to_beginning(
+    seen_in: SeenIn, poses: Array, covariance: Array, settings: MapperSettings
+) -> Revisit | None:
     """Return the newest pose in the frame of one at the beginning of the drive, if the cones are sure of it.
 
-    The poses (P, 3) are those of all cycles. The newest path has to cross the line at which the drive began:
-    in each round of a skidpad the vehicle is on its beginning again, but has not closed a lap.
+    The poses (P, 3) are those of all cycles, and the newest has a covariance (3, 3). The newest path has to
+    cross the line at which the drive began: in each round of a skidpad the vehicle is on its beginning again,
+    but has not closed a lap.
     """
     stations, closing = path_lengths(poses), settings.closing
     length = float(stations[-1])
-    last, expected = min(length - closing.min_path, BEGINNING), Expected.after(length, closing)
+    last, expected = min(length - closing.min_path, BEGINNING), Expected.after(length, covariance, closing)
     found = find_return(seen_in, poses, last, expected, settings.growth)
     if found is None or not found[0].is_sure:
         return None

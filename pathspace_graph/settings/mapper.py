@@ -153,7 +153,7 @@ class ClosureSettings(Positive, group="batch.closure"):
     min_correlation: float = 0.9
     """Least correlation of the curvature with itself a lap later: 0.92 and more in true laps, 0.89 at most
     in two loops side by side."""
-    used: float = 0.75
+    used: float = 2.0 / 3.0
     """Least share of the first lap's coloured detections on the curves of a closed result."""
 
 

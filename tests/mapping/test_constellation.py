@@ -262,6 +262,7 @@ def drifted(poses: Array) -> Array:
     return poses + np.linspace(0.0, 1.0, len(poses))[:, None] * DRIFT
 
 
+UNCERTAIN = np.diag([4.0, 4.0, 0.01])  # covariance of the newest pose
 ROUND = 2.0 * np.pi * 12.0
 LAP, ON_ROUND, ENTRY = (ROUND, 1.0 / 12.0), (ROUND, -1.0 / 12.0), (20.0, 0.0)
 
@@ -269,7 +270,7 @@ LAP, ON_ROUND, ENTRY = (ROUND, 1.0 / 12.0), (ROUND, -1.0 / 12.0), (20.0, 0.0)
 def test_a_lap_ends_where_the_cones_of_its_beginning_are() -> None:
     true = along(LAP, (20.0, 1.0 / 12.0))
     poses = drifted(true)
-    revisit = return_to_beginning(sensor(true), poses, SETTINGS)
+    revisit = return_to_beginning(sensor(true), poses, UNCERTAIN, SETTINGS)
     assert revisit is not None
     assert revisit.later == len(poses) - 1
     np.testing.assert_allclose(revisit.local, relative(true[revisit.earlier], true[-1]), atol=0.25)
@@ -282,12 +283,12 @@ def test_a_round_of_a_skidpad_is_no_lap() -> None:
     poses, seen_in = drifted(true), sensor(true)
     found = find_return(seen_in, poses, 40.0, NEARBY, GROWTH)
     assert found is not None and found[0].is_sure
-    assert return_to_beginning(seen_in, poses, SETTINGS) is None
+    assert return_to_beginning(seen_in, poses, UNCERTAIN, SETTINGS) is None
 
 
 def test_an_open_road_meets_no_cones_again() -> None:
     true = along((150.0, 0.01))
-    assert return_to_beginning(sensor(true), true, SETTINGS) is None
+    assert return_to_beginning(sensor(true), true, UNCERTAIN, SETTINGS) is None
 
 
 @pytest.mark.parametrize(("lane", "is_same"), [(0.0, True), (2.0, True), (4.0, False)])
