@@ -35,10 +35,10 @@ CAUSES: Final = {  # by the name of the calibration
     "scale": Cause("speeds are {:.1f} % too {}", 100.0, ("high", "low")),
     "bias": Cause("the yaw rate is {:.4f} rad/s too {}", 1.0, ("high", "low")),
     "yaw": Cause("the sensor is turned by {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
-    "lateral": Cause("the sensor sits {:.2g} m too far to the {}", 1.0, ("left", "right")),
+    "lateral": Cause("the sensor sits {:.2f} m too far to the {}", 1.0, ("left", "right")),
     "latency": Cause("detections are {:.0f} ms {} than their stamps", 1e3, ("older", "newer")),
     "range_scale": Cause("ranges are {:.1f} % too {}", 100.0, ("long", "short")),
-    "range_bias": Cause("ranges are {:.2g} m too {}", 1.0, ("long", "short")),
+    "range_bias": Cause("ranges are {:.2f} m too {}", 1.0, ("long", "short")),
 }
 
 
@@ -78,7 +78,7 @@ LENGTHS: Final = ("lateral", "range_bias")  # errors of the sensor in m
 TOLD: Final = {
     "latency": ("stamps {:.0f} ms {}", ("late", "early")),
     "yaw": ("turned {:.1f} degrees to the {}", ("left", "right")),
-    "lateral": ("{:.2g} m too far to the {}", ("left", "right")),
+    "lateral": ("{:.2f} m too far to the {}", ("left", "right")),
 }
 STAYING: Final = 0.1  # share of the variance from which errors that stay with a cone are told
 
@@ -127,7 +127,7 @@ def _errors(measured: MeasuredNoise, scale: float) -> list[str]:
     if "range_scale" in clear:
         ranges.append(f"{clear['range_scale']:+.1%}".replace("%", " %"))
     if "range_bias" in clear:
-        ranges.append(f"{'-' if clear['range_bias'] < 0.0 else '+'} {abs(clear['range_bias']):.2g} m")
+        ranges.append(f"{'-' if clear['range_bias'] < 0.0 else '+'} {abs(clear['range_bias']):.2f} m")
     return [*texts, f"ranges {' '.join(ranges)}"] if ranges else texts
 
 
