@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
 from pathspace_graph import estimators as registry
@@ -35,7 +36,11 @@ RUNS: Final = {  # estimator of each run
     "landmarks": "landmark-fixed-lag",
 }
 FIRST, LAST = 25.0, 14.0  # lengths of the beginning of a drive, and of its end that is registered on it (m)
-LEAST: Final = 6  # least number of cones of a registration
+LEAST: Final = 6  # least number of cones of a registration, and of cycles in which a vehicle stands
+NEAR: Final = 12.0  # range within which cones tell that a vehicle stands (m)
+STAYS: Final = 0.5  # most median distance of a cycle's cones from those of the last ones (m)
+TOGETHER: Final = 9  # cycles that are looked at together
+MOST_STANDING: Final = 100  # most cycles in which it stands
 ERRORS: Final = {  # errors of the sensor in the table, with titles and units
     "latency": ("latency [ms]", 1e3),
     "yaw": ("yaw [°]", 180.0 / np.pi),
@@ -76,15 +81,16 @@ def map_real_log(folder: Path, out: Path) -> RealDrive:
 def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Array | None:
     """Return the last pose (3,) of a drive, by the cones of its end laid on those of its beginning.
 
-    The closest points of the same colour are paired, from starts around dead reckoning. Both stretches are
-    short enough for odometry, and the constant errors of the sensor are taken out.
+    The closest points of the same colour are paired, from starts around dead reckoning. The end is where the
+    vehicle stands, or else the last metres; the beginning is short enough for odometry. The constant errors
+    of the sensor are taken out.
     """
     poses = np.array([cycle.pose for cycle in cycles])
     path = arc_lengths(poses[:, :2])
     if path[-1] < FIRST + LAST:
         return None
     first = [cycle for cycle, s in zip(cycles, path, strict=True) if s <= FIRST]
-    last = [cycle for cycle, s in zip(cycles, path, strict=True) if s >= path[-1] - LAST]
+    last = standing(cycles) or [c for c, s in zip(cycles, path, strict=True) if s >= path[-1] - LAST]
     start = [_cones(first, label, noise, np.zeros(3)) for label in BOUNDARIES]
     end = [_cones(last, label, noise, poses[-1]) for label in BOUNDARIES]
     tries = [
@@ -93,6 +99,20 @@ def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Ar
     ]
     count, _, pose = max(tries, key=lambda one: one[:2])
     return pose if count >= LEAST else None
+
+
+def standing(cycles: Sequence[SeenCycle]) -> list[SeenCycle]:
+    """Return the newest cycles in which near cones stay where they are, all at the last pose.
+
+    Odometry may go on while the vehicle stands, so the cones decide. Empty where they are too few cycles.
+    """
+    near = [cycle.detections.points_vehicle for cycle in cycles[-MOST_STANDING:]]
+    near = [points[np.hypot(*points.T) < NEAR] for points in near]
+    ends = np.concatenate([np.zeros((0, 2)), *near[-TOGETHER:]])
+    moved = [np.median(KDTree(ends).query(points)[0]) if len(points) else np.inf for points in near]
+    stays = median_filter(np.array(moved) < STAYS, TOGETHER, mode="nearest")  # single cycles see few cones
+    count = int(np.argmin(stays[::-1])) if not stays.all() else len(stays)
+    return [replace(one, pose=cycles[-1].pose) for one in cycles[-count:]] if count >= LEAST else []
 
 
 def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise, frame: Array) -> Array:
