@@ -282,12 +282,12 @@ class Recorder:
             level = levels.WARN if health.reason else levels.INFO
             text = f"{health.condition}: {health.reason}" if health.reason else health.condition
             self._say(text, levels.ERROR if health.condition == LOST else level)
-        if result.closed and not self._closed:
-            self._say(f"the loop is closed, on {sum(result.sizes)} points", levels.INFO)
+        closes = result.closed and not self._closed
+        said = [f"the loop is closed, on {sum(result.sizes)} points"] if closes else []
         if result.jump is not None:
-            self._say(f"the pose has jumped by {np.hypot(*result.jump[:2]):.2f} m", levels.INFO)
-        if result.notice:
-            self._say(result.notice, levels.INFO)
+            said.append(f"the pose has jumped by {np.hypot(*result.jump[:2]):.2f} m")
+        if said or result.notice:
+            self._say("; ".join(filter(None, (*said, result.notice))), levels.INFO)
         self._last_health, self._closed = health, result.closed
 
     def _say(self, text: str, level: str) -> None:

@@ -203,7 +203,8 @@ class TrackLoop:
 
     def finish(self) -> Array | None:
         """Take the result of a batch that is under way, as no cycle follows; return the jump (3,) if any."""
-        if self._lap_batch is None:
+        ended_later = self.settings.open_lap.ends[len(self._batch_ends) :]  # in the drive that is replayed
+        if self._lap_batch is None or ended_later:
             return None
         self._lap_batch.wait()
         outcome, self._lap_batch = self._lap_batch.marginal(0.0), None
