@@ -243,9 +243,10 @@ def objection(
 ) -> str:
     """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
 
-    Both boundaries are closed. They don't cross but at level crossings, the vehicle crosses neither and has driven beside all of
-    both, and the detections lie on them. Where cycles are missing the drive is not known, so nothing is asked
-    of the boundaries beside a step so long that a point beside its middle would be too far from both poses.
+    Both boundaries are closed. They don't cross but at level crossings, the vehicle crosses neither and has
+    driven beside all of both, and the detections lie on them. Where cycles are missing the drive is not
+    known, so nothing is asked of the boundaries beside a step so long that a point beside its middle would be
+    too far from both poses.
     """
     if not found.closed:
         return "not both of its boundaries are closed"
