@@ -242,7 +242,7 @@ class CalibrationSettings(_Priors):
     """Known bias of the ranges, m."""
     trust: Literal["odometry", "ranges"] | None = None
     """Which of the two sets the size of the map where ranges and speeds disagree: only their ratio can be
-    seen. By default the smoother one."""
+    seen. By default the odometry, unless ranges scatter by less than its scale is known."""
     doubt: float = 4.0
     """Contradiction from which the priors become wide, standard deviations; `inf` to hold them always."""
 
