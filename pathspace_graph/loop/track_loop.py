@@ -22,6 +22,7 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import BEGINNING, RefinedMotion, near_start
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import boundaries_cross
 from pathspace_graph.spline.bspline import BSpline
 
@@ -78,9 +79,14 @@ class TrackLoop:
         self._resumes = 0.0
 
     @property
+    def priors(self) -> MapperSettings:
+        """Return the settings with the priors of the calibrations as they are now."""
+        return self._inflated
+
+    @property
     def sigma_size(self) -> float:
         """Return the standard deviation of the size of the world, where it is no variable (-)."""
-        return self._inflated.odometry.sigma_size
+        return self.priors.odometry.sigma_size
 
     @property
     def is_searching(self) -> bool:

@@ -293,7 +293,14 @@ class FixedLagMapper(MapperEstimate):
         """Map the road beside a lost vehicle anew, until its place on the closed map is found."""
         if self.new_road is None:
             open_lap = replace(self.settings.open_lap, prior="window")
-            settings = replace(self.settings, scale=1.0, open_lap=open_lap)
+            odometry, sensor = self.smoother.variables.calibration, self.smoother.variables.sensor
+            settings = replace(
+                self.settings,
+                scale=1.0,
+                open_lap=open_lap,
+                odometry=self.loop.priors.odometry.about(odometry.tolist()),
+                calibration=self.loop.priors.calibration.about(sensor.tolist()),
+            )
             self.new_road = FixedLagMapper(settings, self.odometry_sigma)
         road = self.new_road
         road._predict(reading)

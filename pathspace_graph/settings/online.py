@@ -1,5 +1,6 @@
 """Settings of the online mapper: growth of open ends, closing, health, the front end, and constant errors."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import inf
 from typing import ClassVar, Final, Literal, Self
@@ -171,6 +172,10 @@ class _Priors(Positive):
     def sigmas(self) -> tuple[float, ...]:
         """Standard deviations in the same order, or none."""
         return tuple(getattr(self, f"sigma_{name}") for name in self.SIGNED if self.sensor)
+
+    def about(self, errors: Iterable[float]) -> Self:
+        """Return the priors with other means: errors in the order of `means`, or none."""
+        return replace(self, **dict(zip(self.SIGNED, errors, strict=False)))  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)
