@@ -38,7 +38,7 @@ RUNS: Final = {  # estimator of each run
 FIRST, LAST = 25.0, 14.0  # lengths of the beginning of a drive, and of its end that is registered on it (m)
 LEAST: Final = 6  # least number of cones of a registration, and of cycles in which a vehicle stands
 NEAR: Final = 12.0  # range within which cones tell that a vehicle stands (m)
-STAYS: Final = 0.5  # most median distance of a cycle's cones from those of the last ones (m)
+STAYS: Final = 0.5  # most median distance of a cycle's cones from those of one of the last (m)
 TOGETHER: Final = 9  # cycles that are looked at together
 MOST_STANDING: Final = 100  # most cycles in which it stands
 ERRORS: Final = {  # errors of the sensor in the table, with titles and units
@@ -108,8 +108,8 @@ def standing(cycles: Sequence[SeenCycle]) -> list[SeenCycle]:
     """
     near = [cycle.detections.points_vehicle for cycle in cycles[-MOST_STANDING:]]
     near = [points[np.hypot(*points.T) < NEAR] for points in near]
-    ends = np.concatenate([np.zeros((0, 2)), *near[-TOGETHER:]])
-    moved = [np.median(KDTree(ends).query(points)[0]) if len(points) else np.inf for points in near]
+    most = KDTree(max(near[-TOGETHER:], key=len))
+    moved = [np.median(most.query(points)[0]) if most.n and len(points) else np.inf for points in near]
     stays = median_filter(np.array(moved) < STAYS, TOGETHER, mode="nearest")  # single cycles see few cones
     count = int(np.argmin(stays[::-1])) if not stays.all() else len(stays)
     return [replace(one, pose=cycles[-1].pose) for one in cycles[-count:]] if count >= LEAST else []
