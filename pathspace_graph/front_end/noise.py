@@ -24,7 +24,7 @@ AGAIN: Final = 1.5  # growth of the driving time after which it is measured agai
 MOST_CYCLES: Final = 300  # newest cycles on which it is measured, which bounds its time
 MIN_SPEED: Final = 0.3  # speed from which on the vehicle drives (m/s)
 SCALE: Final = SENSOR.index("range_scale")
-SIGMA_FREE: Final = 0.1  # of the scale of the ranges where the odometry sets the size of the world (-)
+SIGMA_FREE: Final = 0.02  # of the scale of the ranges, beside that measured, where odometry sets the size (-)
 REFERENCE_RANGE: Final = 10.0  # range at which the scatter of ranges tells how well their scale is known (m)
 
 

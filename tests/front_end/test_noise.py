@@ -160,7 +160,7 @@ def test_where_the_odometry_is_trusted_the_ranges_take_the_whole_ratio() -> None
     assert doubted.sigma_bias > settings.odometry.sigma_bias
     np.testing.assert_array_equal(found.calibration.means, ERRORS)
     expected = np.maximum(SIGMA, settings.calibration.sigmas)
-    expected[3] = 0.1
+    expected[3] = 0.02
     np.testing.assert_array_equal(found.calibration.sigmas, expected)
     assert found.calibration.doubt == inf
     assert replace(found, odometry=settings.odometry, calibration=settings.calibration) == settings
@@ -172,7 +172,7 @@ def test_the_trusted_scale_is_held_whatever_error_contradicts_its_prior() -> Non
     settings = replace(SETTINGS, calibration=CalibrationSettings(trust="odometry"))
     found = learner(noise(yaw_only)).calibrated(settings)
     assert found.odometry == replace(settings.odometry, hold_scale=True)
-    assert found.calibration.sigma_range_scale == 0.1
+    assert found.calibration.sigma_range_scale == 0.02
     np.testing.assert_array_equal(found.calibration.means, yaw_only)
     by_ranges = replace(SETTINGS, calibration=CalibrationSettings(trust="ranges"))
     found = learner(noise(yaw_only)).calibrated(by_ranges)
