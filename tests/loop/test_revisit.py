@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -10,27 +10,20 @@ import pytest
 from pathspace_graph import FixedLagMapper, MapperSettings
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop.revisit import Revisits, earlier_pass
 from pathspace_graph.run import CycleResult
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
 
-from ..scenes.drives import bean_track, beginning, lap_log, map_log, true_poses
+from ..scenes.drives import bean_track, beginning, lap_log, map_log, path_of, true_poses
 
 STEP = 1.0
 SECONDS, PERIOD = 24.0, 0.1
 """The drive of the skidpad ends in the second round."""
 
 
-def along(*pieces: tuple[float, float]) -> Array:
-    """Return poses (n, 3) a step apart on pieces of a path, each a length (m) and a curvature (1/m)."""
-    poses = [np.zeros(3)]
-    for length, curvature in pieces:
-        for _ in range(round(length / STEP)):
-            poses.append(compose(poses[-1], np.array([STEP, 0.0, STEP * curvature])))
-    return np.array(poses)
+along = partial(path_of, STEP)
 
 
 ROUND = 2.0 * np.pi * 9.125

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -33,6 +34,8 @@ from pathspace_graph.mapping.constellation import (
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.tentative import TentativeTracks, merged_in_turn
 from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.drives import path_of
 
 SETTINGS = MapperSettings()
 GROWTH = SETTINGS.growth
@@ -229,13 +232,7 @@ DRIFT = np.array([1.0, -0.8, 0.03])
 """Error of the last pose of a drive, which grows with the path (m, m, rad)."""
 
 
-def along(*pieces: tuple[float, float]) -> Array:
-    """Return poses (n, 3) a step apart on pieces of a path, each a length (m) and a curvature (1/m)."""
-    poses = [np.zeros(3)]
-    for length, curvature in pieces:
-        for _ in range(round(length / STEP)):
-            poses.append(compose(poses[-1], np.array([STEP, 0.0, STEP * curvature])))
-    return np.array(poses)
+along = partial(path_of, STEP)
 
 
 def sensor(poses: Array, seed: int = 0) -> SeenIn:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.checkpoint import copied
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -89,6 +90,15 @@ def bean_track(radius: float = 16.0, dent: float = 0.25, half_width: float = 1.8
     ]
     start = np.array([*middle[0], np.arctan2(tangent[0, 1], tangent[0, 0])])
     return Track(rows[0], rows[1], np.zeros((0, 2)), True, start, "bean")
+
+
+def path_of(step: float, *pieces: tuple[float, float]) -> Array:
+    """Return poses (n, 3) a step (m) apart on pieces of a path, each a length (m) and a curvature (1/m)."""
+    poses = [np.zeros(3)]
+    for length, curvature in pieces:
+        for _ in range(round(length / step)):
+            poses.append(compose(poses[-1], np.array([step, 0.0, step * curvature])))
+    return np.array(poses)
 
 
 def lap_log(track: Track, overrun: float = 10.0) -> Log:
