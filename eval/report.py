@@ -34,7 +34,7 @@ from .views import ESTIMATORS, LANDMARKS, ONLINE, Figure, Rows, View
 
 FORMAT: Final = "pathspace-figures/1"
 FILE: Final = "figures.json"
-ABLATIONS: Final = ("gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
+ABLATIONS: Final = ("stations", "gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
 """Studies of parts of the method, driven by one estimator on the generated tracks for two laps."""
 ONE_SEED: Final = ("gauge", "robust")  # those with so many variants that they are driven with one seed
 PAGES: Final = {  # tables of each page, from the root of the project

@@ -17,7 +17,7 @@ from .footpoint import FootPoints, foot_points
 from .linear import linear_factor
 from .noise import huber_roots, huber_weights
 from .odometry import IntegratedOdometry, odometry_residuals
-from .residuals import RIBBON, beyond_edge, sigma_across
+from .residuals import RIBBON, beyond_edge, sigma_across, station_rows
 from .se2 import rotation, to_map
 from .sensor import corrected, sensor_rows
 
@@ -116,6 +116,72 @@ def _projection_factor(
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(measured)), keys, error)
 
 
+def station_factors(
+    pose_keys: IntArray,
+    control_keys: Sequence[int],
+    tables: SpanPolynomials,
+    *,
+    u: Array,
+    sigma_station: Array,
+    points_vehicle: Array,
+    covariances: Array,
+    twists: Array,
+    huber: float,
+    sensor_key: int | None = None,
+) -> list[gtsam.CustomFactor]:
+    """Return a factor `e_i = t_i . (R z_i + t - S(u_i)) / sigma_i` for the detections of each pose.
+
+    The rows are those of `station_rows`, at the stations u (m,) of cones with standard deviations
+    sigma_station (m,) along the curve, in m. The rest is as in `spline_projection_factors`.
+    """
+    factors = []
+    for own in np.split(np.arange(len(pose_keys)), np.flatnonzero(np.diff(pose_keys)) + 1):
+        if len(own):
+            curve = Curve.of(control_keys, tables, u[own], u[own])
+            measured = points_vehicle[own], covariances[own], twists[own]
+            at = u[own], sigma_station[own]
+            factors.append(_station_factor(int(pose_keys[own[0]]), curve, *at, *measured, huber, sensor_key))
+    return factors
+
+
+def _station_factor(
+    pose_key: int,
+    curve: Curve,
+    u: Array,
+    sigma_station: Array,
+    measured: Array,
+    covariances: Array,
+    twists: Array,
+    huber: float,
+    sensor_key: int | None,
+) -> gtsam.CustomFactor:
+    """Return the factor on the pose of the detections, the sensor's calibration and the control points."""
+    (value, slope), span = curve.tables.evaluate(u, 1)
+    columns, slots = span[:, None] + np.arange(-curve.tables.degree, 1), curve.slots(span)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
+        pose = values.atPose2(pose_key)
+        poses = np.tile(pose_array(pose), (len(measured), 1))
+        sensor = np.zeros(0) if sensor_key is None else np.array(values.atVector(sensor_key))
+        points, control = to_map(corrected(measured, twists, sensor), poses), curve.control_points(values, 2)
+        basis = np.ascontiguousarray(value), np.ascontiguousarray(slope), control[columns]
+        seen = measured, twists, sensor
+        residual, sigma, J = station_rows(points, covariances, poses, *basis, *seen, sigma_station)
+        whitened = residual / sigma
+        if H is None:
+            return huber_roots(whitened, huber)
+        root = np.sqrt(huber_weights(whitened, huber))
+        J *= (root / sigma)[:, None]
+        by_pose = np.column_stack([J[:, :2] @ rotation(pose.theta()), J[:, 2]])
+        by_calibration = [J[:, 3 : 3 + len(sensor)]] if len(sensor) else []
+        by_control = J[:, 3 + len(sensor) :].reshape(*slots.shape, 2)
+        fill(H, [by_pose, *by_calibration, *curve.by_key(by_control, slots)])
+        return np.asarray(whitened * root)
+
+    keys = [pose_key, *([] if sensor_key is None else [int(sensor_key)]), *curve.keys]
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(measured)), keys, error)
+
+
 def boundary_point_factor(
     control_keys: Sequence[int],
     tables: SpanPolynomials,
@@ -190,11 +256,15 @@ class Curve:
 
     def usable(self, foot: FootPoints) -> tuple[BoolArray, IntArray]:
         """Return which rows (m,) may contribute, and the slots (m, p + 1) of their control points' keys."""
+        slots = self.slots(foot.span)
+        return foot.interior & (slots >= 0).all(axis=1), slots
+
+    def slots(self, span: IntArray) -> IntArray:
+        """Return the slots (m, p + 1) of the keys of spans' (m,) control points, -1 where none is held."""
         size = self.tables.size
         slot_of = np.full(size, -1, dtype=np.intp)
         slot_of[self.touched] = np.arange(len(self.touched))
-        slots = slot_of[(foot.span[:, None] + np.arange(-self.tables.degree, 1)) % size]
-        return foot.interior & (slots >= 0).all(axis=1), slots
+        return np.asarray(slot_of[(span[:, None] + np.arange(-self.tables.degree, 1)) % size])
 
     def by_key(self, by_control: Array, slots: IntArray) -> Array:
         """Return derivatives by key (keys, m, d) from those by the points of each span (m, p + 1, d)."""

@@ -1019,6 +1019,45 @@ py::tuple detection_rows(const Array& points, const Array& covariances, const Ar
   return py::make_tuple(residual, sigma, jacobian);
 }
 
+py::tuple station_rows(const Array& points, const Array& covariances, const Array& poses, const Array& value,
+                       const Array& slope, const Array& control, const Array& measured, const Array& twists,
+                       const Array& sensor, const Array& sigma_station) {
+  const Index m = points.shape(0), p = value.shape(1);
+  expect(value.size() == p * m && slope.size() == p * m && control.size() == 2 * p * m);
+  expect(points.size() == 2 * m && sigma_station.size() == m);
+  Array tangents(Shape{m, 2}), along(m), turning(m);
+  for (Index i = 0; i < m; ++i) {
+    double at[2] = {0.0, 0.0}, velocity[2] = {0.0, 0.0};
+    for (Index j = 0; j < p; ++j)
+      for (int c = 0; c < 2; ++c) {
+        const double own = control.data()[2 * (i * p + j) + c];
+        at[c] += value.data()[i * p + j] * own;
+        velocity[c] += slope.data()[i * p + j] * own;
+      }
+    const double speed = std::hypot(velocity[0], velocity[1]), t[2] = {velocity[0] / speed, velocity[1] / speed};
+    const double arm[2] = {points.data()[2 * i] - at[0], points.data()[2 * i + 1] - at[1]};
+    std::copy_n(t, 2, tangents.mutable_data() + 2 * i);
+    along.mutable_data()[i] = arm[0] * t[0] + arm[1] * t[1];
+    turning.mutable_data()[i] = (arm[1] * t[0] - arm[0] * t[1]) / speed;
+  }
+  const py::tuple terms =
+      detection_rows(points, covariances, poses, tangents, along, value, measured, twists, sensor, 0.0);
+  Array sigma = terms[1].cast<Array>(), jacobian = terms[2].cast<Array>();
+  const Index width = jacobian.shape(1);
+  for (Index i = 0; i < m; ++i) {
+    const double* t = tangents.data() + 2 * i;
+    double* J = jacobian.mutable_data() + width * i;
+    const double turn = (J[0] * t[0] + J[1] * t[1]) * turning.data()[i];
+    double* by_control = J + width - 2 * p;
+    for (Index j = 0; j < p; ++j) {
+      by_control[2 * j] -= turn * slope.data()[i * p + j] * t[1];
+      by_control[2 * j + 1] += turn * slope.data()[i * p + j] * t[0];
+    }
+    sigma.mutable_data()[i] = std::hypot(sigma.data()[i], sigma_station.data()[i]);
+  }
+  return py::make_tuple(terms[0], sigma, jacobian);
+}
+
 // Detections chosen by row, and the poses at which they were made.
 struct Seen {
   Seen(const Ints& rows, const Ints& cycles, const Array& measured, const Array& twists, const Array& poses,
@@ -2058,6 +2097,7 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("shifted", &shifted);
   module.def("to_map", &to_map);
   module.def("detection_rows", &detection_rows);
+  module.def("station_rows", &station_rows);
   module.def("placed", &placed);
   module.def("curve_rows", &curve_rows);
   module.def("open_rows", &open_rows);

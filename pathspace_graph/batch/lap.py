@@ -31,13 +31,14 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import by_motion, sigma_of_information
 from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.boundary import Boundary, at_level_crossing, boundaries_cross, crossings, sampled
 from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive
 from .optimizer import LOOSE_GATE, Convergence, Effort, Optimizer
-from .simplification import boundary_of, own_settings, scatter_of_cones, simplified
+from .simplification import boundary_of, map_block, own_settings, scatter_of_cones, simplified
 from .start import Recurrence, aligned_odometry, start_odometry
+from .stations import StationMatches
 from .system import BatchSystem, Biweight, Evaluation, curve_gauge
 
 USED_AGAIN: Final = 0.85  # least share of the detections used after the first lap, over that of the first lap
@@ -87,8 +88,11 @@ class LapMarginal:
     first_kept: int  # cycle before whose pose all measurements are in the marginal, and no later ones
     mean: Array  # (n,) mean of the marginal
     information: Array  # (n, n) its information, the inverse of its covariance
-    scatter: dict[int, Array]  # sigma (m,) of each boundary's cones about the curve at each control point (m)
+    scatter: dict[int, Array]  # sigma (m,) of each boundary's control points that is its cones' scatter (m)
     cones: dict[int, Array]  # parameters (k,) of each boundary's detected cones on its curve (m)
+    sigma_stations: dict[
+        int, Array
+    ]  # sigma (k,) of those along their curve, given the curve (m); may be empty
     seconds: float  # wall time (s)
     objection: str = ""  # what speaks against the map; empty where nothing does
 
@@ -107,8 +111,11 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
         if by_shape and not is_true_closure(found, settings):
             return None
         few, change = simplified(at.state, detections, settings)
-        information, mean = marginal_of(system, at, few, change, lap.first_kept)
+        information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
         scatter = scatter_of_cones(few, detections, settings)
+        cones, sigma_stations = scatter.places, dict[int, Array]()
+        if system.matches is not None:
+            cones, sigma_stations = stations_on(few, system.matches, at.state, change, dense)
         return LapMarginal(
             convergence=convergence,
             splines=few.splines,
@@ -117,8 +124,9 @@ def solve_lap(lap: OpenLap) -> LapMarginal | None:
             first_kept=lap.first_kept,
             mean=mean,
             information=information,
-            scatter={label: scatter.sigma(label, b.abscissae) for label, b in few.boundaries.items()},
-            cones=scatter.places,
+            scatter={label: scatter.of_control_points(label, b) for label, b in few.boundaries.items()},
+            cones=cones,
+            sigma_stations=sigma_stations,
             seconds=time.perf_counter() - begin,
             objection=disagreement(system, at.state.poses)
             or objection(found, few.splines, at.state.poses, settings),
@@ -143,12 +151,13 @@ def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem
 
 def marginal_of(
     system: BatchSystem, at: Evaluation, few: State, change: Array, first_kept: int
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Return information (n, n) and mean (n,) of [calibration | few control points | oldest kept pose].
 
-    Only factors of poses before `first_kept` are summed, linearized at the optimum, since the window has the
-    others. `change` F maps the dense control points to the few. So the covariance is `T Sigma T'` with
-    `T = diag(I, F, I)`, where Sigma is the inverse of the dense marginal's information.
+    The third is the covariance (d, d) of the dense control points. Only factors of poses before `first_kept`
+    are summed, linearized at the optimum, since the window has the others. `change` F maps the dense control
+    points to the few. So the covariance is `T Sigma T'` with `T = diag(I, F, I)`, where Sigma is the inverse
+    of the dense marginal's information.
     """
     state, variables = at.state, at.state.variables
     oldest = pose_keys(np.array([first_kept]))
@@ -159,13 +168,45 @@ def marginal_of(
     T = block_diag(np.eye(len(variables.calibrations)), change, np.eye(POSE))
     here = np.concatenate([variables.calibrations, few.map_points.ravel(), state.poses[first_kept]])
     mean = here + T @ (covariance @ vector)
+    first, last = len(variables.calibrations), len(covariance) - POSE
+    dense = np.asarray(covariance[first:last, first:last], np.float64)
     covariance = T @ covariance @ T.T
-    return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), mean
+    return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), mean, dense
+
+
+def stations_on(
+    few: State, matches: StationMatches, dense: State, change: Array, covariance: Array
+) -> tuple[dict[int, Array], dict[int, Array]]:
+    """Return where stations of dense curves are on curves with few knots (k,), and their sigmas along (k,).
+
+    A cone is `S_dense(u)`. Given the few control points `F c` it moves by `(B_dense(u) - B_few(u') F) dc`,
+    with u' its foot point on the few curve, B the basis, and dc of the given covariance.
+    """
+    places, sigmas = {}, {}
+    for curve in matches.stations.curves:
+        label, u = curve.label, curve.u
+        old, new, new_points = dense.boundaries[label], few.boundaries[label], few.control_points(label)
+        foot = new.find_anywhere(new_points, old.evaluate(dense.control_points(label), u))
+        block = map_block(dense, label)
+        F = change[map_block(few, label), block]
+        along = along_of(old, u, foot.tangent_unit) - along_of(new, foot.u, foot.tangent_unit) @ F
+        places[label] = foot.u
+        sigmas[label] = np.sqrt(np.einsum("kn,kn->k", along @ covariance[block, block], along))
+    return places, sigmas
+
+
+def along_of(boundary: Boundary, u: Array, directions: Array) -> Array:
+    """Return the derivatives (k, 2 m) of `d . S(u)` by the control points, for unit vectors d (k, 2)."""
+    (basis,), span = boundary.tables.evaluate(u)
+    by_control = np.zeros((len(u), boundary.size, 2))
+    terms = basis[:, :, None] * directions[:, None, :]
+    np.add.at(by_control, (np.arange(len(u))[:, None], boundary.columns(span)), terms)
+    return by_control.reshape(len(u), -1)
 
 
 def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:
     """Return the rows of the batch that hold a pose before `first_kept` or no pose at all."""
-    state, sigma, before = at.state, system.settings.batch.sigma_slide, []
+    state, sigma, before = at.state, system.sigma_slide, []
     gauges = {label: curve_gauge(state, label, sigma, first_kept) for label in state.boundaries}
     for rows in system.rows(at, gauges):
         if len(rows):

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SettingsError, SolveError
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors
+from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors, station_factors
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import path_lengths, rotation, to_map
@@ -73,7 +73,7 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
     for label, gauge in system.gauges.items():
         factors += _gauge(gauge, at.state.control_points(label))
-        factors += _projections(system, at, label)
+        factors += [*_projections(system, at, label), *_along(system, at, label)]
     for factor in factors:
         graph.add(factor)
     return graph
@@ -177,6 +177,28 @@ def _projections(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.
         huber=np.inf,
         sensor_key=variables.sensor_key,
         twists=detections.twist[rows],
+    )
+
+
+def _along(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
+    """Return a factor for each cycle, of its detections at stations of a boundary that have any weight."""
+    if at.along is None:
+        return []
+    stations, detections = at.along.stations, system.detections
+    scale = at.along.scale(system.kernel)
+    chosen = (stations.label[at.along.station] == label) & (scale > 0.0)
+    rows, station = at.along.detection[chosen], at.along.station[chosen]
+    return station_factors(
+        pose_keys(detections.cycle[rows]),
+        at.state.keys(label).tolist(),
+        at.state.boundaries[label].tables,
+        u=stations.u[station],
+        sigma_station=np.zeros(len(rows)),
+        points_vehicle=detections.measured[rows],
+        covariances=scale[chosen, None, None] ** -2.0 * np.eye(2),
+        twists=detections.twist[rows],
+        huber=np.inf,
+        sensor_key=at.state.variables.sensor_key,
     )
 
 
@@ -449,7 +471,7 @@ def _map(state: State, joint: Array, scatter: Scatter) -> Map:
     boundaries = {}
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
-        sigma = np.repeat(scatter.sigma(label, boundary.abscissae), 2)
+        sigma = np.repeat(scatter.of_control_points(label, boundary), 2)
         covariance = joint[block, block] + np.diag(sigma**2)
         boundaries[label] = SplineBoundary(state.spline(label), covariance)
     return Map(state.closed, boundaries, joint_covariance(joint, boundaries))

@@ -15,8 +15,10 @@ from pathspace_graph.mapping.state import State
 
 from .association import associate, cone_counts, locate_poses
 from .simplification import reknot
+from .stations import match_stations
 from .system import BatchSystem, Biweight, Evaluation, moved
 
+STATION_PASSES: Final = 2  # times that detections are matched with the cones of a closed optimum
 LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 SEARCH: Final = 20  # rounds in which associations are found anew
@@ -69,6 +71,7 @@ class Optimizer:
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
         """Return the optimum on curves with about one knot for each cone, which meet the cones."""
         detections, settings, effort = self.system.detections, self.system.settings, self.effort
+        self.system.matches = None
         first_gate = self.settings.gate if self.system.revisits else LOOSE_GATE
         state = self.align_poses(state, POSE_STEPS, first_gate)
         state = reknot(state, detections, settings, dense=True)
@@ -79,6 +82,10 @@ class Optimizer:
             at, convergence = self.run(state, self.settings.gate, effort.rounds)
             if cone_counts(at.state, detections, settings) == cones:
                 break
+        if settings.stations and all(b.periodic for b in at.state.boundaries.values()):
+            for _ in range(STATION_PASSES):
+                self.system.matches = match_stations(at.state, detections, settings)
+                at, convergence = self.run(at.state, self.settings.gate, effort.rounds)
         return at, convergence
 
     def align_poses(self, state: State, steps: int, gate: float) -> State:

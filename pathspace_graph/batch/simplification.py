@@ -181,6 +181,16 @@ class Scatter:
         share = distance.min(axis=1) / np.median(np.diff(np.sort(places)))
         return np.asarray(np.sqrt(self.seen**2 + share**2 * max(self.unseen**2 - self.seen**2, 0.0)))
 
+    def of_control_points(self, label: int, boundary: Boundary) -> Array:
+        """Return the standard deviation (m,) that gives a boundary's curve the scatter, in m.
+
+        A curve is the mean of some control points with weights beta, so independent errors of these are
+        divided by `sqrt(sum beta^2)`.
+        """
+        u = boundary.abscissae
+        (basis,), _ = boundary.tables.evaluate(u)
+        return np.asarray(self.sigma(label, u) / np.sqrt((basis**2).sum(axis=1)))
+
 
 def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperSettings) -> Scatter:
     """Return the scatter of the detected cones about the curves of the state."""

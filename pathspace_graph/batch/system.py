@@ -19,10 +19,15 @@ from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import POINT, POSE, SENSOR_KEY, Layout, are_poses, indices, pose_keys
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.stations import Stations
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import headings
+from .stations import StationMatches
 
+SIGMA_SLIDE: Final = 2.0
+"""Standard deviation of a control point's slide along its curve from beside its first pose (m), where
+stations hold it there."""
 POINTS_A_FACTOR: Final = 8  # neighbouring control points in one factor of their anchors; only for speed
 
 
@@ -210,11 +215,40 @@ class Projected:
 
 
 @dataclass(frozen=True, eq=False)
+class AlongStations:
+    """The m used detections that have a station, along their curves at a state; not whitened."""
+
+    stations: Stations
+    detection: IntArray  # (m,) rows in the table of detections
+    station: IntArray  # (m,) station of each
+    keys: IntArray  # (m, k) of [pose | sensor | control points]
+    residual: Array  # (m,) distances beyond the stations (m)
+    sigma: Array  # (m,) standard deviations (m)
+    jacobian: Array  # (m, n)
+
+    @property
+    def whitened(self) -> Array:
+        """Return the residuals (m,) in sigmas."""
+        return np.asarray(self.residual / self.sigma)
+
+    def scale(self, kernel: Biweight) -> Array:
+        """Return the factor (m,) that whitens and weights each row (1/m)."""
+        return np.asarray(np.sqrt(kernel.weights(self.whitened)) / self.sigma)
+
+    def rows(self, kernel: Biweight, cycle: IntArray) -> Rows:
+        """Return whitened rows with robust weights of detections in cycles (m,)."""
+        scale = self.scale(kernel)
+        owner = owners(cycle, self.stations.label[self.station])
+        return Rows(self.keys, self.jacobian * scale[:, None], self.residual * scale, owner)
+
+
+@dataclass(frozen=True, eq=False)
 class Evaluation:
     """Problem at one state."""
 
     state: State
     projected: dict[int, Projected]  # used detections of each boundary
+    along: AlongStations | None  # used detections at their stations
     drive: list[Rows]  # rows of odometry, priors and revisits
     cost: float  # half the sum of squares, with the robust losses of the detections
 
@@ -229,13 +263,18 @@ class BatchSystem:
         self.settings, self.kernel = settings, kernel
         self.gauges: dict[int, CurveGauge] = {}  # weak priors of each boundary
         self.revisits: tuple[Revisit, ...] = ()  # where an open road was driven twice
+        self.matches: StationMatches | None = None  # cones of closed curves, where they hold detections
         count = len(detections)
         self._sigma, self._inside, self._rates = np.ones(count), np.ones(count, bool), np.zeros((count, 2))
 
     def begin(self, state: State) -> None:
         """Make the gauges anew, which hold the control points where they are now, when knots have changed."""
-        sigma = self.settings.batch.sigma_slide
-        self.gauges = {label: curve_gauge(state, label, sigma) for label in state.boundaries}
+        self.gauges = {label: curve_gauge(state, label, self.sigma_slide) for label in state.boundaries}
+
+    @property
+    def sigma_slide(self) -> float:
+        """Return the standard deviation of a control point's slide along its curve (m)."""
+        return SIGMA_SLIDE if self.matches else self.settings.batch.sigma_slide
 
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
         """Return the problem at a state; foot points are refined from those that the detections have.
@@ -250,8 +289,18 @@ class BatchSystem:
         losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
         at_gate = self.kernel.gate**2 / 6.0  # the loss of a detection that isn't used
         cost = losses + at_gate * (len(self.detections) - used) + half_square(drive)
+        along = self._along(state) if self.matches else None
+        if along is not None:
+            cost += float(self.kernel.loss(along.whitened).sum())
         gauges = (self.gauges[b].cost(state.control_points(b), state.poses) for b in state.boundaries)
-        return Evaluation(state, projected, drive, cost + sum(gauges))
+        return Evaluation(state, projected, along, drive, cost + sum(gauges))
+
+    def _along(self, state: State) -> AlongStations:
+        """Return the matched detections that are in use."""
+        assert self.matches is not None
+        stations, (rows, station, sigma) = self.matches.stations, self.matches.used(self.detections)
+        keys, residual, _, jacobian = stations.rows(state, self.detections, rows, station, sigma)
+        return AlongStations(stations, rows, station, keys, residual, sigma, jacobian)
 
     def _project(self, state: State, label: int, hold: bool) -> Projected:
         detections, sensor = self.detections, state.variables.sensor
@@ -273,6 +322,8 @@ class BatchSystem:
         """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights."""
         state = at.state
         groups = [*at.drive]
+        if at.along is not None:
+            groups.append(at.along.rows(self.kernel, self.detections.cycle[at.along.detection]))
         for label, gauge in (gauges or self.gauges).items():
             points = state.control_points(label)
             groups += [

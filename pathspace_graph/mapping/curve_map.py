@@ -1,6 +1,6 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -9,15 +9,18 @@ from pathspace_graph.factors.bspline import Spans
 from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, TOLERANCES, refine_joint_foot_points
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.residuals import detection_rows, pair_residuals
+from pathspace_graph.factors.residuals import detection_rows, pair_residuals, sigma_across
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.graph.rows import Parts, Rows, among, stacked_rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .detections import DetectionTable
+from .detections import NO_STATION, DetectionTable
 from .state import State, factor_numbers
+from .stations import SIGMA_POSE, Stations
+
+SIGHTINGS_IN_WINDOW: Final = 20.0  # usual number of a cone's detections in a window
 
 
 class CurveMap:
@@ -31,6 +34,7 @@ class CurveMap:
         self.held_by_prior = False  # whether the prior holds the curves' spacing and shape
         self.scatter: dict[int, Array] = {}  # (m,) sigma of cones at each control point, if known (m)
         self.cones: dict[int, Array] = {}  # (k,) parameters of the cones of a closed boundary (m), if known
+        self.stations: Stations | None = None  # these cones, where they hold detections along the curves
         self.reached_inactive = False  # whether the latest `rows` reach inactive control points
         self._refined: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
@@ -63,7 +67,27 @@ class CurveMap:
             TOLERANCES,
         )
         self._refined = rows, u
-        return [Rows(*parts)]
+        return [Rows(*parts), *self._along(rows)]
+
+    def _along(self, rows: IntArray) -> list[Rows]:
+        """Return `w t . (R z + t - S(u)) / sigma` for those of the detections (m,) that have a station u."""
+        detections, stations = self.detections, self.stations
+        rows = rows[detections.station[rows] != NO_STATION]
+        if stations is None or len(rows) == 0:
+            return []
+        station = detections.station[rows]
+        sigma_station = self.sigma_stations(station)
+        keys, residual, sigma, jacobian = stations.rows(self.state, detections, rows, station, sigma_station)
+        weight = np.sqrt(huber_weights(residual / sigma, self.settings.gate.huber)) / sigma
+        return [Rows(keys, jacobian * weight[:, None], residual * weight, detections.cycle[rows])]
+
+    def sigma_stations(self, station: IntArray) -> Array:
+        """Return the standard deviations (m,) of stations (m,) along their curves, in each detection (m).
+
+        The error of a station is the same in all of its detections, so each has the variance of all.
+        """
+        assert self.stations is not None
+        return np.asarray(SIGHTINGS_IN_WINDOW**0.5 * self.stations.sigma[station])
 
     def correct(self) -> None:
         """Do nothing: detections are corrected when their points are asked for."""
@@ -91,9 +115,29 @@ class CurveMap:
         self.detections.keep_from(cycle + 1)
         self.state.drop_oldest_pose_u()
 
-    def replaced_by(self, scatter: dict[int, Array], cones: dict[int, Array]) -> None:
-        """Note that curves and prior are a batch's, with the scatter and the places of cones by label."""
+    def replaced_by(
+        self, scatter: dict[int, Array], cones: dict[int, Array], sigma_stations: dict[int, Array]
+    ) -> None:
+        """Note that curves and prior are a batch's, with the scatter and the places of cones by label.
+
+        Where their standard deviations (k,) along the curves are given (m), they are stations from now on.
+        """
         self.held_by_prior, self.scatter, self.cones = True, scatter, cones
+        self.stations = Stations.of(self.state, cones, sigma_stations) if sigma_stations else None
+
+    def match(self, rows: IntArray, directions: Array) -> None:
+        """Match detections (m,), newly in use, with the cones of a closed map.
+
+        They are those on one boundary by unit tangents (m, 2), map frame, at their foot points.
+        """
+        if self.stations is None:
+            return
+        detections = self.detections
+        poses = self.variables.poses_at(detections.cycle[rows])
+        sigma = sigma_across(directions, detections.covariance[rows], poses, SIGMA_POSE)
+        for curve in self.stations.curves:
+            own = (detections.boundary[rows] == curve.label) & (detections.label[rows] == curve.label)
+            detections.station[rows[own]] = curve.matched(detections.u[rows[own]], sigma[own])
 
     # --- weak priors -------------------------------------------------------------------------------------
 

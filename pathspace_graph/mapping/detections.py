@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from typing import Self
+from typing import Final, Self
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
+
+NO_STATION: Final = -1  # of a detection that may be of several cones, or of none of the map
 
 
 @dataclass
@@ -140,17 +142,21 @@ class DetectionTable(DetectionColumns):
     boundary: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # its label, or UNKNOWN
     u: Array = field(default_factory=lambda: np.zeros(0))  # parameter of the foot point (m)
     used: BoolArray = field(default_factory=lambda: np.zeros(0, bool))  # whether a row of the graph
+    station: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # its cone of a closed map, or -1
 
     def _clear_associations(self) -> None:
         self.boundary, self.u, self.used = self.label.copy(), np.zeros(len(self)), np.zeros(len(self), bool)
+        self.station = np.full(len(self), NO_STATION)
 
     def take(self, rows: IntArray, boundary: IntArray | int, u: Array) -> None:
         """Put detections into use on a boundary, with the parameters (m,) of their foot points."""
         self.used[rows], self.boundary[rows], self.u[rows], self.changed[rows] = True, boundary, u, True
+        self.station[rows] = NO_STATION
 
     def release(self, rows: IntArray) -> None:
         """Take detections out of use; those of unknown colour may join either boundary again."""
         self.used[rows], self.boundary[rows], self.changed[rows] = False, self.label[rows], True
+        self.station[rows] = NO_STATION
 
     def release_all(self) -> None:
         self.release(np.arange(len(self)))

@@ -21,6 +21,7 @@ from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import LapBatches, VehicleState
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.detections import NO_STATION
 from pathspace_graph.mapping.motion import vehicle_state, with_size
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.smoother import CurveSmoother
@@ -164,7 +165,7 @@ class MapperEstimate:
         anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
         for label, boundary in self.boundaries.items():
             active = track.state.active(label)
-            factors += _detection_factors(track, label, active)
+            factors += [*_detection_factors(track, label, active), *_station_factors(track, label)]
             if not track.held_by_prior:
                 factors += _gauge_factors(label, boundary, active, settings.gauge)
             keys = control_keys(label, boundary.first + active).tolist()
@@ -304,6 +305,28 @@ def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gt
         huber=settings.gate.huber,
         sensor_key=track.variables.sensor_key,
         twists=detections.twist[rows],
+    )
+
+
+def _station_factors(track: CurveMap, label: int) -> list[gtsam.CustomFactor]:
+    """Return a factor for each cycle of the detections on a boundary that have a station."""
+    detections, stations = track.detections, track.stations
+    rows = detections.used_on(label)
+    rows = rows[detections.station[rows] != NO_STATION]
+    if stations is None or len(rows) == 0:
+        return []
+    boundary, station = track.state.boundaries[label], detections.station[rows]
+    return gtsam_factors.station_factors(
+        pose_keys(detections.cycle[rows]),
+        control_keys(label, boundary.numbers).tolist(),
+        boundary.tables,
+        u=stations.u[station],
+        sigma_station=track.sigma_stations(station),
+        points_vehicle=detections.measured[rows],
+        covariances=detections.covariance[rows],
+        twists=detections.twist[rows],
+        huber=track.settings.gate.huber,
+        sensor_key=track.variables.sensor_key,
     )
 
 

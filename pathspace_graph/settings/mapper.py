@@ -262,6 +262,8 @@ class MapperSettings(Positive):
     """Gauss-Newton steps of a cycle, each relinearized at the current estimate."""
     steps_grown: int = 1
     """Gauss-Newton steps of a cycle in which a curve grew."""
+    stations: bool = True
+    """Whether the cones of a closed map hold the vehicle along its curves; without, only across them."""
     noise: Literal["measured", "stated"] | None = None
     """Noise of odometry and detections: by default as stated, and measured where nothing is. Constant errors
     of the sensor are measured unless this is `stated`."""

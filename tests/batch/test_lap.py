@@ -90,7 +90,7 @@ def test_the_marginal_and_the_window_are_the_whole_problem() -> None:
     system, at = optimum()
     state, first = at.state, len(log().cycles) - WINDOW
     unchanged = np.eye(state.map_points.size)
-    information, mean = marginal_of(system, at, state, unchanged, first)
+    information, mean, _ = marginal_of(system, at, state, unchanged, first)
     here = np.concatenate([state.variables.calibration, state.map_points.ravel(), state.poses[first]])
     keys = np.concatenate([[CALIBRATION_KEY], state.map_keys, pose_keys(np.array([first]))])
     root = np.linalg.cholesky(information).T

@@ -161,6 +161,13 @@ def constellations(rng: np.random.Generator) -> tuple[Any, ...]:
     )
 
 
+def at_stations(rng: np.random.Generator, sensed: int) -> tuple[Any, ...]:
+    """Detections at stations of curves of degree 3."""
+    points, known, own, _, _, _, measured, twists, sensor, _ = detections(rng, sensed)
+    basis = *rng.normal(size=(2, COUNT, 4)), rng.normal(size=(COUNT, 4, 2))
+    return points, known, own, *basis, measured, twists, sensor, rng.uniform(0.0, 1.0, COUNT)
+
+
 def seen_curves(rng: np.random.Generator, periodic: bool) -> tuple[Any, ...]:
     """Curves, and detections in use on them, of two cycles of three."""
     spans, control_points = curves(rng, periodic, 3)
@@ -198,6 +205,7 @@ CASES: dict[str, Arguments] = {
     "shifted": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng), rng.normal(size=5)),
     "to_map": lambda rng: (rng.normal(size=(COUNT, 2)), poses(rng)),
     "detection_rows": lambda rng: detections(rng, 5),
+    "station_rows": lambda rng: at_stations(rng, 5),
     "placed": lambda rng: (*table(rng), 0.1 * rng.normal(size=5)),
     "open_rows": lambda rng: (
         np.array([0, 1]),
@@ -351,6 +359,7 @@ def test_every_compiled_function_is_tested() -> None:
         ("to_map", lambda rng: (rng.normal(size=(1, 2)), poses(rng))),
         ("to_map", lambda rng: (np.zeros((0, 2)), poses(rng, 1))),
         ("detection_rows", lambda rng: detections(rng, 0)),
+        ("station_rows", lambda rng: at_stations(rng, 0)),
         ("placed", lambda rng: (*table(rng), np.zeros(0))),
         ("curve_rows", lambda rng: seen_curves(rng, True)),
         ("in_view", lambda rng: views(rng, True)),

@@ -1,0 +1,133 @@
+"""Detections of a batch at the stations of its cones: which detection is of which cone, in every lap."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.residuals import sigma_across
+from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.mapping.detections import NO_STATION, DetectionTable
+from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.stations import SIGMA_POSE, CurveStations, Stations
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .association import MIN_CONES, cones_of_curve, first_parameter
+
+FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched (m along the curve)
+SIGMA_STATION: Final = 0.02  # of a cone along a curve that has a control point for each and follows it (m)
+BLOCK: Final = 20.0  # length of the stretches of a later lap that are shifted along the curves together (m)
+REACH: Final = 4.0  # most of a shift (m)
+STEP: Final = 0.1  # between the shifts that are tried (m)
+SIGMA_SHIFT: Final = 1.0  # standard deviation of a shift before it is known (m)
+STRAY: Final = 0.05  # likelihood of a detection far from any cone, by that of one at a cone
+APART: Final = 0.5  # difference between shifts that contradict each other (m)
+ODDS: Final = 20.0  # least odds of a shift against each that contradicts it
+
+
+@dataclass(frozen=True, eq=False)
+class StationMatches:
+    """The stations of a batch's closed curves, and the detections that are of one beyond doubt."""
+
+    stations: Stations
+    rows: IntArray  # (m,) detections, by row of their table
+    station: IntArray  # (m,) station of each
+    sigma: Array  # (m,) standard deviations along the curve, of detection and station (m)
+
+    def used(self, detections: DetectionTable) -> tuple[IntArray, IntArray, Array]:
+        """Return rows, stations and sigmas (k,) of those in use on the boundary of their station."""
+        on_boundary = detections.boundary[self.rows] == self.stations.label[self.station]
+        chosen = detections.used[self.rows] & on_boundary
+        return self.rows[chosen], self.station[chosen], self.sigma[chosen]
+
+
+def match_stations(
+    state: State, detections: DetectionTable, settings: MapperSettings
+) -> StationMatches | None:
+    """Return the cones of the first lap as stations of closed curves, with the detections of all laps.
+
+    None where a curve has too few cones. A lap ends beside its beginning by some decimetres: cones of both
+    ends would be smeared, and those of a later lap matched with their neighbours. So the first lap places
+    them, and each stretch of a later one is shifted along the curves to where its cones are. Where two shifts
+    are about as likely, its detections are of no cone.
+    """
+    places = {}
+    for label, boundary in state.boundaries.items():
+        first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0))
+        cones = cones_of_curve(state, first, label, settings)
+        if len(cones.u) < MIN_CONES:
+            return None
+        u = first_parameter(state, label) + cones.u
+        points = state.control_points(label)
+        places[label] = boundary.find(points, cones.points, u - FOOT_ROOM, u + FOOT_ROOM).u
+    sigmas = {label: np.full(len(u), SIGMA_STATION) for label, u in places.items()}
+    stations = Stations.of(state, places, sigmas)
+    seen = [SeenAgain.of(state, detections, curve) for curve in stations.curves]
+    shift = np.append(shifts(seen), 0.0)  # none for the block -1
+    rows, station, sigma = [], [], []
+    for one in seen:
+        match = one.curve.matched(one.u + shift[one.block], np.hypot(one.sigma, SIGMA_POSE))
+        rows.append(one.rows[match != NO_STATION])
+        station.append(match[match != NO_STATION])
+        sigma.append(np.hypot(one.sigma, SIGMA_STATION)[match != NO_STATION])
+    return StationMatches(stations, *map(np.concatenate, (rows, station, sigma)))
+
+
+@dataclass(frozen=True, eq=False)
+class SeenAgain:
+    """The m used detections of a closed curve's colour, and the stretch of a later lap that each is of."""
+
+    curve: CurveStations
+    rows: IntArray  # rows (m,) in the table of detections
+    u: Array  # parameters (m,) of the foot points (m)
+    sigma: Array  # standard deviations (m,) along the curve (m)
+    block: IntArray  # stretch (m,) of the way driven from which it was seen, -1 in the first lap
+
+    @classmethod
+    def of(cls, state: State, detections: DetectionTable, curve: CurveStations) -> Self:
+        """Choose the detections in use on a curve."""
+        label, boundary = curve.label, state.boundaries[curve.label]
+        rows = detections.used_on(label)
+        rows = rows[detections.label[rows] == label]
+        u, cycle = detections.u[rows], detections.cycle[rows]
+        tangent = boundary.evaluate(state.control_points(label), u, 1)
+        tangent /= np.hypot(*tangent.T)[:, None]
+        poses = state.variables.poses_at(cycle)
+        sigma = sigma_across(tangent, detections.covariance[rows], poses, 0.0)
+        again = laps_of(state, detections, label)[rows] > 0
+        block = (path_lengths(state.poses)[cycle] // BLOCK).astype(np.intp)
+        return cls(curve, rows, u, sigma, np.where(again, block, -1))
+
+
+def laps_of(state: State, detections: DetectionTable, label: int) -> IntArray:
+    """Return the lap (m,) on a closed curve in which each detection's foot point was passed, from 0."""
+    pose_u, length = state.pose_u[label], state.boundaries[label].length
+    at = pose_u[detections.cycle]
+    ahead = np.mod(detections.u - at + 0.5 * length, length) - 0.5 * length
+    return np.asarray(np.floor((at + ahead - pose_u[0]) / length), np.intp)
+
+
+def shifts(seen: Sequence[SeenAgain]) -> Array:
+    """Return by how much each block (k,) of a later lap is to be shifted along the curves; nan in doubt (m).
+
+    A shift is of the vehicle, so it is one for all curves. Its likelihood is that of the cones seen from the
+    block and its neighbours, each once, at their stations.
+    """
+    count = 1 + max(int(one.block.max(initial=-1)) for one in seen)
+    tries = np.arange(-REACH, REACH + 0.5 * STEP, STEP)
+    score = np.zeros((len(tries), count + 2))
+    for one in seen:
+        again = one.block >= 0
+        u, block = one.u[again], one.block[again]
+        sigma = np.hypot(one.sigma[again], SIGMA_POSE)
+        beyond = one.curve.nearest(u + tries[:, None])[1]
+        likelihood = np.log(STRAY + np.exp(-0.5 * (beyond / sigma) ** 2))
+        cone = block * len(one.curve.u) + one.curve.nearest(u)[0]
+        likelihood /= np.bincount(cone)[cone]
+        score[:, 1:-1] += [np.bincount(block, row, count) for row in likelihood]
+    score = score[:, :-2] + score[:, 1:-1] + score[:, 2:] - 0.5 * (tries[:, None] / SIGMA_SHIFT) ** 2
+    best = tries[score.argmax(axis=0)]
+    rival = np.where(np.abs(tries[:, None] - best) > APART, score, -np.inf).max(axis=0)
+    return np.where(score.max(axis=0) - rival > np.log(ODDS), best, np.nan)

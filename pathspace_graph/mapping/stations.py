@@ -1,0 +1,122 @@
+"""Stations: where along closed curves their cones are, which tells where along them the vehicle is.
+
+Distances across the curves say nothing along them. A cone of a closed map has a parameter on its curve, its
+station, and a detection that is of one cone beyond doubt gets a second row, along the tangent there. A
+station is no variable and a cone no landmark: the row moves the curve, the pose and the sensor's calibration.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.bspline import SpanPolynomials
+from pathspace_graph.factors.residuals import station_rows
+from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY
+
+from .detections import NO_STATION, DetectionTable
+from .state import State
+
+CERTAIN: Final = 3.0  # sigmas along a curve that are less than half the distance of the next cone
+SIGMA_POSE: Final = 0.2  # standard deviation of the vehicle along a curve when its detections are matched (m)
+
+
+@dataclass(frozen=True, eq=False)
+class CurveStations:
+    """The stations of one closed curve, ascending."""
+
+    label: int  # of the boundary
+    first: int  # number of the first among those of all curves
+    u: Array  # parameters (k,) of the cones in m, within one length
+    sigma: Array  # standard deviations (k,) of the cones along the curve, given the curve (m)
+    length: float  # length of the curve (m)
+
+    @classmethod
+    def of(cls, label: int, first: int, tables: SpanPolynomials, u: Array, sigma: Array) -> Self:
+        """Place cones at parameters (k,), at least one, of a closed curve with these tables."""
+        u = tables.low + np.mod(u - tables.low, tables.length)
+        order = np.argsort(u)
+        return cls(label, first, u[order], sigma[order], tables.length)
+
+    @property
+    def apart(self) -> Array:
+        """Return the distances (k,) of each station to the nearer one of its neighbours (m)."""
+        gaps = np.diff(self.u, append=self.u[0] + self.length)
+        return np.minimum(gaps, np.roll(gaps, 1))
+
+    def nearest(self, u: Array) -> tuple[IntArray, Array]:
+        """Return the nearest station to each parameter, of any shape, and how far beyond it that is (m)."""
+        after = self.u.searchsorted(self.u[0] + np.mod(u - self.u[0], self.length))
+        both = np.stack([after - 1, after]) % len(self.u)
+        beyond = np.mod(u - self.u[both] + 0.5 * self.length, self.length) - 0.5 * self.length
+        second = np.abs(beyond[1]) < np.abs(beyond[0])
+        return np.where(second, both[1], both[0]), np.where(second, beyond[1], beyond[0])
+
+    def matched(self, u: Array, sigma: Array) -> IntArray:
+        """Return the number (m,) of the station of detections with foot points u (m,).
+
+        It is `NO_STATION` where that is in doubt.
+        Their standard deviations along the curve, with the vehicle's, are sigma (m,). Doubt is judged by what
+        is expected: a choice by the distances that were found would keep the small ones.
+        """
+        station, beyond = self.nearest(u)
+        limit = CERTAIN * np.hypot(sigma, self.sigma[station])
+        sure = (limit < 0.5 * self.apart[station]) & (np.abs(beyond) < limit)
+        return np.where(sure, self.first + station, NO_STATION)
+
+
+@dataclass(frozen=True, eq=False)
+class Stations:
+    """The stations of all curves of a state, one curve after the other, and their basis functions."""
+
+    curves: tuple[CurveStations, ...]
+    u: Array  # (k,) parameters (m)
+    sigma: Array  # (k,) standard deviations along the curves (m)
+    label: IntArray  # (k,) boundary of each
+    value: Array  # (k, p + 1) basis functions at the stations
+    slope: Array  # (k, p + 1) their derivatives (1/m)
+    columns: IntArray  # (k, p + 1) control points that they weigh, by row of `State.map_points`
+
+    @classmethod
+    def of(cls, state: State, u: Mapping[int, Array], sigma: Mapping[int, Array]) -> Self:
+        """Place cones at parameters (k,) of closed curves, at least one on each; by label, as the sigmas."""
+        curves, columns, values, before, count = list[CurveStations](), [], [], 0, 0
+        for label, boundary in state.boundaries.items():
+            own = CurveStations.of(label, count, boundary.tables, u[label], sigma[label])
+            value, span = boundary.tables.evaluate(own.u, 1)
+            curves.append(own)
+            columns.append(before + boundary.columns(span))
+            values.append(value)
+            before, count = before + boundary.size, count + len(own.u)
+        value, slope = map(np.ascontiguousarray, np.concatenate(values, axis=1))
+        numbers = np.array([own.label for own in curves]).repeat([len(own.u) for own in curves])
+        places, sigmas = np.concatenate([(own.u, own.sigma) for own in curves], axis=1)
+        return cls(tuple(curves), places, sigmas, numbers, value, slope, np.concatenate(columns))
+
+    def rows(
+        self, state: State, detections: DetectionTable, rows: IntArray, station: IntArray, sigma: Array
+    ) -> tuple[IntArray, Array, Array, Array]:
+        """Return keys, residuals (m,), sigmas (m,) and derivatives of detections (m,) at stations (m,).
+
+        As `residuals:station_rows`, on [pose | sensor | control points]; sigma (m,) are those of the stations
+        in m.
+        """
+        cycle, variables = detections.cycle[rows], state.variables
+        columns, sensor = self.columns[station], variables.sensor
+        measuring = np.array([FIRST_POSE, SENSOR_KEY]) + np.outer(cycle, [1, 0])
+        keys = np.concatenate([measuring[:, : 2 if len(sensor) else 1], state.map_keys[columns]], axis=1)
+        residual, sigma, jacobian = station_rows(
+            detections.points_map(rows, variables),
+            detections.covariance[rows],
+            variables.poses_at(cycle),
+            self.value[station],
+            self.slope[station],
+            state.map_points[columns],
+            detections.measured[rows],
+            detections.twist[rows],
+            sensor,
+            sigma,
+        )
+        return keys, residual, sigma, jacobian

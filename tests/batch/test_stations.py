@@ -1,0 +1,182 @@
+"""Stations of a batch: cones of the first lap, detections of later ones, what they tell along the curves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pathspace_graph.batch.lap import OpenLap, along_of, lap_optimum, marginal_of, stations_on
+from pathspace_graph.batch.mapper import BatchMapper, nonlinear_graph
+from pathspace_graph.batch.optimizer import gradient
+from pathspace_graph.batch.simplification import map_block, simplified
+from pathspace_graph.batch.stations import BLOCK, SeenAgain, laps_of, match_stations, shifts
+from pathspace_graph.batch.system import SIGMA_SLIDE, BatchSystem, Evaluation, moved
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.io.log import Log
+from pathspace_graph.labels import LEFT
+from pathspace_graph.mapping.stations import CurveStations
+from pathspace_graph.settings.mapper import MapperSettings
+
+from ..scenes.drives import bean_track, lap_log, noisy, true_poses
+from .test_lap import open_lap
+from .test_nonlinear_graph import rotations
+
+Array = NDArray[np.float64]
+
+LENGTH = 120.0
+JITTER = 0.6
+"""Standard deviation of a cone's place in a row that isn't regular (m)."""
+
+
+def row(gap: float, jitter: float) -> CurveStations:
+    """Return the stations of a closed curve of 120 m, some gap apart."""
+    u = np.arange(0.5 * gap, LENGTH, gap)
+    return CurveStations(
+        LEFT, 0, u + jitter * np.random.default_rng(2).normal(size=len(u)), np.full(len(u), 0.02), LENGTH
+    )
+
+
+def seen_again(curve: CurveStations, off: float) -> SeenAgain:
+    """Return five detections of each cone in a second lap, with foot points `off` (m) along the curve."""
+    rng = np.random.default_rng(5)
+    u = np.repeat(curve.u, 5) - off + 0.05 * rng.normal(size=5 * len(curve.u))
+    block = ((LENGTH + u) // BLOCK).astype(np.intp)
+    return SeenAgain(curve, np.arange(len(u)), u, np.full(len(u), 0.1), block)
+
+
+@pytest.mark.parametrize("off", [0.0, 1.3, -1.7, 2.9])
+def test_a_later_lap_is_shifted_to_its_cones(off: float) -> None:
+    """The blocks of the first lap have nothing to shift."""
+    found = shifts([seen_again(row(3.0, JITTER), off)])[int(LENGTH / BLOCK) :]
+    np.testing.assert_allclose(found, off, atol=0.11)
+
+
+def test_a_shift_that_may_be_another_is_in_doubt() -> None:
+    """In a row of gaps of 3 m half a gap ahead is half a gap behind; a whole one is too much to believe."""
+    regular = row(3.0, 0.0)
+    half, none = (shifts([seen_again(regular, off)])[int(LENGTH / BLOCK) :] for off in (1.5, 0.0))
+    assert np.isnan(half).all()
+    np.testing.assert_allclose(none, 0.0, atol=0.11)
+
+
+def test_both_boundaries_tell_the_shift_together() -> None:
+    """Each of two regular rows would be in doubt, but not both."""
+    rows = [seen_again(row(gap, 0.0), 1.4) for gap in (2.5, 3.0)]
+    assert np.isnan(shifts(rows[:1])[int(LENGTH / BLOCK) :]).all()
+    np.testing.assert_allclose(shifts(rows)[int(LENGTH / BLOCK) :], 1.4, atol=0.11)
+
+
+def test_nothing_seen_again_has_no_shift() -> None:
+    first = seen_again(row(3.0, JITTER), 0.0)
+    assert len(shifts([replace(first, block=np.full(len(first.rows), -1))])) == 0
+
+
+# --- a drive ---------------------------------------------------------------------------------------------
+
+
+@cache
+def log() -> Log:
+    """Return a lap and a quarter with noise, past cones that no gap tells apart from the next."""
+    return noisy(lap_log(bean_track(), overrun=25.0), seed=3)
+
+
+@cache
+def optimum() -> tuple[BatchSystem, Evaluation, OpenLap]:
+    """Return the lap's problem at its optimum, the detections of which have stations."""
+    lap = open_lap()
+    system, at, _ = lap_optimum(lap)
+    return system, at, lap
+
+
+def true_cones(system: BatchSystem, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the true cone (m,) of each detection."""
+    drive = log()
+    assert drive.truth is not None
+    poses = true_poses(drive)[system.detections.cycle[rows]]
+    points = to_map(system.detections.measured[rows], poses)
+    return np.asarray(np.hypot(*(points[:, None] - drive.truth.cones).transpose(2, 0, 1)).argmin(axis=1))
+
+
+@pytest.mark.parametrize("off", [0.0, 0.8, -1.0])
+def test_detections_of_both_passes_are_of_one_cone(off: float) -> None:
+    """The seam: the second pass is decimetres along from the first, and is matched with its own cones."""
+    system, at, _ = optimum()
+    state, detections = at.state.copy(), system.detections
+    for label in state.boundaries:
+        second = laps_of(at.state, detections, label) > 0
+        u = detections.u.copy()
+        u[second & (detections.boundary == label)] += off
+        detections = replace(detections, u=u)
+    found = match_stations(state, detections, system.settings)
+    assert found is not None
+    again = np.concatenate([laps_of(state, detections, label)[found.rows] > 0 for label in state.boundaries])
+    assert again.any()
+    cone = true_cones(system, found.rows)
+    for station in np.unique(found.station):
+        assert len(np.unique(cone[found.station == station])) == 1
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    system, at, _ = optimum()
+    state = moved(at.state, np.random.default_rng(2).normal(0.0, 0.01, at.state.variables.layout.size))
+    system.evaluate(state, hold=True)
+    here, layout = system.evaluate(state), state.variables.layout
+    assert here.along is not None and len(here.along.residual) > 300
+    slope = gradient(system.rows(here), layout)
+    rng = np.random.default_rng(5)
+    for _ in range(3):
+        direction, h = rng.normal(size=layout.size), 1e-6
+        costs = [system.evaluate(moved(state, s * h * direction)).cost for s in (1.0, -1.0)]
+        assert slope @ direction == pytest.approx((costs[0] - costs[1]) / (2.0 * h), rel=1e-3)
+
+
+def test_gtsam_has_the_same_linear_problem() -> None:
+    system, at, _ = optimum()
+    state, variables = at.state, at.state.variables
+    theirs = nonlinear_graph(system, at).linearize(variables.gtsam_values(variables.keys))
+    information, vector = theirs.hessian(variables.layout.ordering)
+    expected, negative_gradient = system.linear_graph(at).hessian(variables.layout.ordering)
+    turn, size = rotations(state), np.sqrt(np.diagonal(expected))
+    found = turn @ information @ turn.T
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-6)
+    np.testing.assert_allclose(turn @ vector / size, negative_gradient / size, atol=1e-5)
+
+
+def test_a_station_s_sigma_is_how_it_moves_along_the_few_curve() -> None:
+    """By drawing dense control points of their covariance: the few ones follow by the change."""
+    system, at, lap = optimum()
+    assert system.matches is not None
+    few, change = simplified(at.state, system.detections, system.settings)
+    _, _, dense = marginal_of(system, at, few, change, lap.first_kept)
+    places, sigmas = stations_on(few, system.matches, at.state, change, dense)
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(dense)), dense, 2000)
+    for curve in system.matches.stations.curves:
+        label, old, new = curve.label, at.state.boundaries[curve.label], few.boundaries[curve.label]
+        t = new.evaluate(few.control_points(label), places[label], 1)
+        t /= np.hypot(*t.T)[:, None]
+        mine = draws[:, map_block(at.state, label)]
+        moved_few = mine @ change[map_block(few, label), map_block(at.state, label)].T
+        along = mine @ along_of(old, curve.u, t).T - moved_few @ along_of(new, places[label], t).T
+        np.testing.assert_allclose(along.std(axis=0), sigmas[label], rtol=0.1)
+
+
+def test_a_setting_leaves_the_pure_projection() -> None:
+    lap = open_lap(MapperSettings(stations=False))
+    system, at, _ = lap_optimum(lap)
+    assert system.matches is None and at.along is None
+    assert system.sigma_slide == system.settings.batch.sigma_slide
+    assert optimum()[0].sigma_slide == SIGMA_SLIDE
+
+
+def test_stations_hold_the_vehicle_along_the_curves() -> None:
+    """The same drive, by itself odometry of 2 %: the second pass is told where the first one was."""
+    without, held = (
+        BatchMapper(MapperSettings(stations=stations), log().noise).solve(log(), "odometry")
+        for stations in (False, True)
+    )
+    error = [np.hypot(*(result.trajectory - true_poses(log()))[:, :2].T).mean() for result in (without, held)]
+    assert error[1] < error[0]
