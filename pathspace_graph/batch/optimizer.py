@@ -15,7 +15,6 @@ from pathspace_graph.mapping.state import State
 
 from .association import associate, cone_counts, locate_poses
 from .simplification import reknot
-from .stations import match_stations
 from .system import BatchSystem, Biweight, Evaluation, moved
 
 STATION_PASSES: Final = 2  # times that detections are matched with the cones of a closed optimum
@@ -71,7 +70,6 @@ class Optimizer:
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
         """Return the optimum on curves with about one knot for each cone, which meet the cones."""
         detections, settings, effort = self.system.detections, self.system.settings, self.effort
-        self.system.matches = None
         first_gate = self.settings.gate if self.system.revisits else LOOSE_GATE
         state = self.align_poses(state, POSE_STEPS, first_gate)
         state = reknot(state, detections, settings, dense=True)
@@ -84,8 +82,7 @@ class Optimizer:
                 break
         if settings.stations and all(b.periodic for b in at.state.boundaries.values()):
             for _ in range(STATION_PASSES):
-                self.system.matches = match_stations(at.state, detections, settings)
-                at, convergence = self.run(at.state, self.settings.gate, effort.rounds)
+                at, convergence = self.run(at.state, self.settings.gate, effort.rounds, stations=True)
         return at, convergence
 
     def align_poses(self, state: State, steps: int, gate: float) -> State:
@@ -97,17 +94,18 @@ class Optimizer:
         return state
 
     def run(
-        self, state: State, gate: float, rounds: int, rough: bool = False
+        self, state: State, gate: float, rounds: int, rough: bool = False, stations: bool = False
     ) -> tuple[Evaluation, Convergence]:
         """Optimize in rounds until nothing changes, and return the problem there.
 
         Each round takes one step. The gate (sigmas) shrinks to that of the settings (graduated robust
         weights), and only then may it end. After `SEARCH` rounds, or half of them, associations and sigmas
         stay: where two rows are near, some would change for ever. The end of a `rough` one isn't measured.
+        With `stations`, cones of closed curves hold the detections along them.
         """
         system = self.system
         locate_poses(state, self.settings.association)
-        system.begin(state)
+        system.begin(state, stations)
         self._last_step, tolerance = None, (ROUGH_TOLERANCE if rough else 1.0) * self.effort.tolerance
         cost, done, searched, search = np.inf, 0, 0, max(min(SEARCH, rounds // 2), 1)
         while done < rounds:

@@ -23,7 +23,7 @@ from pathspace_graph.mapping.stations import Stations
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import headings
-from .stations import StationMatches
+from .stations import StationMatches, match_stations
 
 SIGMA_SLIDE: Final = 2.0
 """Standard deviation of a control point's slide along its curve from beside its first pose (m), where
@@ -267,8 +267,12 @@ class BatchSystem:
         count = len(detections)
         self._sigma, self._inside, self._rates = np.ones(count), np.ones(count, bool), np.zeros((count, 2))
 
-    def begin(self, state: State) -> None:
-        """Make the gauges anew, which hold the control points where they are now, when knots have changed."""
+    def begin(self, state: State, stations: bool = False) -> None:
+        """Make the gauges anew, which hold the control points where they are now, when knots have changed.
+
+        With `stations`, the detections in use are matched with the cones of closed curves.
+        """
+        self.matches = match_stations(state, self.detections, self.settings) if stations else None
         self.gauges = {label: curve_gauge(state, label, self.sigma_slide) for label in state.boundaries}
 
     @property

@@ -137,7 +137,7 @@ class CurveMap:
         sigma = sigma_across(directions, detections.covariance[rows], poses, SIGMA_POSE)
         for curve in self.stations.curves:
             own = (detections.boundary[rows] == curve.label) & (detections.label[rows] == curve.label)
-            detections.station[rows[own]] = curve.matched(detections.u[rows[own]], sigma[own])
+            detections.match(rows[own], curve.matched(detections.u[rows[own]], sigma[own]))
 
     # --- weak priors -------------------------------------------------------------------------------------
 

@@ -153,6 +153,10 @@ class DetectionTable(DetectionColumns):
         self.used[rows], self.boundary[rows], self.u[rows], self.changed[rows] = True, boundary, u, True
         self.station[rows] = NO_STATION
 
+    def match(self, rows: IntArray, station: IntArray) -> None:
+        """Set the stations (m,) of detections that have just been put into use."""
+        self.station[rows] = station
+
     def release(self, rows: IntArray) -> None:
         """Take detections out of use; those of unknown colour may join either boundary again."""
         self.used[rows], self.boundary[rows], self.changed[rows] = False, self.label[rows], True
