@@ -174,7 +174,7 @@ def test_the_window_has_every_measurement_once() -> None:
     expected = np.linalg.inv(hessian)
     scale = np.sqrt(np.diagonal(expected))
     assert np.abs((swap.covariance - expected) / np.outer(scale, scale)).max() < 1e-8
-    assert np.abs(expected @ negative_gradient / scale).max() < 0.02
+    assert np.abs(expected @ negative_gradient / scale).max() < 0.05
 
 
 def test_poses_of_the_lap_are_the_solved_ones_and_later_ones_move_with_the_last() -> None:
