@@ -8,18 +8,18 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
-from pathspace_graph.batch.start import Recurrence, unwrap
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.noise import NoiseLearner
+from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.lengths import joined
 from pathspace_graph.mapping.constellation import relative_pose
 from pathspace_graph.mapping.motion import inflate_priors
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import BEGINNING, RefinedMotion, near_start
+from pathspace_graph.mapping.registration import BEGINNING, HEADING, RefinedMotion, near_start
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.settings.mapper import MapperSettings
@@ -37,10 +37,9 @@ STAYS_OPEN: Final = "the loop stays open"  # begins the notice where a batch did
 LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cycle before it was
 REST: Final = 10.0  # distance for which the loop is left as it is after a failure (m)
 RECOGNITION_INTERVAL: Final = 10.0  # least distance of two attempts to recognize the place (m along the path)
-RECURRENCE_INTERVAL: Final = 5.0  # the same for attempts to find a lap in the odometry alone
 RETURN_CYCLES: Final = 10  # least number of cycles of two attempts to find the beginning again by its cones
 LONG_PATH: Final = 1000.0
-"""Path from which on both distances grow with it (m), as the cost of an attempt does."""
+"""Path from which on this distance grows with it (m), as the cost of an attempt does."""
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
 """Notice of the first cycle with a revisit."""
 NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
@@ -75,7 +74,7 @@ class TrackLoop:
         self._settled: float | None = None  # path driven (m) when the closed map was last replaced
         self._closing_tried = 0.0
         self._return_tried, self._return_cycle, self._loop_rests = 0.0, 0, 0.0
-        self._loop_tried, self._recognition_tried = 0.0, 0.0  # paths (m) at which they are tried next
+        self._shape_tried = 0.0
         self._resumes = 0.0
 
     @property
@@ -174,7 +173,8 @@ class TrackLoop:
         """
         if closes:
             self._closes()
-            self.corrected_poses = self.record.closed(self._smoother)
+            self.record.replaced(self.record.with_window(self._smoother))
+            self.corrected_poses = self.record.poses
             self._boundaries_cross = self._crosses()
             return None, f"{OWN_PRIOR}: {self.record.unsolvable}"
         self.record.estimated(self._smoother.map.state)
@@ -185,7 +185,7 @@ class TrackLoop:
             if self._lap_batch is None:
                 self._try_return()
             if self._lap_batch is None:
-                self._try_loop()
+                self._try_shape()
         batch = self._lap_batch
         if not self.closed and batch is None:
             jump = self.revisits.use()
@@ -264,7 +264,7 @@ class TrackLoop:
             self._closes()
         self.lap_seconds = outcome.seconds
         jump, self._settled = go_on_from(smoother, outcome), self._path.length
-        self.record.replaced(outcome.poses[: outcome.first_kept], smoother.variables.poses)
+        self.record.replaced(np.concatenate([outcome.poses[: outcome.first_kept], smoother.variables.poses]))
         self.corrected_poses = self.record.poses
         self._boundaries_cross = self._crosses()
         return jump, notice
@@ -291,7 +291,7 @@ class TrackLoop:
         self.closed = True
         self._smoother.settle()
 
-    def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
+    def _begin_batch(self, start: ClosedMap | Revisit) -> None:
         """Send the lap to its batch, which begins at a map that has just been closed, or at odometry.
 
         In a replay the batch ends in the recorded cycle.
@@ -318,26 +318,25 @@ class TrackLoop:
         if not near_start(self._path, variables.poses[-1], self.settings.closing):
             return
         covariance = smoother.newest_covariance()
-        found = self.record.return_to_beginning(covariance, variables.calibration, variables.sensor)
+        found = self.record.return_to_beginning(covariance, variables.sensor)
         if found is not None:
             self._close_by_batch(found)
 
-    def registered(self, found: RefinedMotion) -> None:
-        """Send the lap to a batch: the newest detections fit the beginning of the curves after a motion."""
-        smoother, record = self._smoother, self.record
-        poses = unwrap(np.concatenate([record.poses[: smoother.first_cycle], smoother.variables.poses]))
-        newest, beginning = poses[-1:].copy(), path_lengths(poses) < BEGINNING
+    def registered(self, found: RefinedMotion, within: float = BEGINNING) -> None:
+        """Send the lap to a batch: a motion lays the newest pose beside one `within` the first metres."""
+        poses = self.record.with_window(self._smoother)
+        newest = poses[-1:].copy()
         found.motion.move(newest)
-        earlier = int(np.hypot(*(poses[beginning, :2] - newest[0, :2]).T).argmin())
-        information = np.asarray(np.linalg.inv(found.covariance), np.float64)
+        beside = (path_lengths(poses) < within) & (np.cos(poses[:, 2] - newest[0, 2]) > np.cos(HEADING))
+        away = np.where(beside, np.hypot(*(poses[:, :2] - newest[0, :2]).T), np.inf)
+        earlier, information = int(away.argmin()), np.asarray(np.linalg.inv(found.covariance), np.float64)
         ends = (earlier, poses[earlier]), (len(poses) - 1, newest[0])
-        revisit = relative_pose(*ends, newest[0], information)
-        self._close_by_batch(record.recurrence_by(revisit, smoother.variables.calibration))
+        self._close_by_batch(relative_pose(*ends, newest[0], information))
 
-    def _close_by_batch(self, recurrence: Recurrence) -> None:
+    def _close_by_batch(self, revisit: Revisit) -> None:
         """Send the lap to a batch, which closes the loop if it agrees; until then the map stays open."""
         self._loop_rests = self._path.length + self.settings.open_lap.retry
-        self._begin_batch(recurrence)
+        self._begin_batch(revisit)
 
     def _is_solvable(self) -> bool:
         """Return whether the lap can be solved as a batch; a lap of too many cones is given up."""
@@ -346,22 +345,17 @@ class TrackLoop:
             self.record.give_up("the lap has too many cones for a batch")
         return self.record.unsolvable is None
 
-    def _try_loop(self) -> None:
-        """Send the lap to a batch from odometry where it is over, but the registration closes no loop."""
-        boundaries, length = self._smoother.map.state.boundaries, self._path.length
-        if length < max(self._loop_tried, self._loop_rests) or set(boundaries) != set(BOUNDARIES):
+    def _try_shape(self) -> None:
+        """Send the lap to a batch where the shape of the newest curves tells the place of a lost vehicle."""
+        length = self._path.length
+        if length < max(self._shape_tried, self._loop_rests):
             return
-        apart = max(length / LONG_PATH, 1.0)
-        self._loop_tried = length + RECURRENCE_INTERVAL * apart
-        if not self._is_solvable():
+        if set(self._smoother.map.state.boundaries) != set(BOUNDARIES) or not self._is_solvable():
             return
-        recurrence = self.record.recurrence()
-        if recurrence is None and length >= self._recognition_tried:
-            self._recognition_tried = length + RECOGNITION_INTERVAL * apart
-            place = recognize(self._smoother)
-            recurrence = None if place is None else self.record.recurrence_since(place.label, place.u)
-        if recurrence is not None:
-            self._close_by_batch(recurrence)
+        self._shape_tried = length + RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)
+        found = recognize(self._smoother)
+        if found is not None:
+            self.registered(found, within=length - self.settings.closing.min_path)
 
     # --- a vehicle that is lost --------------------------------------------------------------------------
 
