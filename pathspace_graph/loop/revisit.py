@@ -26,6 +26,7 @@ from pathspace_graph.factors.se2 import (
     wrap_angle,
 )
 from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.constellation import NEARBY, lay_newest, revisit_of
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
@@ -141,7 +142,7 @@ STARTS: Final = 6  # most earlier stretches, alike in their turns, that it is re
 def recognize(smoother: CurveSmoother) -> RefinedMotion | None:
     """Return the motion of `find_place`; None if there is none, or the vehicle is not lost."""
     settings, track = smoother.map.settings.closing, smoother.map
-    if not may_tell_place(track.state, settings):
+    if set(track.state.boundaries) != set(BOUNDARIES) or not may_tell_place(track.state, settings):
         return None
     smoother.transform_to_origin()
     covariance = smoother.newest_covariance()

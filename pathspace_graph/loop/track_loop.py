@@ -72,9 +72,8 @@ class TrackLoop:
         self._boundaries_cross = False
         self._inflated = self.settings  # with the priors of the calibrations as they are now
         self._settled: float | None = None  # path driven (m) when the closed map was last replaced
-        self._closing_tried = 0.0
-        self._return_tried, self._return_cycle, self._loop_rests = 0.0, 0, 0.0
-        self._shape_tried = 0.0
+        self._tried: dict[str, tuple[float, int]] = {}  # path (m) and cycle of the last attempt in each way
+        self._open_until = 0.0  # path (m) up to which no return is looked for
         self._resumes = 0.0
 
     @property
@@ -107,15 +106,20 @@ class TrackLoop:
 
     def may_close(self) -> bool:
         """Return whether it is time to register the newest detections with the beginning of an open loop."""
-        settings, length = self.settings.closing, self._path.length
-        newest = self._smoother.variables.poses[-1]
-        if self.closed or self._rests or self._lap_batch is not None or length < self._loop_rests:
+        if self.closed or self._rests or self._lap_batch is not None or not self._is_near_start():
             return False
-        if not near_start(self._path, newest, settings):
+        return self._is_due("curves", self.settings.closing.check_interval)
+
+    def _is_near_start(self) -> bool:
+        return near_start(self._path, self._smoother.variables.poses[-1], self.settings.closing)
+
+    def _is_due(self, way: str, interval: float, cycles: float = np.inf) -> bool:
+        """Return whether to look for a return in a way again, some metres or cycles after the last time."""
+        length, cycle = self._path.length, self._smoother.next_cycle
+        tried, tried_cycle = self._tried.get(way, (-np.inf, 0))
+        if length < self._open_until or (length < tried + interval and cycle < tried_cycle + cycles):
             return False
-        if length - self._closing_tried < settings.check_interval:
-            return False
-        self._closing_tried = length
+        self._tried[way] = length, cycle
         return True
 
     # --- what a cycle tells ------------------------------------------------------------------------------
@@ -182,10 +186,8 @@ class TrackLoop:
             return None, ""
         if not self.closed and self._path.length > self.settings.closing.min_path:
             self.record.prepare()
-            if self._lap_batch is None:
-                self._try_return()
-            if self._lap_batch is None:
-                self._try_shape()
+            if self._lap_batch is None and self._is_solvable():
+                self._look_for_return()
         batch = self._lap_batch
         if not self.closed and batch is None:
             jump = self.revisits.use()
@@ -254,7 +256,7 @@ class TrackLoop:
                 return None, ""
             if outcome.is_final:
                 self.record.give_up(outcome.reason)
-                self._loop_rests = 0.0  # a registration may close the loop at once
+                self._open_until = 0.0  # a registration may close the loop at once
             return None, joined([STAYS_OPEN, outcome.reason], ": ")
         if repairs and (not notice or self._crosses(outcome.splines) > self._boundaries_cross):
             return None, ""
@@ -306,21 +308,20 @@ class TrackLoop:
         due = min(max([due, *recorded]), last + 1)
         self._lap_batch = LapBatch(lap, smoother.times[-1], due, last)
 
-    def _try_return(self) -> None:
-        """Send the lap to a batch where the newest cones lie on those of the beginning."""
-        smoother, length = self._smoother, self._path.length
-        due = length >= self._return_tried or smoother.next_cycle >= self._return_cycle
-        if not due or length < self._loop_rests or not self._is_solvable():
-            return
-        self._return_tried = length + self.settings.closing.check_interval
-        self._return_cycle = smoother.next_cycle + RETURN_CYCLES
-        variables = smoother.variables
-        if not near_start(self._path, variables.poses[-1], self.settings.closing):
-            return
-        covariance = smoother.newest_covariance()
-        found = self.record.return_to_beginning(covariance, variables.sensor)
-        if found is not None:
-            self._close_by_batch(found)
+    def _look_for_return(self) -> None:
+        """Send the lap to a batch where the newest cones lie on those of the beginning, or a shape recurs."""
+        smoother, closing = self._smoother, self.settings.closing
+        if self._is_due("cones", closing.check_interval, RETURN_CYCLES) and self._is_near_start():
+            covariance = smoother.newest_covariance()
+            revisit = self.record.return_to_beginning(covariance, smoother.variables.sensor)
+            if revisit is not None:
+                self._close_by_batch(revisit)
+                return
+        length = self._path.length
+        if self._is_due("shape", RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)):
+            found = recognize(smoother)
+            if found is not None:
+                self.registered(found, within=length - closing.min_path)
 
     def registered(self, found: RefinedMotion, within: float = BEGINNING) -> None:
         """Send the lap to a batch: a motion lays the newest pose beside one `within` the first metres."""
@@ -335,7 +336,7 @@ class TrackLoop:
 
     def _close_by_batch(self, revisit: Revisit) -> None:
         """Send the lap to a batch, which closes the loop if it agrees; until then the map stays open."""
-        self._loop_rests = self._path.length + self.settings.open_lap.retry
+        self._open_until = self._path.length + self.settings.open_lap.retry
         self._begin_batch(revisit)
 
     def _is_solvable(self) -> bool:
@@ -344,18 +345,6 @@ class TrackLoop:
         if sum(len(boundary.cone_parameters) for boundary in boundaries) > self.settings.open_lap.max_cones:
             self.record.give_up("the lap has too many cones for a batch")
         return self.record.unsolvable is None
-
-    def _try_shape(self) -> None:
-        """Send the lap to a batch where the shape of the newest curves tells the place of a lost vehicle."""
-        length = self._path.length
-        if length < max(self._shape_tried, self._loop_rests):
-            return
-        if set(self._smoother.map.state.boundaries) != set(BOUNDARIES) or not self._is_solvable():
-            return
-        self._shape_tried = length + RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)
-        found = recognize(self._smoother)
-        if found is not None:
-            self.registered(found, within=length - self.settings.closing.min_path)
 
     # --- a vehicle that is lost --------------------------------------------------------------------------
 
