@@ -41,7 +41,7 @@ def drifting() -> tuple[Log, LogOdometry]:
 
 
 def revisits() -> list[Revisit]:
-    """Returns the last pose and one a lap before, each in the frame of one a lap earlier, without an error."""
+    """Returns the last pose and one a lap before, each in the frame of one a lap earlier, with no error."""
     truth = true_poses(drifting()[0])
     driven, found = path_lengths(truth), []
     for later in (int(driven.searchsorted(driven[-1] - COURSE)), len(truth) - 1):
