@@ -10,6 +10,7 @@ last seconds agree with any place along a straight there. The bends in the newes
 the place.
 """
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -136,17 +137,22 @@ def have_parted(poses: Array, stations: Array, place: int) -> bool:
 
 STRETCH: Final = 150.0  # length at the end of the curves that is registered (m): its bends tell the place
 STRETCH_ROOM: Final = 10.0  # beyond the ends of the earlier stretch in which foot points are searched (m)
+SIGMAS_BENT: Final = (1.5, 1.5, 0.15)  # of the newest pose in the stretch behind it (m, m, rad)
 STARTS: Final = 6  # most earlier stretches, alike in their turns, that it is registered with
 
 
 def recognize(smoother: CurveSmoother) -> RefinedMotion | None:
-    """Return the motion of `find_place`; None if there is none, or the vehicle is not lost."""
+    """Return the motion of `find_place`; None if there is none, or the vehicle is not lost.
+
+    The newest stretch was laid as it is, but odometry has bent it, so the covariance is wider.
+    """
     settings, track = smoother.map.settings.closing, smoother.map
     if set(track.state.boundaries) != set(BOUNDARIES) or not may_tell_place(track.state, settings):
         return None
     smoother.transform_to_origin()
     covariance = smoother.newest_covariance()
-    return find_place(track, covariance, settings) if is_lost(covariance, settings) else None
+    found = find_place(track, covariance, settings) if is_lost(covariance, settings) else None
+    return found and replace(found, covariance=found.covariance + np.diag(SIGMAS_BENT) ** 2)
 
 
 def may_tell_place(state: State, settings: ClosingSettings) -> bool:

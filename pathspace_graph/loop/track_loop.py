@@ -309,7 +309,7 @@ class TrackLoop:
         self._lap_batch = LapBatch(lap, smoother.times[-1], due, last)
 
     def _look_for_return(self) -> None:
-        """Send the lap to a batch where the newest cones lie on those of the beginning, or a shape recurs."""
+        """Send the lap to a batch where the newest cones lie on early ones, or the newest curves do."""
         smoother, closing = self._smoother, self.settings.closing
         if self._is_due("cones", closing.check_interval, RETURN_CYCLES) and self._is_near_start():
             covariance = smoother.newest_covariance()
@@ -324,7 +324,7 @@ class TrackLoop:
                 self.registered(found, within=length - closing.min_path)
 
     def registered(self, found: RefinedMotion, within: float = BEGINNING) -> None:
-        """Send the lap to a batch: a motion lays the newest pose beside one `within` the first metres."""
+        """Send the lap to a batch: once moved, the newest pose is beside one `within` the first metres."""
         poses = self.record.with_window(self._smoother)
         newest = poses[-1:].copy()
         found.motion.move(newest)

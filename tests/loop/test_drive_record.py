@@ -1,4 +1,4 @@
-"""The record of the open lap: its poses in the closed map, and after which path length the drive recurs."""
+"""The record of the open lap: its measurements, and its poses in the closed map."""
 
 from __future__ import annotations
 
