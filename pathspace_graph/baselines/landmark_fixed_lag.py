@@ -148,7 +148,7 @@ class LandmarkFixedLag:
         if self.closed:
             self._merge(*find_duplicates(state, len(state), self.smoother.last_covariance, self.settings))
         elif self._near_start():
-            reach = self.settings.closing.radius + self.settings.closing.drift * length
+            reach = self.settings.closing.radius_after(length)
             recent, old = state.positions(detected), np.flatnonzero(self._old())
             pairs = detect_loop(self.smoother, recent, old, reach)
             if pairs is not None:

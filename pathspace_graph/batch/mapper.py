@@ -15,7 +15,6 @@ from pathspace_graph.errors import SettingsError, SolveError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors, station_factors
 from pathspace_graph.factors.noise import KnownNoise
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import path_lengths, rotation, to_map
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
@@ -47,10 +46,10 @@ from pathspace_graph.scale import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.spline.boundary import Boundary
 
-from .lap import disagreement, evidence, is_true_closure, objection
+from .lap import disagreement, objection, share_used
 from .optimizer import LOOSE_GATE, Convergence, Optimizer
 from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplified
-from .start import CurveMapper, Recurrence, find_recurrence, find_revisits, start_odometry, start_online
+from .start import CurveMapper, find_revisits, start_odometry, start_online
 from .system import BatchSystem, Biweight, CurveGauge, Evaluation
 
 ROOM: Final = 4.0  # distance from its foot points in which a factor searches them (m along the curve)
@@ -296,10 +295,7 @@ class BatchMapper:
         start, online = start or self.settings.batch.start, None
         optimizer, found = _optimizer(judged, on_round), None
         if start != "online":
-            found = find_optimum_by_cones(optimizer, judged)
-        if found is None and start != "online":
-            optimizer = _optimizer(judged, on_round)
-            found = find_closed_optimum(optimizer)
+            found = find_closed_optimum(optimizer, judged)
         if found is None and start == "odometry":
             optimizer = _optimizer(judged, on_round)
             found = find_open_optimum(optimizer)
@@ -398,23 +394,22 @@ def _vehicle(state: State, known: FactoredSystem, sigma_size: float) -> VehicleS
     return VehicleState.split(state.poses[-1], variables.calibrations, covariance)
 
 
-def find_optimum_by_cones(optimizer: Optimizer, judged: JudgedLog) -> tuple[Evaluation, Convergence] | None:
+def find_closed_optimum(optimizer: Optimizer, judged: JudgedLog) -> tuple[Evaluation, Convergence] | None:
     """Return the optimum whose search begins with odometry and the cones that were met again.
 
     None where none were met again, the search fails, or something speaks against the map.
     """
     system, chain, settings = optimizer.system, judged.chain, judged.settings
-    recurrence = find_revisits(chain, all_cones(judged), settings)
-    if not recurrence.recurs:
+    system.revisits = find_revisits(chain, all_cones(judged), settings)
+    if not system.revisits:
         return None
-    system.revisits = recurrence.revisits
     try:
-        at, convergence = optimizer.find(start_odometry(chain, system.detections, settings, recurrence))
+        start = start_odometry(chain, system.detections, settings, system.revisits)
+        at, convergence = optimizer.find(start)
     except SolveError:
         return None
-    found = evidence(at, system.detections, settings)
-    poses = at.state.poses
-    why = disagreement(system, poses) or objection(found, at.state.splines, poses, settings)
+    poses, used = at.state.poses, share_used(at, system.detections)
+    why = disagreement(system, poses) or objection(at.state.splines, poses, used, settings)
     return None if why else (at, convergence)
 
 
@@ -427,28 +422,10 @@ def all_cones(judged: JudgedLog) -> DetectionColumns:
     return table
 
 
-def find_closed_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence] | None:
-    """Return the optimum whose search begins with the loop in the odometry.
-
-    None where no lap recurs in it, the search fails, or the detections are against the loop.
-    """
-    system = optimizer.system
-    chain, detections, settings = system.chain, system.detections, system.settings
-    recurrence = find_recurrence(chain.dead_reckoned(np.zeros(CALIBRATION_SIZE)), settings)
-    if not recurrence.recurs:
-        return None
-    try:
-        at, convergence = optimizer.find(start_odometry(chain, detections, settings, recurrence))
-    except SolveError:
-        return None
-    return (at, convergence) if is_true_closure(evidence(at, detections, settings), settings) else None
-
-
 def find_open_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:
     """Return the optimum whose search begins with an open map along the odometry."""
     system = optimizer.system
-    path = Recurrence(path_lengths(system.chain.dead_reckoned(np.zeros(CALIBRATION_SIZE))))
-    return optimizer.find(start_odometry(system.chain, system.detections, system.settings, path))
+    return optimizer.find(start_odometry(system.chain, system.detections, system.settings))
 
 
 def _with_wider_priors(

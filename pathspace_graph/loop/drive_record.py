@@ -9,7 +9,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
-from math import nan
 from multiprocessing import current_process, resource_tracker
 from threading import Thread
 from typing import Any, Final, cast
@@ -18,11 +17,11 @@ import numpy as np
 from joblib.externals import loky
 from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
-from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, is_worth_trying, solve_lap
-from pathspace_graph.batch.start import Recurrence, find_recurrence, unwrap
+from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
+from pathspace_graph.batch.start import unwrap
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
-from pathspace_graph.factors.se2 import compose, path_lengths, to_map, to_vehicle, wrap_angle
+from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.front_end.noise import NoiseLearner
@@ -75,8 +74,6 @@ class DriveRecord:
         self._motions: list[MeasuredMotion] = []  # that lead to each cycle
         self._seen: list[Detections] = []  # of each cycle, with their stated covariances
         self._orange: list[Detections] = []  # those of orange cones
-        self._beside: dict[int, Array] = {}  # (n,) parameter of each cycle on each curve, NaN before it
-        self._reckoned: Array = np.zeros((0, 3))  # pose of each cycle by the odometry alone
         self._prepared = False
 
     def give_up(self, reason: str) -> None:
@@ -93,8 +90,6 @@ class DriveRecord:
         self._motions.append(reading.motion)
         self._seen.append(Detections(seen.t, seen.points_vehicle, reading.stated, seen.labels))
         self._orange.append(reading.orange)
-        last = self._reckoned[-1] if len(self._reckoned) else np.zeros(3)
-        self._reckoned = _extended(self._reckoned, compose(last, reading.motion.odometry.delta))
         if len(self.stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
@@ -104,29 +99,24 @@ class DriveRecord:
             self._seen[cycle] = self._seen[cycle].with_others(detections)
 
     def estimated(self, state: State) -> None:
-        """Add the newest pose, and its parameter on each curve while these are open."""
-        if state.closed and self.unsolvable is not None:
-            return
-        for label in () if state.closed else state.boundaries:
-            known = self._beside.get(label, np.full(len(self.poses), nan))
-            self._beside[label] = _extended(known, state.pose_u[label][-1])
-        self.poses = _extended(self.poses, state.poses[-1])
+        """Add the newest pose, unless the loop has closed and no batch needs it."""
+        if not state.closed or self.unsolvable is None:
+            self.poses = read_only(np.concatenate([self.poses, state.poses[-1:]]))
 
-    def replaced(self, earlier: Array, window: Array) -> None:
-        """Replace all poses by those (k, 3) before the window and those (P, 3) in it, after a swap."""
-        self.poses = read_only(unwrap(np.concatenate([earlier, window])))
+    def with_window(self, smoother: CurveSmoother) -> Array:
+        """Return the poses (P, 3) of all cycles: those of the window are as they are now."""
+        return unwrap(np.concatenate([self.poses[: smoother.first_cycle], smoother.variables.poses]))
+
+    def replaced(self, poses: Array) -> None:
+        """Replace the poses (P, 3) of all cycles."""
+        self.poses = read_only(unwrap(poses))
 
     def bent(self, keyframes: Mapping[int, Array], smoother: CurveSmoother) -> None:
         """Replace the poses: the window has its own, earlier ones move with the keyframes (3,), by cycle."""
         first = smoother.first_cycle
         earlier, window = unwrap(self.poses[: first + 1]), smoother.variables.poses
         bent = bend(earlier, {0: earlier[0], **keyframes, first: window[0]})
-        self.replaced(bent[:first], window)
-
-    def recurrence(self) -> Recurrence | None:
-        """Return the recurrence of the path driven, if odometry alone says that the lap is over."""
-        found = find_recurrence(self._reckoned, self.settings)
-        return found if is_worth_trying(found, self.settings) else None
+        self.replaced(np.concatenate([bent[:first], window]))
 
     def seen_in(self, sensor: Array) -> SeenIn:
         """Return the detections of some cycles, corrected by the calibration (5,) of the sensor, or (0,)."""
@@ -143,24 +133,9 @@ class DriveRecord:
 
         return seen_in
 
-    def return_to_beginning(self, covariance: Array, calibration: Array, sensor: Array) -> Recurrence | None:
-        """Return the lap that has been driven, if the newest cones lie on those of the drive's beginning."""
-        revisit = return_to_beginning(self.seen_in(sensor), unwrap(self.poses), covariance, self.settings)
-        return None if revisit is None else self.recurrence_by(revisit, calibration)
-
-    def recurrence_by(self, revisit: Revisit, calibration: Array) -> Recurrence:
-        """Return the recurrence of the drive whose later pose was measured in the frame of an earlier one."""
-        chain = chained(self.stamps, self._noise.motions_of_lap(self._motions), self.settings.odometry)
-        driven = path_lengths(chain.dead_reckoned(calibration))
-        lap = float(driven[revisit.later] - driven[revisit.earlier] - revisit.local[0])
-        return Recurrence(driven, lap, revisits=(revisit,))
-
-    def recurrence_since(self, label: int, u: float) -> Recurrence:
-        """Return the recurrence of the path driven since the vehicle was beside a place (m) of a boundary."""
-        poses = self._reckoned
-        before = int(np.nanargmin(np.abs(self._beside[label] - u)))
-        driven, turn = path_lengths(poses), float(poses[-1, 2] - poses[before, 2])
-        return Recurrence(driven, float(driven[-1] - driven[before]), turn, 1.0)
+    def return_to_beginning(self, covariance: Array, sensor: Array) -> Revisit | None:
+        """Return the newest pose beside an early one, if the newest cones lie on those of the beginning."""
+        return return_to_beginning(self.seen_in(sensor), unwrap(self.poses), covariance, self.settings)
 
     def prepare(self) -> None:
         """Start the process that solves laps, once, so that it is ready when the loop closes."""
@@ -173,23 +148,13 @@ class DriveRecord:
         if self._prepared and self.unsolvable is None:
             _submit(_nothing)
 
-    def closed(self, smoother: CurveSmoother) -> Array:
-        """Keep the poses (P, 3) of all cycles as they are after the loop has closed, and return them."""
-        poses = unwrap(np.concatenate([self.poses[: smoother.first_cycle], smoother.variables.poses]))
-        self.replaced(poses, np.zeros((0, 3)))
-        return poses
-
-    def lap(self, first_kept: int, start: ClosedMap | Recurrence, settings: MapperSettings) -> OpenLap:
+    def lap(self, first_kept: int, start: ClosedMap | Revisit, settings: MapperSettings) -> OpenLap:
         """Return the lap; the priors of its calibrations are those of the settings, which may be wide."""
         chain = chained(self.stamps, self._noise.motions_of_lap(self._motions), settings.odometry)
         table = DetectionTable.of(self._seen, twists=chain.twists)
         seen = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
         table = replace(table, covariance=seen.covariances)
         return OpenLap(settings, chain, table, first_kept, start)
-
-
-def _extended(known: Array, newest: Array) -> Array:
-    return read_only(np.concatenate([known, newest[None]]))
 
 
 @dataclass(frozen=True)
@@ -211,10 +176,10 @@ class LapBatch:
         self.due, self.last = due, last  # first and last cycle in which the marginal may replace the prior
         self.first_kept = lap.first_kept  # cycle from which on the window holds the poses until then
         self._lap = lap
-        self._future: Future[LapMarginal | None] | None = None
+        self._future: Future[LapMarginal] | None = None
         self.send()
 
-    def send(self) -> Future[LapMarginal | None]:
+    def send(self) -> Future[LapMarginal]:
         """Hand the lap to the process, unless it has it already; a snapshot holds the lap alone."""
         if self._future is None:
             self._future = _submit(solve_lap, self._lap)
@@ -243,8 +208,6 @@ class LapBatch:
         except Exception as error:  # a vehicle drives on, whatever has failed there
             failed = f"the batch of the lap has failed: {type(error).__name__}: {error}"
             return Unsolved(" ".join(failed.split()))
-        if solved is None:
-            return Unsolved("the detections are against the loop", is_final=False)
         nearly = solved.convergence.converged or solved.convergence.gradient < SOLVED
         return solved if nearly else Unsolved("the batch of the lap has not converged", is_final=False)
 

@@ -10,13 +10,12 @@ last seconds agree with any place along a straight there. The bends in the newes
 the place.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pathspace_graph.batch.start import unwrap
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import (
     compose,
@@ -28,6 +27,7 @@ from pathspace_graph.factors.se2 import (
     wrap_angle,
 )
 from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.constellation import NEARBY, lay_newest, revisit_of
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
@@ -37,6 +37,7 @@ from pathspace_graph.mapping.registration import (
     START_CHI2,
     START_STEP,
     Motion,
+    RefinedMotion,
     Registration,
     Sightings,
     by_motion,
@@ -74,9 +75,9 @@ class Revisits:
         if smoother.submaps is None or not smoother.submaps.keyframes:
             return None
         self._next = length + ATTEMPTS
-        poses = np.concatenate([record.poses[: smoother.first_cycle], smoother.variables.poses])
+        poses = record.with_window(smoother)
         place = earlier_pass(poses)
-        revisit = None if place is None else self._measured(unwrap(poses), place)
+        revisit = None if place is None else self._measured(poses, place)
         if revisit is None:
             return None
         self._next = length + INTERVAL
@@ -136,26 +137,22 @@ def have_parted(poses: Array, stations: Array, place: int) -> bool:
 
 STRETCH: Final = 150.0  # length at the end of the curves that is registered (m): its bends tell the place
 STRETCH_ROOM: Final = 10.0  # beyond the ends of the earlier stretch in which foot points are searched (m)
+SIGMAS_BENT: Final = (1.5, 1.5, 0.15)  # of the newest pose in the stretch behind it (m, m, rad)
 STARTS: Final = 6  # most earlier stretches, alike in their turns, that it is registered with
 
 
-@dataclass(frozen=True, eq=False)
-class RecognizedPlace:
-    """Place where the newest stretch of the curves lies on an earlier stretch."""
+def recognize(smoother: CurveSmoother) -> RefinedMotion | None:
+    """Return the motion of `find_place`; None if there is none, or the vehicle is not lost.
 
-    motion: Motion  # motion of the newest stretch onto the earlier one
-    label: int  # a boundary
-    u: float  # parameter of this beside the newest pose (m), a lap or more before
-
-
-def recognize(smoother: CurveSmoother) -> RecognizedPlace | None:
-    """Return the earlier place of the newest stretch; None if it is not found, or the vehicle is not lost."""
+    The newest stretch was laid as it is, but odometry has bent it, so the covariance is wider.
+    """
     settings, track = smoother.map.settings.closing, smoother.map
-    if not may_tell_place(track.state, settings):
+    if set(track.state.boundaries) != set(BOUNDARIES) or not may_tell_place(track.state, settings):
         return None
     smoother.transform_to_origin()
     covariance = smoother.newest_covariance()
-    return find_place(track, covariance, settings) if is_lost(covariance, settings) else None
+    found = find_place(track, covariance, settings) if is_lost(covariance, settings) else None
+    return found and replace(found, covariance=found.covariance + np.diag(SIGMAS_BENT) ** 2)
 
 
 def may_tell_place(state: State, settings: ClosingSettings) -> bool:
@@ -172,8 +169,8 @@ def may_tell_place(state: State, settings: ClosingSettings) -> bool:
     return sigma_of_information(rows.T @ rows) <= settings.sigma_max
 
 
-def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) -> RecognizedPlace | None:
-    """Return the only place at which the newest stretch of the curves agrees with an earlier stretch.
+def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) -> RefinedMotion | None:
+    """Return the only motion by which the newest stretch of the curves lies on an earlier stretch.
 
     It is searched for within the `covariance` (3, 3) of the newest pose. None if no place agrees, if several
     do, or if the place along the track is uncertain.
@@ -185,7 +182,7 @@ def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) ->
     variance = np.linalg.eigvalsh(covariance[:2, :2])[-1]
     wide = np.diag([variance, variance, covariance[2, 2]])
     prior = np.asarray(np.linalg.inv(wide * settings.prior_scale**2), np.float64)
-    found: RecognizedPlace | None = None
+    found: RefinedMotion | None = None
     for vector, low in _starts(state, prior, settings):
         place = _register(state, newest, Motion(centre, vector), low, prior, settings)
         if place is None:
@@ -241,8 +238,8 @@ def _minima(values: Array, apart: int) -> list[int]:
 
 def _register(
     state: State, newest: dict[int, Array], start: Motion, low: float, prior: Array, settings: ClosingSettings
-) -> RecognizedPlace | None:
-    """Return the place of the newest cones, registered from a start whose first boundary begins at `low`."""
+) -> RefinedMotion | None:
+    """Return the motion of the newest cones, registered from a start whose first boundary begins at `low`."""
     first, boundary = next(iter(state.boundaries.items()))
     corners = boundary.evaluate(state.control_points(first), np.array([low, low + STRETCH]))
     stretches = {label: _between(state, label, corners) for label in state.boundaries}
@@ -252,11 +249,8 @@ def _register(
     found = Registration(state, seen, stretches, settings).refine(start, np.zeros(3), prior)
     shares = [len(found.matches.inliers(b)[0]) / max(len(cones), 1) for b, cones in newest.items()]
     sigma = sigma_of_information(found.matches.hessian)
-    if min(shares) < settings.inlier_share or sigma > settings.sigma_max:
-        return None
-    low_high = np.array(stretches[first])[:, None]
-    place = boundary.find(state.control_points(first), found.motion.apply(state.poses[-1:, :2]), *low_high)
-    return RecognizedPlace(found.motion, first, float(place.u[0]))
+    is_there = min(shares) >= settings.inlier_share and sigma <= settings.sigma_max
+    return found if is_there else None
 
 
 def _between(state: State, label: int, corners: Array) -> tuple[float, float]:

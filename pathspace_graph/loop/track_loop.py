@@ -8,18 +8,18 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
-from pathspace_graph.batch.start import Recurrence, unwrap
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.noise import NoiseLearner
+from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health, HealthMonitor
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.lengths import joined
 from pathspace_graph.mapping.constellation import relative_pose
 from pathspace_graph.mapping.motion import inflate_priors
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import BEGINNING, RefinedMotion, near_start
+from pathspace_graph.mapping.registration import BEGINNING, HEADING, RefinedMotion, near_start
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.settings.mapper import MapperSettings
@@ -37,10 +37,9 @@ STAYS_OPEN: Final = "the loop stays open"  # begins the notice where a batch did
 LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cycle before it was
 REST: Final = 10.0  # distance for which the loop is left as it is after a failure (m)
 RECOGNITION_INTERVAL: Final = 10.0  # least distance of two attempts to recognize the place (m along the path)
-RECURRENCE_INTERVAL: Final = 5.0  # the same for attempts to find a lap in the odometry alone
 RETURN_CYCLES: Final = 10  # least number of cycles of two attempts to find the beginning again by its cones
 LONG_PATH: Final = 1000.0
-"""Path from which on both distances grow with it (m), as the cost of an attempt does."""
+"""Path from which on this distance grows with it (m), as the cost of an attempt does."""
 REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
 """Notice of the first cycle with a revisit."""
 NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
@@ -73,9 +72,8 @@ class TrackLoop:
         self._boundaries_cross = False
         self._inflated = self.settings  # with the priors of the calibrations as they are now
         self._settled: float | None = None  # path driven (m) when the closed map was last replaced
-        self._closing_tried = 0.0
-        self._return_tried, self._return_cycle, self._loop_rests = 0.0, 0, 0.0
-        self._loop_tried, self._recognition_tried = 0.0, 0.0  # paths (m) at which they are tried next
+        self._tried: dict[str, tuple[float, int]] = {}  # path (m) and cycle of the last attempt in each way
+        self._open_until = 0.0  # path (m) up to which no return is looked for
         self._resumes = 0.0
 
     @property
@@ -108,15 +106,20 @@ class TrackLoop:
 
     def may_close(self) -> bool:
         """Return whether it is time to register the newest detections with the beginning of an open loop."""
-        settings, length = self.settings.closing, self._path.length
-        newest = self._smoother.variables.poses[-1]
-        if self.closed or self._rests or self._lap_batch is not None or length < self._loop_rests:
+        if self.closed or self._rests or self._lap_batch is not None or not self._is_near_start():
             return False
-        if not near_start(self._path, newest, settings):
+        return self._is_due("curves", self.settings.closing.check_interval)
+
+    def _is_near_start(self) -> bool:
+        return near_start(self._path, self._smoother.variables.poses[-1], self.settings.closing)
+
+    def _is_due(self, way: str, interval: float, cycles: float = np.inf) -> bool:
+        """Return whether to look for a return in a way again, some metres or cycles after the last time."""
+        length, cycle = self._path.length, self._smoother.next_cycle
+        tried, tried_cycle = self._tried.get(way, (-np.inf, 0))
+        if length < self._open_until or (length < tried + interval and cycle < tried_cycle + cycles):
             return False
-        if length - self._closing_tried < settings.check_interval:
-            return False
-        self._closing_tried = length
+        self._tried[way] = length, cycle
         return True
 
     # --- what a cycle tells ------------------------------------------------------------------------------
@@ -174,7 +177,8 @@ class TrackLoop:
         """
         if closes:
             self._closes()
-            self.corrected_poses = self.record.closed(self._smoother)
+            self.record.replaced(self.record.with_window(self._smoother))
+            self.corrected_poses = self.record.poses
             self._boundaries_cross = self._crosses()
             return None, f"{OWN_PRIOR}: {self.record.unsolvable}"
         self.record.estimated(self._smoother.map.state)
@@ -182,10 +186,8 @@ class TrackLoop:
             return None, ""
         if not self.closed and self._path.length > self.settings.closing.min_path:
             self.record.prepare()
-            if self._lap_batch is None:
-                self._try_return()
-            if self._lap_batch is None:
-                self._try_loop()
+            if self._lap_batch is None and self._is_solvable():
+                self._look_for_return()
         batch = self._lap_batch
         if not self.closed and batch is None:
             jump = self.revisits.use()
@@ -254,7 +256,7 @@ class TrackLoop:
                 return None, ""
             if outcome.is_final:
                 self.record.give_up(outcome.reason)
-                self._loop_rests = 0.0  # a registration may close the loop at once
+                self._open_until = 0.0  # a registration may close the loop at once
             return None, joined([STAYS_OPEN, outcome.reason], ": ")
         if repairs and (not notice or self._crosses(outcome.splines) > self._boundaries_cross):
             return None, ""
@@ -264,7 +266,7 @@ class TrackLoop:
             self._closes()
         self.lap_seconds = outcome.seconds
         jump, self._settled = go_on_from(smoother, outcome), self._path.length
-        self.record.replaced(outcome.poses[: outcome.first_kept], smoother.variables.poses)
+        self.record.replaced(np.concatenate([outcome.poses[: outcome.first_kept], smoother.variables.poses]))
         self.corrected_poses = self.record.poses
         self._boundaries_cross = self._crosses()
         return jump, notice
@@ -291,7 +293,7 @@ class TrackLoop:
         self.closed = True
         self._smoother.settle()
 
-    def _begin_batch(self, start: ClosedMap | Recurrence) -> None:
+    def _begin_batch(self, start: ClosedMap | Revisit) -> None:
         """Send the lap to its batch, which begins at a map that has just been closed, or at odometry.
 
         In a replay the batch ends in the recorded cycle.
@@ -306,38 +308,36 @@ class TrackLoop:
         due = min(max([due, *recorded]), last + 1)
         self._lap_batch = LapBatch(lap, smoother.times[-1], due, last)
 
-    def _try_return(self) -> None:
-        """Send the lap to a batch where the newest cones lie on those of the beginning."""
-        smoother, length = self._smoother, self._path.length
-        due = length >= self._return_tried or smoother.next_cycle >= self._return_cycle
-        if not due or length < self._loop_rests or not self._is_solvable():
-            return
-        self._return_tried = length + self.settings.closing.check_interval
-        self._return_cycle = smoother.next_cycle + RETURN_CYCLES
-        variables = smoother.variables
-        if not near_start(self._path, variables.poses[-1], self.settings.closing):
-            return
-        covariance = smoother.newest_covariance()
-        found = self.record.return_to_beginning(covariance, variables.calibration, variables.sensor)
-        if found is not None:
-            self._close_by_batch(found)
+    def _look_for_return(self) -> None:
+        """Send the lap to a batch where the newest cones lie on early ones, or the newest curves do."""
+        smoother, closing = self._smoother, self.settings.closing
+        if self._is_due("cones", closing.check_interval, RETURN_CYCLES) and self._is_near_start():
+            covariance = smoother.newest_covariance()
+            revisit = self.record.return_to_beginning(covariance, smoother.variables.sensor)
+            if revisit is not None:
+                self._close_by_batch(revisit)
+                return
+        length = self._path.length
+        if self._is_due("shape", RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)):
+            found = recognize(smoother)
+            if found is not None:
+                self.registered(found, within=length - closing.min_path)
 
-    def registered(self, found: RefinedMotion) -> None:
-        """Send the lap to a batch: the newest detections fit the beginning of the curves after a motion."""
-        smoother, record = self._smoother, self.record
-        poses = unwrap(np.concatenate([record.poses[: smoother.first_cycle], smoother.variables.poses]))
-        newest, beginning = poses[-1:].copy(), path_lengths(poses) < BEGINNING
+    def registered(self, found: RefinedMotion, within: float = BEGINNING) -> None:
+        """Send the lap to a batch: once moved, the newest pose is beside one `within` the first metres."""
+        poses = self.record.with_window(self._smoother)
+        newest = poses[-1:].copy()
         found.motion.move(newest)
-        earlier = int(np.hypot(*(poses[beginning, :2] - newest[0, :2]).T).argmin())
-        information = np.asarray(np.linalg.inv(found.covariance), np.float64)
+        beside = (path_lengths(poses) < within) & (np.cos(poses[:, 2] - newest[0, 2]) > np.cos(HEADING))
+        away = np.where(beside, np.hypot(*(poses[:, :2] - newest[0, :2]).T), np.inf)
+        earlier, information = int(away.argmin()), np.asarray(np.linalg.inv(found.covariance), np.float64)
         ends = (earlier, poses[earlier]), (len(poses) - 1, newest[0])
-        revisit = relative_pose(*ends, newest[0], information)
-        self._close_by_batch(record.recurrence_by(revisit, smoother.variables.calibration))
+        self._close_by_batch(relative_pose(*ends, newest[0], information))
 
-    def _close_by_batch(self, recurrence: Recurrence) -> None:
+    def _close_by_batch(self, revisit: Revisit) -> None:
         """Send the lap to a batch, which closes the loop if it agrees; until then the map stays open."""
-        self._loop_rests = self._path.length + self.settings.open_lap.retry
-        self._begin_batch(recurrence)
+        self._open_until = self._path.length + self.settings.open_lap.retry
+        self._begin_batch(revisit)
 
     def _is_solvable(self) -> bool:
         """Return whether the lap can be solved as a batch; a lap of too many cones is given up."""
@@ -345,23 +345,6 @@ class TrackLoop:
         if sum(len(boundary.cone_parameters) for boundary in boundaries) > self.settings.open_lap.max_cones:
             self.record.give_up("the lap has too many cones for a batch")
         return self.record.unsolvable is None
-
-    def _try_loop(self) -> None:
-        """Send the lap to a batch from odometry where it is over, but the registration closes no loop."""
-        boundaries, length = self._smoother.map.state.boundaries, self._path.length
-        if length < max(self._loop_tried, self._loop_rests) or set(boundaries) != set(BOUNDARIES):
-            return
-        apart = max(length / LONG_PATH, 1.0)
-        self._loop_tried = length + RECURRENCE_INTERVAL * apart
-        if not self._is_solvable():
-            return
-        recurrence = self.record.recurrence()
-        if recurrence is None and length >= self._recognition_tried:
-            self._recognition_tried = length + RECOGNITION_INTERVAL * apart
-            place = recognize(self._smoother)
-            recurrence = None if place is None else self.record.recurrence_since(place.label, place.u)
-        if recurrence is not None:
-            self._close_by_batch(recurrence)
 
     # --- a vehicle that is lost --------------------------------------------------------------------------
 

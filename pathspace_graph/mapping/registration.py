@@ -142,10 +142,9 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
     """Return whether a pose (3,) may be on the beginning again: after a long path, near it, and along it."""
     if path.length < settings.min_path:
         return False
-    drift = settings.radius + settings.drift * path.length
     away = np.hypot(*(path.beginning[:, :2] - pose[:2]).T)
     same_direction = np.cos(path.beginning[:, 2] - pose[2]) > np.cos(HEADING)
-    return bool((same_direction & (away < drift)).any())
+    return bool((same_direction & (away < settings.radius_after(path.length))).any())
 
 
 def passes_start(state: State, path: DrivenPath, motion: Motion) -> bool:

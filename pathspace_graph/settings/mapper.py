@@ -146,13 +146,8 @@ class AssociationSettings(Positive, group="batch.association"):
 
 @dataclass(frozen=True)
 class ClosureSettings(Positive, group="batch.closure"):
-    """When a loop is tried that no registration has closed, and when its result is believed."""
+    """When a closed loop is believed."""
 
-    laps: float = 1.3
-    """Least length of the path driven, in laps."""
-    min_correlation: float = 0.9
-    """Least correlation of the curvature with itself a lap later: 0.92 and more in true laps, 0.89 at most
-    in two loops side by side."""
     used: float = 2.0 / 3.0
     """Least share of the first lap's coloured detections on the curves of a closed result."""
 
@@ -187,7 +182,7 @@ class BatchSettings(Positive):
 
     start: Start = "auto"
     """Start of the optimization: odometry alone, or the map of an online run over the log. With `auto` it is
-    odometry where laps recur and the detections are for the closed loop, else an online run."""
+    odometry where cones are met again and nothing speaks against the closed loop, else an online run."""
     size_share: float = 0.43
     """Most control points as a share of the distinct cones that were detected (the paper has 0.44)."""
     dense_share: float = 1.0

@@ -70,6 +70,10 @@ class ClosingSettings(Positive):
     gauge_laps: float = 4.0
     """Laps on the closed map after which its position and heading as a whole are held; `inf` for never."""
 
+    def radius_after(self, length: float) -> float:
+        """Return the distance from the first stretch within which the loop may close after a length (m)."""
+        return self.radius + self.drift * length
+
 
 @dataclass(frozen=True)
 class HealthSettings(Positive):

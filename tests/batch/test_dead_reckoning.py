@@ -1,4 +1,4 @@
-"""The start from odometry alone: lap correspondences by hand, and a drift that they take out."""
+"""The start from odometry and revisits: a drift that they take out, and curves beside the first lap."""
 
 from __future__ import annotations
 
@@ -8,21 +8,17 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.start import (
-    Recurrence,
-    align_laps,
-    find_recurrence,
-    lap_correspondences,
-    start_odometry,
-)
+from pathspace_graph.batch.start import aligned_odometry, start_odometry
+from pathspace_graph.factors.se2 import path_lengths, relative, wrap_angle
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
+from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.batch import course_log
+from ..scenes.batch import COURSE, course_log
 from ..scenes.drives import ahead, corridor, exact_log, true_poses
 
 Array = NDArray[np.float64]
@@ -41,41 +37,39 @@ def drifting() -> tuple[Log, LogOdometry]:
     return log, judge_log(log, log.noise, SETTINGS).chain
 
 
-# --- correspondences -------------------------------------------------------------------------------------
-
-
-def by_hand() -> Recurrence:
-    """Returns a pose each 3 m along 39 m of a course of 15 m, which turns once to the left in a lap."""
-    return Recurrence(np.arange(0.0, 40.0, 3.0), 15.0, 6.1, 1.0)
-
-
-def test_each_lap_passes_every_reference_pose_once() -> None:
-    """Reference poses stand at 0 and 7.5 m of each lap, and poses at 0, 3, 6 ... m."""
-    cycles, reference, turns = lap_correspondences(by_hand())
-    np.testing.assert_array_equal(cycles * 3.0, [0.0, 9.0, 15.0, 24.0, 30.0, 39.0])
-    np.testing.assert_array_equal(reference, [0, 1, 0, 1, 0, 1])
-    np.testing.assert_allclose(turns, 2.0 * np.pi * np.array([0, 0, 1, 1, 2, 2]))
-
-
 # --- drift -----------------------------------------------------------------------------------------------
+
+
+def revisits() -> list[Revisit]:
+    """Returns the last pose and one a lap before, each in the frame of one a lap earlier, with no error."""
+    truth = true_poses(drifting()[0])
+    driven, found = path_lengths(truth), []
+    for later in (int(driven.searchsorted(driven[-1] - COURSE)), len(truth) - 1):
+        earlier = int(driven.searchsorted(driven[later] - COURSE))
+        local = relative(truth[earlier], truth[later])
+        local[2] = wrap_angle(local[2])
+        found.append(Revisit(earlier, later, local, np.diag([10.0, 10.0, 50.0])))
+    return found
 
 
 def test_the_drift_of_the_odometry_is_taken_out() -> None:
     """Dead reckoning ends metres away, the aligned laps within decimetres. The bias has a prior."""
     log, chain = drifting()
     reckoned, truth = chain.dead_reckoned(np.zeros(2)), true_poses(log)
-    poses, calibration = align_laps(chain, find_recurrence(reckoned, SETTINGS))
+    aligned = aligned_odometry(chain, revisits())
     assert np.hypot(*(reckoned - truth)[-1, :2]) > 2.0
-    assert np.hypot(*(poses - truth)[:, :2].T).max() < 0.7
-    np.testing.assert_allclose(calibration[1], BIAS, rtol=0.3)
+    assert np.hypot(*(aligned.poses - truth)[:, :2].T).max() < 0.7
+    np.testing.assert_allclose(aligned.calibration[1], BIAS, rtol=0.3)
 
 
-def test_what_is_aligned_is_a_minimum_of_odometry_and_correspondences() -> None:
-    """The gradient by every pose is that of the odometry alone where a pose has no correspondence."""
+def test_what_is_aligned_is_a_minimum_of_odometry_and_revisits() -> None:
+    """The gradient by every pose is that of the odometry alone where a pose has no revisit."""
     _, chain = drifting()
-    recurrence = find_recurrence(chain.dead_reckoned(np.zeros(2)), SETTINGS)
-    poses, calibration = align_laps(chain, recurrence)
-    free = np.setdiff1d(np.arange(1, len(poses) - 1), lap_correspondences(recurrence)[0])
+    again = revisits()
+    aligned = aligned_odometry(chain, again)
+    poses, calibration = aligned.poses, aligned.calibration
+    met = [cycle for one in again for cycle in (one.earlier, one.later)]
+    free = np.setdiff1d(np.arange(1, len(poses) - 1), met)
     h = 1e-5
     for k in free[:: len(free) // 8]:
         for axis in range(3):
@@ -93,7 +87,7 @@ def test_what_is_aligned_is_a_minimum_of_odometry_and_correspondences() -> None:
 
 def test_the_curves_of_a_closed_course_stand_beside_its_path() -> None:
     log, chain = drifting()
-    state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
+    state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS, revisits())
     assert set(state.boundaries) == set(BOUNDARIES)
     assert log.truth is not None
     for label, boundary in state.boundaries.items():
@@ -105,13 +99,13 @@ def test_the_curves_of_a_closed_course_stand_beside_its_path() -> None:
         assert distance.max() < 1.0
 
 
-def test_a_path_that_does_not_recur_is_dead_reckoned() -> None:
+def test_a_path_without_a_revisit_is_dead_reckoned() -> None:
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, 5.0), cones, labels)
     chain = judge_log(log, log.noise, SETTINGS).chain
     state = start_odometry(chain, DetectionTable.of(log.cycles), SETTINGS)
-    np.testing.assert_array_equal(state.poses, chain.dead_reckoned(np.zeros(2)))
-    np.testing.assert_array_equal(state.variables.calibration, 0.0)
+    np.testing.assert_allclose(state.poses, chain.dead_reckoned(np.zeros(2)), atol=1e-9)
+    np.testing.assert_allclose(state.variables.calibration, 0.0, atol=1e-9)
     for label, y in ((LEFT, 2.0), (RIGHT, -2.0)):
         assert not state.boundaries[label].periodic
         np.testing.assert_allclose(state.control_points(label)[:, 1], y, atol=1e-6)

@@ -16,10 +16,9 @@ from pathspace_graph.batch.mapper import all_cones
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import (
     INTERVAL,
-    Recurrence,
-    align_revisits,
     aligned_odometry,
     find_revisits,
+    length_of_lap,
 )
 from pathspace_graph.factors.se2 import path_lengths, relative, wrap_angle
 from pathspace_graph.front_end.front_end import judge_log
@@ -38,8 +37,8 @@ Array = NDArray[np.float64]
 SETTINGS = own_settings(MapperSettings())
 
 
-def found_in(log: Log) -> tuple[LogOdometry, Recurrence]:
-    """Return the odometry of a log, and its recurrence by its cones."""
+def found_in(log: Log) -> tuple[LogOdometry, tuple[Revisit, ...]]:
+    """Return the odometry of a log, and its revisits."""
     judged = judge_log(log, log.noise, SETTINGS)
     return judged.chain, find_revisits(judged.chain, all_cones(judged), judged.settings)
 
@@ -57,11 +56,11 @@ def laps() -> Log:
 def test_each_later_lap_of_a_drive_is_met_again_every_few_metres() -> None:
     """Where each pose is in the frame of the earlier one is found within centimetres."""
     log = laps()
-    chain, found = found_in(log)
-    truth, revisits = true_poses(log), found.revisits
+    chain, revisits = found_in(log)
+    truth = true_poses(log)
     driven = path_lengths(truth)
     lap = float(driven[revisits[0].later] - driven[revisits[0].earlier])
-    assert found.lap == pytest.approx(lap, rel=0.02)
+    assert length_of_lap(chain.dead_reckoned(np.zeros(2)), revisits[0]) == pytest.approx(lap, rel=0.02)
     later = driven[[one.later for one in revisits]]
     assert (np.diff(later[:-1]) >= INTERVAL - 1.0).all()  # at the end of the drive there may be one more
     assert len(revisits) > 0.6 * (driven[-1] - lap) / INTERVAL
@@ -71,14 +70,13 @@ def test_each_later_lap_of_a_drive_is_met_again_every_few_metres() -> None:
     rounds = (driven[[one.later for one in revisits]] - driven[[one.earlier for one in revisits]]) / lap
     np.testing.assert_allclose(rounds, np.round(rounds), atol=0.05)
     before = np.hypot(*(chain.dead_reckoned(np.zeros(2)) - truth)[:, :2].T)
-    after = np.hypot(*(align_revisits(chain, revisits)[0] - truth)[:, :2].T)
+    after = np.hypot(*(aligned_odometry(chain, revisits).poses - truth)[:, :2].T)
     assert after.mean() < 0.5 * before.mean()
 
 
 def test_an_open_road_is_met_nowhere_again() -> None:
     log = noisy(exact_log(ahead(8.0, 12.0), *corridor(120.0)), seed=2)
-    _, found = found_in(log)
-    assert not found.recurs and found.revisits == ()
+    assert found_in(log)[1] == ()
 
 
 # --- how far an optimum is from them ---------------------------------------------------------------------

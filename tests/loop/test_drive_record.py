@@ -1,19 +1,18 @@
-"""The record of the open lap: its poses in the closed map, and after which path length the drive recurs."""
+"""The record of the open lap: its measurements, and its poses in the closed map."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.start import Recurrence
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
 from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_twists
 from pathspace_graph.factors.se2 import compose, wrap_angle
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.front_end.noise import NoiseLearner
+from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.variables import CALIBRATION_KEY, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
@@ -29,6 +28,7 @@ Array = NDArray[np.float64]
 
 RADIUS, SPEED, CYCLE = 40.0, 10.0, 0.1
 LAP = 2.0 * np.pi * RADIUS
+AGAIN = Revisit(0, 1, np.zeros(3), np.eye(3))
 NOTHING = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp)
 
 
@@ -60,26 +60,6 @@ def driven(laps: float, drift: float) -> DriveRecord:
     return record
 
 
-@pytest.mark.parametrize("back", [1.0, 1.2])
-def test_the_drive_recurs_since_it_was_beside_the_place(back: float) -> None:
-    """The place is `back` laps behind; the path length and the turn since then are those of the odometry."""
-    drift, before = 0.004, 2.0 * np.pi * (1.5 - back)
-    record = driven(1.5, drift)
-    found = record.recurrence_since(LEFT, before * (RADIUS - 2.0))
-    assert found.lap == pytest.approx(back * LAP, abs=2.5 * SPEED * CYCLE)
-    assert found.turn == pytest.approx(found.lap * (1.0 / RADIUS + drift), abs=1e-2)
-    assert found.driven[-1] == pytest.approx(1.5 * LAP, abs=4.0)
-    assert found.recurs
-
-
-def test_a_lap_is_over_once_a_good_part_of_it_was_driven_again() -> None:
-    """A circle turns alike everywhere, so only how near the drive is to its beginning tells the lap."""
-    assert driven(1.2, 0.0).recurrence() is None
-    found = driven(1.5, 0.0).recurrence()
-    assert found is not None
-    assert found.lap == pytest.approx(LAP, abs=20.0)
-
-
 def test_a_record_that_was_given_up_keeps_the_first_reason() -> None:
     record = driven(0.2, 0.0)
     record.give_up("one")
@@ -90,7 +70,7 @@ def test_a_record_that_was_given_up_keeps_the_first_reason() -> None:
 def test_the_chain_of_the_lap_is_the_odometry_that_was_measured() -> None:
     record = driven(0.5, 0.0)
     settings = MapperSettings(odometry=OdometrySettings(sigma_scale=0.1, sigma_bias=0.2))
-    chain = record.lap(3, record.recurrence_since(LEFT, 0.0), settings).chain
+    chain = record.lap(3, AGAIN, settings).chain
     np.testing.assert_array_equal(chain.calibration_sigma, [0.1, 0.2])
     poses = chain.dead_reckoned(np.zeros(2))
     angle = len(poses) * SPEED * CYCLE / RADIUS
@@ -156,7 +136,7 @@ def test_a_lap_is_solved_with_the_noise_that_is_known_when_it_closes() -> None:
         record.measured(front_end.update(odometry, replace(cone, t=0.2 * (k + 1))))
     along, across = RayNoise(np.array([0.1, 0.05])), RayNoise(np.array([0.0, 0.02]))
     noise.measured = MeasuredNoise(stated, drift, 0.05, along, across)
-    lap = record.lap(0, Recurrence(np.zeros(2), 1.0, 0.0, 1.0), MapperSettings())
+    lap = record.lap(0, AGAIN, MapperSettings())
     expected = integrate_twists(np.full(4, 0.05), twist, np.hypot(stated, drift / np.sqrt(0.05)))
     found = lap.chain.odometry.intervals[0].covariance
     np.testing.assert_allclose(found, expected.covariance, atol=2.0 * MIN_SIGMA**2)
