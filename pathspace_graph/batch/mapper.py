@@ -1,6 +1,6 @@
 """The offline batch: every pose, every detection and both curves of a log in one least-squares problem."""
 
-from collections.abc import Callable, Iterator, MutableSequence
+from collections.abc import Callable, Iterator, MutableSequence, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -20,6 +20,7 @@ from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
+from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import odometry_factor
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
@@ -210,6 +211,9 @@ def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) ->
     return room
 
 
+Found = tuple[Evaluation, Convergence]
+"""An optimum, and how its search ended."""
+
 NAME: Final = "spline"  # name of the estimator on the command line
 
 
@@ -292,23 +296,8 @@ class BatchMapper:
         judged = judge_log(log, self.noise, own_settings(self.settings))
         settings, chain = judged.settings, judged.chain
         watch.lap("integrate")
-        start, online = start or self.settings.batch.start, None
-        optimizer, found = _optimizer(judged, on_round), None
-        if start != "online":
-            found = find_closed_optimum(optimizer, judged)
-        if found is None and start == "odometry":
-            optimizer = _optimizer(judged, on_round)
-            found = find_open_optimum(optimizer)
-        if found is None:
-            if self.online is None:
-                raise SettingsError("start online: expected an online mapper to begin with, found none")
-            watch.lap("optimum")
-            mapper = self.online(replace(self.settings, scale=1.0), self.noise)
-            state, online = start_online(log, mapper)
-            optimizer = _optimizer(judged, on_round)
-            optimizer.system.revisits = mapper.revisits
-            watch.lap("start")
-            found = optimizer.find(state)
+        start = start or self.settings.batch.start
+        optimizer, found, online = self._search(log, judged, start, on_round, watch)
         system = optimizer.system
         at, convergence, known = _with_wider_priors(optimizer, *found)
         watch.lap("optimum")
@@ -344,6 +333,33 @@ class BatchMapper:
             optimum=at,
             objection=unmapped(detections, state.poses),
         )
+
+    def _search(
+        self, log: Log, judged: JudgedLog, start: Start, on_round: Callable[[], None] | None, watch: Stopwatch
+    ) -> tuple[Optimizer, Found, RunResult | None]:
+        """Return the optimum with its optimizer, and the online run that the search began with, if it did."""
+        if start != "online":
+            optimizer = _optimizer(judged, on_round)
+            revisits = find_revisits(judged.chain, all_cones(judged), judged.settings)
+            found = find_closed_optimum(optimizer, revisits)
+            if found is None and start == "odometry":
+                optimizer = _optimizer(judged, on_round)
+                found = find_open_optimum(optimizer)
+            if found is not None:
+                return optimizer, found, None
+        if self.online is None:
+            raise SettingsError("start online: expected an online mapper to begin with, found none")
+        watch.lap("optimum")
+        mapper = self.online(replace(self.settings, scale=1.0), self.noise)
+        state, online = start_online(log, mapper)
+        watch.lap("start")
+        optimizer = _optimizer(judged, on_round)
+        found = find_closed_optimum(optimizer, mapper.closed_by) if start == "auto" else None
+        if found is None:
+            optimizer = _optimizer(judged, on_round)
+            optimizer.system.revisits = mapper.revisits
+            found = optimizer.find(state)
+        return optimizer, found, online
 
 
 def _optimizer(judged: JudgedLog, on_round: Callable[[], None] | None) -> Optimizer:
@@ -394,17 +410,17 @@ def _vehicle(state: State, known: FactoredSystem, sigma_size: float) -> VehicleS
     return VehicleState.split(state.poses[-1], variables.calibrations, covariance)
 
 
-def find_closed_optimum(optimizer: Optimizer, judged: JudgedLog) -> tuple[Evaluation, Convergence] | None:
-    """Return the optimum whose search begins with odometry and the cones that were met again.
+def find_closed_optimum(optimizer: Optimizer, revisits: Sequence[Revisit]) -> Found | None:
+    """Return the optimum whose search begins with odometry and the places that were met again.
 
-    None where none were met again, the search fails, or something speaks against the map.
+    None where there are none, the search fails, or something speaks against the map.
     """
-    system, chain, settings = optimizer.system, judged.chain, judged.settings
-    system.revisits = find_revisits(chain, all_cones(judged), settings)
-    if not system.revisits:
+    system, settings = optimizer.system, optimizer.system.settings
+    system.revisits = tuple(revisits)
+    if not revisits:
         return None
     try:
-        start = start_odometry(chain, system.detections, settings, system.revisits)
+        start = start_odometry(system.chain, system.detections, settings, revisits)
         at, convergence = optimizer.find(start)
     except SolveError:
         return None
@@ -422,7 +438,7 @@ def all_cones(judged: JudgedLog) -> DetectionColumns:
     return table
 
 
-def find_open_optimum(optimizer: Optimizer) -> tuple[Evaluation, Convergence]:
+def find_open_optimum(optimizer: Optimizer) -> Found:
     """Return the optimum whose search begins with an open map along the odometry."""
     system = optimizer.system
     return optimizer.find(start_odometry(system.chain, system.detections, system.settings))

@@ -54,6 +54,7 @@ class TrackLoop:
     def __init__(self, smoother: CurveSmoother, path: DrivenPath, noise: NoiseLearner) -> None:
         self.settings = smoother.map.settings
         self.closed = False  # whether the loop has closed: the map has its final size
+        self.closed_by: Revisit | None = None  # return that began the batch which closed it, or is to
         self.health = Health()  # how far the newest estimate can be trusted
         self.corrected_poses: Array = np.zeros((0, 3))  # (k, 3) of the first k cycles, since closing
         self.lap_seconds = float("nan")  # wall time (s) of the lap's batch, once it has replaced the prior
@@ -337,6 +338,7 @@ class TrackLoop:
     def _close_by_batch(self, revisit: Revisit) -> None:
         """Send the lap to a batch, which closes the loop if it agrees; until then the map stays open."""
         self._open_until = self._path.length + self.settings.open_lap.retry
+        self.closed_by = revisit
         self._begin_batch(revisit)
 
     def _is_solvable(self) -> bool:

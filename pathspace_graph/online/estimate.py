@@ -242,6 +242,11 @@ class MapperEstimate:
         return tuple(self.loop.revisits.found)
 
     @property
+    def closed_by(self) -> tuple[Revisit, ...]:
+        """Return the pose measured in the frame of one of the beginning, by which a batch closed the loop."""
+        return (self.loop.closed_by,) if self.closed and self.loop.closed_by else ()
+
+    @property
     def lap_seconds(self) -> float:
         """Return the wall time (s) of the batch of the lap, once it has replaced the prior."""
         return self.loop.lap_seconds

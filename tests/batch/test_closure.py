@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import objection, share_used
-from pathspace_graph.batch.mapper import BatchMapper, find_closed_optimum
+from pathspace_graph.batch.mapper import BatchMapper, all_cones, find_closed_optimum
 from pathspace_graph.batch.optimizer import LOOSE_GATE, Optimizer
 from pathspace_graph.batch.simplification import own_settings
+from pathspace_graph.batch.start import find_revisits
 from pathspace_graph.batch.system import BatchSystem, Biweight
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.io.log import Log
@@ -46,7 +47,7 @@ def test_a_course_that_is_driven_again_is_closed() -> None:
     judged = judge_log(driven(1.4), driven(1.4).noise, SETTINGS)
     detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
     optimizer = Optimizer(BatchSystem(detections, judged.chain, SETTINGS, Biweight(LOOSE_GATE)))
-    found = find_closed_optimum(optimizer, judged)
+    found = find_closed_optimum(optimizer, find_revisits(judged.chain, all_cones(judged), SETTINGS))
     assert found is not None
     at, convergence = found
     assert convergence.converged
