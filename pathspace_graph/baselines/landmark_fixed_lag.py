@@ -29,7 +29,7 @@ from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from . import landmark_association as association
-from .landmark_association import Gates, difference_covariances, find_duplicates, squared_mahalanobis
+from .landmark_association import CREATE, GATES, difference_covariances, find_duplicates, squared_mahalanobis
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 
 UNSEEN: Final = 40.0  # path (m) without a detection after which a landmark is not associated near the start
@@ -251,7 +251,7 @@ def detect_loop(
     old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
         return None
-    gate = Gates.of(settings.landmark).match
+    gate = GATES.match
     test = JointCompatibility(smoother, recent, old, settings.closing.prior_scale)
     seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
     if len(seeds) == 0:
@@ -265,7 +265,7 @@ def detect_loop(
     i, j = np.array(pairs, np.intp).T
     labels = state.labels[recent[i]]
     enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
-    fits = distance < chi2_quantile(settings.landmark.create, POINT * len(labels))
+    fits = distance < chi2_quantile(CREATE, POINT * len(labels))
     return (recent[i], old[j]) if enough and len(labels) >= MIN_PAIRS and fits else None
 
 

@@ -82,7 +82,7 @@ def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
     poses = unwrap(np.concatenate([corrected, run.trajectory[len(corrected) :]]))
     vehicle = mapper.vehicle_state()
     calibration = np.concatenate([vehicle.calibration, vehicle.sensor])
-    add_drive(state, poses, calibration, mapper.settings.batch.association)
+    add_drive(state, poses, calibration)
     return state, run
 
 
@@ -184,7 +184,7 @@ def start_odometry(
     detections.correct(calibration[CALIBRATION_SIZE:])
     for label in BOUNDARIES:
         _begin_boundary(state, label, poses, recurrence, detections, settings)
-    add_drive(state, poses, calibration, settings.batch.association)
+    add_drive(state, poses, calibration)
     return state
 
 
