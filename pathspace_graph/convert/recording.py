@@ -13,7 +13,7 @@ from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
-from pathspace_graph.io.log import Detections, Log, Odometry, Truth
+from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .messages import Points, points_of, stamp_of, twist_of
@@ -39,20 +39,14 @@ class Recording:
     scans: list[Points]  # detections of each message, in the frame of the sensor
     source: dict[str, str]  # where the record comes from, in words
     notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, with the number of times
-    truth: Truth | None = None  # what is known of the drive, for evaluation only
-    odometry_sigma: Array | None = None  # (3,) sigmas of a twist (m/s, m/s, rad/s), where they are stated
     mounting: tuple[float, float, float] | None = None  # sensor's pose (m, m, rad), where it is stated
-
-
-def twists_of(moves: Array) -> Array:
-    """Return the logarithm (n, 3) of relative poses (n, 3): the twists that lead there in 1 s."""
-    return np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
 
 
 def twists_between(t: Array, poses: Array) -> Array:
     """Return the constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
-    moves = np.array([relative(one, other) for one, other in pairwise(poses)])
-    return twists_of(moves) / np.diff(t)[:, None]
+    moves = [relative(one, other) for one, other in pairwise(poses)]
+    logarithms = np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
+    return logarithms / np.diff(t)[:, None]
 
 
 def rate(count: int, seconds: float) -> str:
@@ -101,7 +95,7 @@ def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None
 
 
 def windowed(record: Recording, window: Window, file: Path) -> Recording:
-    """Return the part of a record that counts; a later beginning, where the map begins, has no truth."""
+    """Return the part of a record that counts."""
     notes, record = record.notes, _near(record, window.range_max, record.notes)
     scan_t = record.scan_t + window.time_offset
     clocks = elapsed(record.t), elapsed(scan_t)
@@ -116,11 +110,8 @@ def windowed(record: Recording, window: Window, file: Path) -> Recording:
     notes["odometry samples outside --start and --end were left out"] += int((~kept).sum())
     notes["messages with detections outside --start and --end were left out"] += int((~seen).sum())
     scans = [scan for scan, one in zip(record.scans, seen.tolist(), strict=True) if one]
-    truth = record.truth
-    if truth is not None and window != Window():
-        truth = None if window.start else replace(truth, associations=None)
     t, twists = record.t[kept], record.twists[kept]
-    return replace(record, t=t, twists=twists, scan_t=scan_t[seen], scans=scans, truth=truth)
+    return replace(record, t=t, twists=twists, scan_t=scan_t[seen], scans=scans)
 
 
 def _near(record: Recording, most: float | None, notes: Counter[str]) -> Recording:
@@ -138,7 +129,7 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
     """Return a record in order of time, in the vehicle frame; InputError of `file` if nothing is usable."""
     frames = replace(frames, mounting=frames.mounting or record.mounting)
     odometry = _odometry(record, frames, file)
-    stated = record.odometry_sigma if noise.sigma_odometry is None else noise.sigma_odometry
+    stated = noise.sigma_odometry
     return Log(
         odometry,
         _cycles(record, odometry, frames, noise, file),
@@ -146,7 +137,6 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
         source=record.source,
         odometry_stated=stated is not None,
         detections_stated=noise.states_detections or not record.notes[ASSUMED],
-        truth=record.truth,
     )
 
 
