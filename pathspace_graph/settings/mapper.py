@@ -217,16 +217,6 @@ class CkfSettings(Positive):
 
 
 @dataclass(frozen=True)
-class CenterlineSettings(Positive):
-    """The estimators that map a track as one centre line with a width."""
-
-    spacing: float = 3.0
-    """Distance of the knots of the centre line (m)."""
-    sigma_width: float = 0.3
-    """Standard deviation (m) of the second difference of the half widths at neighbouring control points."""
-
-
-@dataclass(frozen=True)
 class MapperSettings(Positive):
     """All settings of the estimators; each takes the groups that are its own."""
 
@@ -259,7 +249,6 @@ class MapperSettings(Positive):
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     batch: BatchSettings = field(default_factory=BatchSettings)
     ckf: CkfSettings = field(default_factory=CkfSettings)
-    centerline: CenterlineSettings = field(default_factory=CenterlineSettings)
 
     sigma_step: ClassVar[float] = 0.5  # of a control point's move in a step, m: damps sliding along the curve
 
