@@ -47,7 +47,7 @@ Used = tuple[int, tuple[int, int], bool]  # number of detections that were used,
 
 
 class _Filter:
-    """What both filters share; a late cycle is a ReadingError, since no earlier pose could take it."""
+    """What both filters share."""
 
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None

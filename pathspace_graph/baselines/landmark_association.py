@@ -73,10 +73,8 @@ def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
     return np.asarray((labels[:, None] == landmark_labels[None]) | (labels == UNKNOWN)[:, None])
 
 
-def associate_newest(
-    smoother: LandmarkSmoother, new: slice, eligible: BoolArray, cycle: int | None = None
-) -> None:
-    """Associate the rows `new` of the newest pose, or late ones of a `cycle`, with eligible (n,) landmarks.
+def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray) -> None:
+    """Associate the rows `new` of the newest pose with eligible (n,) landmarks.
 
     A detection between the gates becomes AMBIGUOUS, and so does one in the match gate of a landmark with
     another label, for whose own label it votes.
@@ -87,7 +85,7 @@ def associate_newest(
     near = nearest_within(state.landmarks, points, ROUGH)[1]
     landmarks = np.flatnonzero(near & eligible)
     numbers = state.numbers[landmarks]
-    predicted = predict(smoother, landmarks, cycle)
+    predicted = predict(smoother, landmarks)
     any_label = pair_costs(detections.point[rows], detections.covariance[rows], *predicted)
     same_label = compatible(detections.label[rows], state.labels[landmarks])
     landmark, is_new = associate(np.where(same_label, any_label, np.inf))
@@ -99,14 +97,14 @@ def associate_newest(
         state.vote(detections.label[rows[explained]], numbers[any_label[explained].argmin(axis=1)])
 
 
-def predict(smoother: LandmarkSmoother, landmarks: IntArray, cycle: int | None = None) -> tuple[Array, Array]:
-    """Return where landmarks (k,), by position, should be detected from the newest or a given cycle's pose.
+def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> tuple[Array, Array]:
+    """Return where landmarks (k,), by position, should be detected from the newest pose.
 
     The places (k, 2) are in m, vehicle frame, with covariances `H_j Sigma H_j'` (k, 2, 2), Sigma that of pose
     and landmark in the last step, zero before the first one.
     """
     state, k = smoother.map.state, len(landmarks)
-    cycles = np.full(k, smoother.next_cycle - 1 if cycle is None else cycle)
+    cycles = np.full(k, smoother.next_cycle - 1)
     poses, zero = smoother.variables.poses_at(cycles), np.zeros((k, POINT))
     expected = landmark_residuals(poses, state.landmarks[landmarks], zero)
     if smoother.last_step is None or k == 0:

@@ -4,7 +4,6 @@ The loop closes where enough of the landmarks seen now are those of the beginnin
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import chi2_quantile
-from pathspace_graph.front_end.front_end import FrontEnd, at_nearest_pose
+from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections, Odometry
@@ -61,9 +60,7 @@ class LandmarkFixedLag:
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         watch = Stopwatch()
-        cycle = self.front_end.admit(odometry, detections, self.smoother.times)
-        if cycle.late:
-            return cycle.counted(self._use_late(cycle.detections, watch))
+        cycle = self.front_end.admit(odometry, detections)
         reading = self.front_end.update(cycle.odometry, cycle.detections)
         motion, detections = reading.motion, reading.detections
         predict(self.smoother, self.path, motion, detections.t)
@@ -81,21 +78,11 @@ class LandmarkFixedLag:
         watch.lap("marginalize")
         return cycle.counted(self._result(detections.t, watch.laps))
 
-    def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
-        detections = self.front_end.use_late(detections, self.smoother.times)
-        late, cycle, twist = at_nearest_pose(self.smoother, detections, self.settings.motion)
-        new = self.smoother.map.detections.append(late, cycle, twist)
-        self.smoother.map.correct()
-        self._use(new, detections.t, watch, cycle)
-        watch.lap("update")
-        used = int(self.smoother.map.detections.used[new].sum())
-        return replace(self._result(detections.t, watch.laps), readings=used)
-
-    def _use(self, new: slice, t: float, watch: Stopwatch, cycle: int | None = None) -> None:
+    def _use(self, new: slice, t: float, watch: Stopwatch) -> None:
         eligible = np.ones(len(self.smoother.map.state), bool)
         if not self.closed and self._near_start():  # one detection can't tell which old landmark it shows
             eligible = ~self._old()
-        association.associate_newest(self.smoother, new, eligible, cycle)
+        association.associate_newest(self.smoother, new, eligible)
         watch.lap("associate")
         created = self._create(new, t)
         watch.lap("create")

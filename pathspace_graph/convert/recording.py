@@ -1,6 +1,8 @@
 """A record in any order as a log, and arriving messages as cycles; what was left out is counted."""
 
+from bisect import insort
 from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -267,14 +269,20 @@ BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexErr
 
 
 class MessageStream:
-    """Buffer of twists, which gives each message with detections those up to it; refused ones are counted."""
+    """Buffer of messages, which gives cycles in order, each with its twists; refused ones are counted.
 
-    def __init__(self, frames: Frames | None = None) -> None:
+    A cycle waits for older ones until a message is newer by `wait` (s), as an estimator takes none that is
+    late.
+    """
+
+    def __init__(self, frames: Frames | None = None, wait: float = 0.0) -> None:
         self.frames, self.noise, self.rule = frames or Frames(), NoiseSettings(), LabelRule()
         self.refused: Counter[str] = Counter()  # number of messages for each reason
         self._twists: deque[tuple[float, list[float]]] = deque(maxlen=MAX_BUFFERED)
         self._first = np.inf  # the stamp (s) of the first twist
-        self._newest = -np.inf  # the stamp (s) of the newest cycle in order
+        self._wait = wait
+        self._waiting = list[Detections]()  # in order of their stamps
+        self._newest = -np.inf  # the stamp (s) of the newest message with detections
 
     def take_odometry(self, message: Any, received: float) -> None:
         """Buffer the twist of a message that was received at this time (s)."""
@@ -290,8 +298,8 @@ class MessageStream:
         except BROKEN as error:
             self.refused[str(error)] += 1
 
-    def take_detections(self, message: Any, received: float) -> tuple[Odometry, Detections] | None:
-        """Return a perception cycle with the twists since the last in `use`, none for a late one, or None."""
+    def take_detections(self, message: Any, received: float) -> Iterator[tuple[Odometry, Detections]]:
+        """Yield the cycles that have waited for long enough, with the twists since the last in `use`."""
         try:
             points = usable(points_of(message, self.rule), self.refused)
             t = stamp_of(message) or received
@@ -300,13 +308,18 @@ class MessageStream:
             cycle = in_vehicle_frame(t, points, self.frames, self.noise, self.refused)
         except BROKEN as error:
             self.refused[str(error)] += 1
-            return None
-        rows = [] if t <= self._newest else [row for row in self._twists if row[0] <= t]
+            return
+        self._newest = max(self._newest, t)
+        insort(self._waiting, cycle, key=lambda one: one.t)
+        while self._waiting and self._waiting[0].t <= self._newest - self._wait:
+            yield self._with_twists(self._waiting.pop(0))
+
+    def _with_twists(self, cycle: Detections) -> tuple[Odometry, Detections]:
+        rows = [row for row in self._twists if row[0] <= cycle.t]
         twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
         return Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
 
     def use(self, t: float) -> None:
         """Drop the twists that a cycle at t (s) has used, but for the last one, which is held."""
-        self._newest = max(self._newest, t)
-        while len(self._twists) > 1 and self._twists[1][0] <= self._newest:
+        while len(self._twists) > 1 and self._twists[1][0] <= t:
             self._twists.popleft()
