@@ -20,7 +20,7 @@ from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
 SCREEN = 50
 """Lines of a screen."""
-MOST_SETTINGS = 89
+MOST_SETTINGS = 90
 MOST_ESSENTIAL = 12
 ONLINE = ["LOG", "--out", "MAP"]
 
