@@ -152,7 +152,7 @@ class Plan:
         return {"endurance": views.lap_columns(frame, shown, ("rmse", "inside", "nees", "ate"))}
 
     def centerline(self, folder: Path) -> Views:
-        """Drive the estimators of a centre line with a width, and those of two boundaries."""
+        """Drive estimators of two boundaries, whose centre line is held against the true one."""
         study, frame = self._shipped("centerline", folder, tracks=GENERATED, seeds=(0,))
         return {"centerline": views.metrics_table(frame, CENTRE_LINE, study.estimators)}
 

@@ -42,21 +42,20 @@ LINE_STRIP = 4
 class Bridge:
     """Hands ROS messages to a mapper, which no message can stop."""
 
-    def __init__(self, mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+    def __init__(self, mounting: tuple[float, float, float] = (0.0, 0.0, 0.0), wait: float = 0.0) -> None:
         self.mapper = FixedLagMapper(odometry_sigma=np.array(SIGMA_ODOMETRY))
-        self.stream = MessageStream(Frames(mounting))
+        self.stream = MessageStream(Frames(mounting), wait)
 
     def update(self, message: Any, received: float) -> CycleResult | None:
-        """Map a message with detections, received at this time (s); return None if it could not be used."""
-        cycle = self.stream.take_detections(message, received)
-        if cycle is None:
-            return None
-        try:
-            result = self.mapper.update(*cycle)
-        except PathspaceError as error:  # a ReadingError changes nothing in the mapper
-            self.stream.refused[str(error)] += 1
-            return None
-        self.stream.use(result.t)
+        """Map a message with detections, received at this time (s); return the last result, if any."""
+        result: CycleResult | None = None
+        for cycle in self.stream.take_detections(message, received):
+            try:
+                result = self.mapper.update(*cycle)
+            except PathspaceError as error:  # a ReadingError changes nothing in the mapper
+                self.stream.refused[str(error)] += 1
+                continue
+            self.stream.use(result.t)
         return result
 
     def save(self, folder: Path) -> None:
@@ -107,7 +106,8 @@ def main() -> None:
 
     rclpy.init()
     node = rclpy.create_node("pathspace_graph")
-    bridge = Bridge(tuple(node.declare_parameter("mounting", [0.0, 0.0, 0.0]).value))
+    mounting, wait = node.declare_parameter("mounting", [0.0] * 3), node.declare_parameter("wait", 0.0)
+    bridge = Bridge(tuple(mounting.value), wait.value)
     kind = MarkerArray if node.declare_parameter("markers", False).value else PointCloud2
     to_map, to_ahead = (node.create_publisher(MarkerArray, f"~/{name}", 1) for name in ("map", "ahead"))
     to_path, path = node.create_publisher(PathMessage, "~/path", 1), PathMessage()
@@ -124,7 +124,7 @@ def main() -> None:
 
     def take_detections(message: Any) -> None:
         result = bridge.update(message, now())
-        if result is None or result.late:
+        if result is None:
             return
         stamp, ahead = node.get_clock().now().to_msg(), bridge.mapper.ahead(AHEAD)
         path.header = Header(frame_id="map", stamp=stamp)

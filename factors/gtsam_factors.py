@@ -1,4 +1,4 @@
-"""Residuals as GTSAM factors for any nonlinear graph: projection, ribbon, spacing, smoothness and odometry.
+"""Residuals as GTSAM factors for any nonlinear graph: projection, spacing, smoothness and odometry.
 
 A factor holds its measurement and its keys, but no graph. It is a pure function of the values.
 """
@@ -17,7 +17,7 @@ from .footpoint import FootPoints, foot_points
 from .linear import linear_factor
 from .noise import huber_roots, huber_weights
 from .odometry import IntegratedOdometry, odometry_residuals
-from .residuals import RIBBON, beyond_edge, sigma_across, station_rows
+from .residuals import sigma_across, station_rows
 from .se2 import rotation, to_map
 from .sensor import corrected, sensor_rows
 
@@ -39,7 +39,6 @@ def spline_projection_factors(
     huber: float,
     sensor_key: int | None = None,
     twists: Array | None = None,
-    sides: Array | None = None,
 ) -> list[gtsam.CustomFactor]:
     """Return a factor `e_i = n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections of each pose.
 
@@ -50,9 +49,7 @@ def spline_projection_factors(
     is in m. A row's weight falls beyond the whitened residual `huber`, which may be infinite.
 
     With a `sensor_key`, the detections are corrected by the sensor's calibration (5,) of that key (see
-    `sensor.by_sensor`), with twists (m, 3) of the vehicle in m/s, m/s and rad/s. With `sides` (m,), 1 for
-    left and -1 for right, the curve is the centre line of a ribbon, the keys of its control points hold
-    `Point3` (x, y, h), and the residuals are those of `beyond_edge`.
+    `sensor.by_sensor`), with twists (m, 3) of the vehicle in m/s, m/s and rad/s.
 
     Foot points, standard deviations and weights are recomputed at every evaluation. With Jacobians, rows are
     scaled by the square root of their Huber weight. Without, half their squares are the Huber loss, so that
@@ -64,16 +61,12 @@ def spline_projection_factors(
     if len(pose_keys) == 0:
         return []
     twists = np.zeros((len(low), 3)) if twists is None else twists
-    edges = low if sides is None else sides
-    _require_alike(
-        "poses, detections and stretches", pose_keys, points_vehicle, covariances, edges, low, high
-    )
+    _require_alike("poses, detections and stretches", pose_keys, points_vehicle, covariances, low, high)
     factors = []
     for own in np.split(np.arange(len(pose_keys)), np.flatnonzero(np.diff(pose_keys)) + 1):
         pose_key, curve = int(pose_keys[own[0]]), Curve.of(control_keys, tables, low[own], high[own])
         measured = points_vehicle[own], covariances[own], twists[own]
-        side = None if sides is None else sides[own]
-        factors.append(_projection_factor(pose_key, curve, *measured, side, sigma_model, huber, sensor_key))
+        factors.append(_projection_factor(pose_key, curve, *measured, sigma_model, huber, sensor_key))
     return factors
 
 
@@ -83,7 +76,6 @@ def _projection_factor(
     measured: Array,
     covariances: Array,
     twists: Array,
-    sides: Array | None,
     sigma_model: float,
     huber: float,
     sensor_key: int | None,
@@ -95,7 +87,7 @@ def _projection_factor(
         poses = np.tile(pose_array(pose), (len(measured), 1))
         sensor = np.zeros(0) if sensor_key is None else np.array(values.atVector(sensor_key))
         points = to_map(corrected(measured, twists, sensor), poses)
-        foot, residual, gradient, by_control = curve.distances(values, points, sides)
+        foot, residual, gradient, by_control = curve.distances(values, points)
         sigma = sigma_across(foot.normal_unit, covariances, poses, sigma_model)
         steepness = np.hypot(gradient[:, 0], gradient[:, 1])
         direction = gradient / steepness[:, None]
@@ -163,7 +155,7 @@ def _station_factor(
         pose = values.atPose2(pose_key)
         poses = np.tile(pose_array(pose), (len(measured), 1))
         sensor = np.zeros(0) if sensor_key is None else np.array(values.atVector(sensor_key))
-        points, control = to_map(corrected(measured, twists, sensor), poses), curve.control_points(values, 2)
+        points, control = to_map(corrected(measured, twists, sensor), poses), curve.control_points(values)
         basis = np.ascontiguousarray(value), np.ascontiguousarray(slope), control[columns]
         seen = measured, twists, sensor
         residual, sigma, J = station_rows(points, covariances, poses, *basis, *seen, sigma_station)
@@ -231,27 +223,21 @@ class Curve:
         touched = _touched(tables, low, high)
         return Curve(tuple(int(control_keys[j]) for j in touched), touched, tables, low, high)
 
-    def control_points(self, values: gtsam.Values, entries: int) -> Array:
-        """Return the unwrapped control points (n, entries); those that do not matter here stay zero."""
-        at, size = values.atPoint2 if entries == 2 else values.atPoint3, self.tables.size
-        distinct = np.zeros((size, entries))
-        distinct[self.touched] = [at(key) for key in self.keys]
+    def control_points(self, values: gtsam.Values) -> Array:
+        """Return the unwrapped control points (n, 2); those that do not matter here stay zero."""
+        size = self.tables.size
+        distinct = np.zeros((size, 2))
+        distinct[self.touched] = [values.atPoint2(key) for key in self.keys]
         return np.asarray(distinct[np.arange(len(self.tables.starts) + self.tables.degree) % size])
 
-    def distances(
-        self, values: gtsam.Values, points: Array, sides: Array | None = None
-    ) -> tuple[FootPoints, Array, Array, Array]:
-        """Return foot points, distances (m,), and their derivatives (m, 2) and (m, degree + 1, d).
+    def distances(self, values: gtsam.Values, points: Array) -> tuple[FootPoints, Array, Array, Array]:
+        """Return foot points, distances (m,), and their derivatives (m, 2) and (m, degree + 1, 2).
 
-        The derivatives are by the points (m, 2), map frame, and by the control points of each span. With
-        `sides` (m,) the distances are those of `beyond_edge`.
+        The derivatives are by the points (m, 2), map frame, and by the control points of each span.
         """
-        control_points = self.control_points(values, 2 if sides is None else RIBBON)
         step = GRID_SHARE * self.tables.length / len(self.tables.starts)
-        line = np.ascontiguousarray(control_points[:, :2])
+        line = self.control_points(values)
         foot = foot_points(self.tables, line, points, self.low, self.high, step)
-        if sides is not None:
-            return foot, *beyond_edge(self.tables, control_points, sides, foot)
         return foot, foot.distance, foot.normal_unit, -foot.basis[:, :, None] * foot.normal_unit[:, None, :]
 
     def usable(self, foot: FootPoints) -> tuple[BoolArray, IntArray]:

@@ -1,13 +1,12 @@
 """Residuals of detections and weak priors, with their Jacobians, as functions of arrays."""
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import scipy  # which imports its modules when they are used
 
 from .arrays import Array
-from .bspline import SpanPolynomials, scatter
+from .bspline import scatter
 from .footpoint import FootPoints
 from .kernels import compiled
 from .se2 import in_vehicle, left_of, to_vehicle
@@ -129,44 +128,6 @@ def station_rows(
     by_turn = (factor * turning)[:, None, None] * slope[:, :, None] * n[:, None, :]
     jacobian[:, -slope.shape[1] * 2 :] += by_turn.reshape(len(t), 2 * slope.shape[1])
     return residual, np.hypot(sigma, sigma_station), jacobian
-
-
-# --- a ribbon: a centre line with a width ----------------------------------------------------------------
-
-RIBBON: Final = 3  # entries of a ribbon's control point: x, y (m, map frame) and half the width h (m)
-_LEAST_SPREAD = 0.05  # 1 - k d, which vanishes at the centre of curvature, counts as at least this
-
-
-def beyond_edge(
-    tables: SpanPolynomials, control_points: Array, sides: Array, foot: FootPoints
-) -> tuple[Array, Array, Array]:
-    """Return `r = s n . (p - C(u)) - h(u)` (m,), in m, with u the foot point of p on the centre line C.
-
-    It is the distance beyond the edge of a side, not whitened. With it come the derivatives (m, 2) by p, map
-    frame, and (m, degree + 1, 3) by the control points (x, y, h) of the span. The side s (m,) is 1 for the
-    left edge and -1 for the right one; control_points (n, 3) are unwrapped. With d = n . (p - C), the unit
-    tangent t, the speed |C'| and the curvature k of the centre line,
-
-        du/dp = t / (|C'| (1 - k d)),   du/dc_j = (d beta'_j n / |C'| - beta_j t) / (|C'| (1 - k d)),
-        dr/dp = s n - h' du/dp,   dr/dc_j = -s beta_j n - h' du/dc_j,   dr/dh_j = -beta_j
-
-    are exact at an interior foot point.
-    """
-    (basis, slope, bend), span = tables.evaluate(foot.u, 2)
-    columns = span[:, None] + np.arange(-tables.degree, 1)
-    points = control_points[columns]
-    half, half_slope = (np.einsum("mj,mj->m", values, points[:, :, 2]) for values in (basis, slope))
-    first, second = (np.einsum("mj,mjd->md", values, points[:, :, :2]) for values in (slope, bend))
-    speed = np.hypot(first[:, 0], first[:, 1])
-    curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
-    n, t, d = foot.normal_unit, foot.tangent_unit, foot.distance
-    along = half_slope / (speed * np.maximum(1.0 - curvature * d, _LEAST_SPREAD))
-    by_control = np.empty((*basis.shape, RIBBON))
-    turning = (along * d / speed)[:, None] * slope + sides[:, None] * basis
-    by_control[:, :, :2] = (along[:, None] * basis)[:, :, None] * t[:, None]
-    by_control[:, :, :2] -= turning[:, :, None] * n[:, None]
-    by_control[:, :, 2] = -basis
-    return sides * d - half, sides[:, None] * n - along[:, None] * t, by_control
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pathspace_graph.baselines.centerline import CenterlineBatch, CenterlineMapper
     from pathspace_graph.baselines.filters import CkfMapper, LandmarkCkf
     from pathspace_graph.baselines.landmark_batch import LandmarkBatch
     from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from .run import run_online, split_odometry
 
 __all__ = [
-    "LEFT", "RIGHT", "BSpline", "BatchMapper", "CenterlineBatch", "CenterlineMapper", "CkfMapper",
+    "LEFT", "RIGHT", "BSpline", "BatchMapper", "CkfMapper",
     "CycleRecord", "Detections", "FixedLagMapper", "Hint", "InputError", "LandmarkBatch", "LandmarkCkf",
     "LandmarkFixedLag", "Log", "Map", "MapperSettings", "Odometry", "OutputError", "PathspaceError",
     "PointBoundary", "ReadingError", "RunResult", "SettingsError", "SolveError", "SplineBoundary", "hints",
@@ -38,7 +37,6 @@ __all__ = [
 # imported when first asked for: the command line's help, and sim, need no estimator
 _HOMES = {
     "batch.mapper": ("BatchMapper",),
-    "baselines.centerline": ("CenterlineBatch", "CenterlineMapper"),
     "baselines.filters": ("CkfMapper", "LandmarkCkf"),
     "errors": ("InputError", "OutputError", "PathspaceError", "ReadingError", "SettingsError", "SolveError"),
     "estimators": ("make_batch", "make_online"),

@@ -27,7 +27,6 @@ COMMANDS: Final = {  # module of `commands`, dataclass of the options in it, and
     "ablate": ("studies", "Ablate", "runs a study of estimators and settings over many drives"),
     "faults": ("studies", "FaultSuite", "measures what each fault of a car costs, and what is said of it"),
     "report": ("studies", "Report", "measures the figures of the pages, and writes their tables"),
-    "figures": ("plot", "Figures", "draws the paper's isolated tests"),
     "scale": ("studies", "Scale", "measures the time of an update against map size, detections and laps"),
     "plot": ("plot", "Plot", "draws a map with its uncertainty band"),
     "export": ("export", "Export", "writes a map in a format that planners and other tools read"),

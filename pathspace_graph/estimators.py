@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
@@ -16,17 +16,14 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .errors import SettingsError, check_name, check_type
+from .errors import check_name, check_type
 from .run import BatchEstimator, OnlineEstimator
 
 MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
 MakeBatch = Callable[[MapperSettings, KnownNoise], BatchEstimator]
-MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or one centre line with a width
 
 DEFAULT: Final = "fixed-lag"  # online estimator where none is named
 DEFAULT_BATCH: Final = "spline"  # batch estimator where none is named
-CENTERLINE: Final = "centerline-fixed-lag"
-CENTERLINE_BATCH: Final = "centerline"  # estimators of one centre line, online and as a batch
 ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add online estimators
 BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
 
@@ -43,10 +40,10 @@ def _load(point: EntryPoint, settings: MapperSettings, noise: KnownNoise) -> Any
     return point.load()(settings, noise.odometry)
 
 
-def _baseline(home: str, settings: MapperSettings, noise: KnownNoise, **others: Any) -> Any:
+def _baseline(home: str, settings: MapperSettings, noise: KnownNoise) -> Any:
     """Return the estimator of a class `module:name` of the baselines, which is imported by then."""
     module, name = home.split(":")
-    return getattr(import_module(f".baselines.{module}", __package__), name)(settings, noise, **others)
+    return getattr(import_module(f".baselines.{module}", __package__), name)(settings, noise)
 
 
 ONLINE: Final[dict[str, MakeOnline]] = {  # makers, from settings and known noise
@@ -55,14 +52,12 @@ ONLINE: Final[dict[str, MakeOnline]] = {  # makers, from settings and known nois
     "landmark-fixed-lag": partial(_baseline, "landmark_fixed_lag:LandmarkFixedLag"),
     "ckf": partial(_baseline, "filters:CkfMapper"),
     "landmark-ckf": partial(_baseline, "filters:LandmarkCkf"),
-    CENTERLINE: partial(_baseline, "centerline:CenterlineMapper"),
 }
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
     DEFAULT_BATCH: lambda settings, noise: BatchMapper(settings, noise, FixedLagMapper),
     "landmark-batch": partial(_baseline, "landmark_batch:LandmarkBatch"),
-    CENTERLINE_BATCH: partial(_baseline, "centerline:CenterlineBatch", online=FixedLagMapper),
 }
 
 
@@ -74,16 +69,6 @@ def check_online(name: str, option: str = "--estimator") -> None:
 
 def check_batch(name: str) -> None:
     check_name(name, BATCH, f"--estimator: expected a known batch estimator ({', '.join(sorted(BATCH))})")
-
-
-def for_map(name: str, kind: MapKind) -> str:
-    """Return the estimator with this kind of map in place of a default one; SettingsError for others."""
-    lines = {DEFAULT: CENTERLINE, DEFAULT_BATCH: CENTERLINE_BATCH}
-    if kind == "boundaries" or name in lines.values():
-        return name
-    if name not in lines:
-        raise SettingsError(f"--map {kind}: expected --estimator {' or '.join(lines)}, found {name}")
-    return lines[name]
 
 
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:

@@ -7,8 +7,6 @@ from itertools import groupby
 from math import nan
 from typing import ClassVar, Final
 
-from pathspace_graph.settings.online import HealthSettings
-
 from .labels import BOUNDARIES, NAMES
 from .lengths import Length, Text
 
@@ -16,6 +14,18 @@ GOOD: Final = "good"
 DEGRADED: Final = "degraded"
 LOST: Final = "lost"
 CONDITIONS: Final = (GOOD, DEGRADED, LOST)
+
+# A coloured detection in the view of the curves is explained if it is in use, or lies on a closed curve of
+# its colour farther along: in a hairpin the sensor sees the next stretch across the infield.
+WINDOW: Final = 1.0  # age up to which detections are judged together (s)
+MIN_OFFERED: Final = 12  # least number of detections that are judged, older ones if the window holds fewer
+BLIND: Final = 2.0  # time without detections from which on the estimate is degraded (s)
+SHARE_DEGRADED: Final = 0.8  # share of explained detections on a closed map, below which it is degraded
+SHARE_LOST: Final = 0.55  # the same share below which the vehicle is lost
+OPEN_DEGRADED: Final = 0.35  # the same on an open map, low since much of what is seen is not mapped yet
+MAX_INNOVATION: Final = 1.2  # mean squared normalized innovation of a good estimate; one sigma is added
+SIGMA_DEGRADED: Final = 1.0  # standard deviation of the position on a closed map, beyond which (m)
+SIGMA_LOST: Final = 5.0  # the same beyond which the vehicle is lost (m)
 
 
 @dataclass(frozen=True)
@@ -49,8 +59,7 @@ class Evidence:
 class HealthMonitor:
     """Judge of the newest cycles' evidence together."""
 
-    def __init__(self, settings: HealthSettings | None = None) -> None:
-        self.settings = settings or HealthSettings()
+    def __init__(self) -> None:
         self._recent: deque[Evidence] = deque()
         self._offered = 0  # by all the recent cycles together
         self._last_offered: float | None = None
@@ -67,17 +76,17 @@ class HealthMonitor:
         offered, explained, used, squares = self._offered, 0, 0, 0.0
         for one in self._recent:
             explained, used, squares = explained + one.explained, used + one.used, squares + one.innovations
-        share = explained / offered if offered >= self.settings.min_offered else 1.0
-        innovation = squares / used if used >= self.settings.min_offered else 0.0
+        share = explained / offered if offered >= MIN_OFFERED else 1.0
+        innovation = squares / used if used >= MIN_OFFERED else 0.0
         cones = max(used / len(self._recent), 1.0)  # cycles show the same ones, with the same errors
-        most = self.settings.innovation * (1.0 + (2.0 / cones) ** 0.5)
+        most = MAX_INNOVATION * (1.0 + (2.0 / cones) ** 0.5)
         health = self._judge(evidence, share, innovation, most)
         return self._beside_gap(offered) if health == Health(GOOD) else health
 
     def _beside_gap(self, offered: int) -> Health:
         """Return the health where nothing is wrong, but the map may have a gap of a boundary."""
         unmapped = [sum(one.unmapped[label] for one in self._recent) for label in BOUNDARIES]
-        most = (1.0 - self.settings.share_degraded) * (offered + sum(unmapped))
+        most = (1.0 - SHARE_DEGRADED) * (offered + sum(unmapped))
         names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]
         if len(names) == len(BOUNDARIES):
             return Health(DEGRADED, "no boundary is mapped here")
@@ -95,9 +104,9 @@ class HealthMonitor:
     def _holds(self, label: int) -> bool | None:
         offered = sum(one.offered_by[label] for one in self._recent)
         explained = sum(one.explained_by[label] for one in self._recent)
-        if offered < self.settings.min_offered / len(BOUNDARIES):
+        if offered < MIN_OFFERED / len(BOUNDARIES):
             return None
-        return explained >= self.settings.share_degraded * offered
+        return explained >= SHARE_DEGRADED * offered
 
     def _remember(self, evidence: Evidence) -> None:
         recent = self._recent
@@ -105,19 +114,18 @@ class HealthMonitor:
         self._offered += evidence.offered
         if evidence.offered or evidence.rests or self._last_offered is None:
             self._last_offered = evidence.t
-        while recent[0].t <= evidence.t - self.settings.window:
-            if self._offered - recent[0].offered < self.settings.min_offered:
+        while recent[0].t <= evidence.t - WINDOW:
+            if self._offered - recent[0].offered < MIN_OFFERED:
                 return
             self._offered -= recent.popleft().offered
 
     def _judge(self, newest: Evidence, share: float, innovation: float, most: float) -> Health:
-        settings = self.settings
-        lost = settings.share_lost if newest.closed else 0.0  # on an open map it goes on by dead reckoning
-        degraded = settings.share_degraded if newest.closed else settings.open_degraded
+        lost = SHARE_LOST if newest.closed else 0.0  # on an open map it goes on by dead reckoning
+        degraded = SHARE_DEGRADED if newest.closed else OPEN_DEGRADED
         blind = newest.t - (newest.t if self._last_offered is None else self._last_offered)
-        if newest.sigma > settings.sigma_degraded:
+        if newest.sigma > SIGMA_DEGRADED:
             uncertain = Text("the position is uncertain by {sigma:.2g} m", sigma=Length(newest.sigma))
-            return Health(LOST if newest.sigma > settings.sigma_lost else DEGRADED, uncertain)
+            return Health(LOST if newest.sigma > SIGMA_LOST else DEGRADED, uncertain)
         if share < degraded:
             wrong = self._wrong_side() if share < lost and newest.closed else ""
             reason = wrong or f"{100 * share:.0f} % of the detections lie on the map"
@@ -125,7 +133,7 @@ class HealthMonitor:
         self._wrong = None
         if newest.odometry:
             return Health(DEGRADED, newest.odometry)
-        if blind > settings.blind:
+        if blind > BLIND:
             return Health(DEGRADED, f"no detection in view of the map for {blind:.1f} s")
         if innovation > most:
             sigmas = innovation**0.5

@@ -52,8 +52,6 @@ class CycleResult(Brief):
     """How far the estimate can be trusted; empty for an estimator without a monitor."""
     dropped: int = 0
     """Number of the cycle's detections that were dropped as impossible."""
-    late: bool = False
-    """Whether the cycle was handed over after a newer one, and was used at its own time."""
     refused: int = 0
     """Number of cycles that were refused since the last one that was used."""
 
@@ -133,7 +131,7 @@ class ObservedCycle:
     @cached_property
     def record(self) -> CycleRecord:
         result = self.result
-        same = ("readings", "closed", "notice", "dropped", "late", "refused")
+        same = ("readings", "closed", "notice", "dropped", "refused")
         return CycleRecord(
             cycle=self.number,
             t=self.detections.t,

@@ -10,6 +10,7 @@ from pathspace_graph.health import (
     DEGRADED,
     GOOD,
     LOST,
+    MIN_OFFERED,
     Evidence,
     Health,
     HealthMonitor,
@@ -17,7 +18,6 @@ from pathspace_graph.health import (
     counts,
     stretches,
 )
-from pathspace_graph.settings.online import HealthSettings
 
 PERIOD = 0.1
 """Perception cycles are this far apart (s)."""
@@ -95,9 +95,8 @@ def test_a_few_detections_are_not_judged_alone() -> None:
     healths = drive((CLEAN, 2.0), (sparse, 0.5))
     assert healths[-1] == Health(GOOD)
     alone = drive((sparse, 3.0))
-    settings = HealthSettings()
-    assert [health.condition for health in alone[: settings.min_offered - 1]] == [GOOD] * 11
-    assert alone[settings.min_offered - 1].condition == LOST
+    assert [health.condition for health in alone[: MIN_OFFERED - 1]] == [GOOD] * 11
+    assert alone[MIN_OFFERED - 1].condition == LOST
 
 
 def test_a_vehicle_that_sees_nothing_is_degraded() -> None:

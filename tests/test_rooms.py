@@ -42,7 +42,7 @@ ARROWS: dict[str, set[str]] = {
     "sim": {"io"},
     "convert": {"io", "factors"},
     "graph": {"factors"},
-    "health": {"settings"},
+    "health": set(),
     "run": {"factors", "io", "laps", "health"},
     "scale": {"factors", "settings", "io", "run"},
     "checkpoint": set(),

@@ -16,12 +16,10 @@ from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
 from pathspace_graph.eval.metrics.measures import online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
-from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.eval.metrics.summary import has_cones, summarize, versions
 from pathspace_graph.io.files import atomic_folder, is_temporary, write_json, write_text
 from pathspace_graph.io.log import LOG_FILE
-from pathspace_graph.io.map import SplineBoundary
-from pathspace_graph.io.results import BatchRun, RunResult, write_result
+from pathspace_graph.io.results import BatchRun, write_result
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
@@ -35,11 +33,8 @@ from .tables import TextTable, group_starts
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
 RUN: Final = ("log", "estimator")
-_PRINTED: Final = (  # metrics whose differences are in the table; the file has all
-    *("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m"),
-    *("two_way", "ghost_share", "size", "ate", "ms_mean"),
-)
-_NOT_PAIRED: Final = ("nees_low", "nees_high")  # metrics whose differences mean nothing
+_PRINTED: Final = ("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "size", "ate", "ms_mean")
+"""Metrics whose differences are in the table; the file has all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +48,13 @@ class Comparison:
 
     @cached_property
     def frame(self) -> pd.DataFrame:
-        """Tidy row per run and lap, and one per run for the whole log, with the gaps to the batch."""
-        results = {tuple(outcome.names.values()): outcome.result for outcome in self.outcomes}
+        """Tidy row per run and lap, and one per run for the whole log."""
         rows: list[dict[str, Any]] = []
         for outcome in self.outcomes:
             laps = 0 if outcome.result is None else outcome.result.laps
             for row in outcome.rows:
                 about = {"scope": "lap" if row.lap else "log", "lap": row.lap or laps}
                 rows.append({**outcome.names, **about, **row.values})
-            batch = results.get((outcome.names["log"], registry.DEFAULT_BATCH))
-            if outcome.result is not None and batch is not None and outcome.result is not batch:
-                rows[-1] |= gap_columns(outcome.result, batch)
         add_batch(rows, ("log",))
         return pd.DataFrame(rows, columns=None if rows else [*RUN, "scope", "lap"])
 
@@ -94,15 +85,6 @@ class Comparison:
     def unsettled(self) -> list[Outcome]:
         """Outcomes of batches that did not converge."""
         return [o for o in self.outcomes if isinstance(o.result, BatchRun) and not o.result.converged]
-
-
-def gap_columns(result: RunResult, batch: RunResult) -> dict[str, float]:
-    """Return the mean two-way distance (m) of the curves, if any, and the rms distance (m) of the poses."""
-    by = gap(result, batch)
-    row = {"gap_trajectory": float(np.hypot(by.along, by.across))}
-    if by.curves and all(isinstance(b, SplineBoundary) for b in result.map.boundaries.values()):
-        row["gap_curves"] = float(np.mean(list(by.curves.values())))
-    return row
 
 
 def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedLog, ...]:
@@ -205,7 +187,7 @@ def paired_frame(comparison: Comparison) -> pd.DataFrame:
     """Return a tidy row for each estimator and metric of whole logs: its difference from the reference."""
     reference, rows = comparison.reference, []
     final = comparison.final.set_index([*RUN]).unstack("estimator")
-    keys = [key for key in METRICS if key in final and key not in _NOT_PAIRED]
+    keys = [key for key in METRICS if key in final]
     for estimator in (name for name in comparison.estimators if name != reference):
         for key in keys:
             values = final[key].reindex(columns=[estimator, reference]).to_numpy(float)

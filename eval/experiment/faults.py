@@ -28,7 +28,7 @@ from .tables import TextTable, group_starts
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
 FAULT_COLUMNS: Final = 4  # panels side by side in the figure of faults
 Values = Mapping[str, Any]  # values of an outcome by name
-_WORST: Final = ("error_max", "error_end", "divergence_time", "divergence_distance")
+_WORST: Final = ("error_max", "divergence_time", "divergence_distance")
 _MEASURED: Final = (
     *("rmse", "size", "missed", "closed_at_end", "lost_at_end"),
     *("reported_degraded", "reported_lost", *_WORST),

@@ -1,1 +1,1 @@
-"""Pictures of maps, and the paper's isolated tests as figures."""
+"""Pictures of maps."""

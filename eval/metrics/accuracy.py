@@ -169,7 +169,7 @@ def _along(spline: BSpline, step: float) -> Array:
 
 
 def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
-    """Return mean_p min_q |p - q| over mapped points p, mean_q min_p |q - p| over true ones q, and the mean.
+    """Return mean_p min_q |p - q| over mapped points p, and mean_q min_p |q - p| over true ones q.
 
     All are in m, over both boundaries together: `mapped_to_truth` is large where something false is mapped,
     `truth_to_mapped` where something true isn't. Points of curves are equal lengths apart. Landmarks have
@@ -188,12 +188,11 @@ def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
             forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
             back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
     to_truth, to_mapped = mean_of(np.concatenate(forth)), mean_of(np.concatenate(back))
-    two_way = 0.5 * (to_truth + to_mapped)
-    return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped, "two_way": two_way}
+    return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped}
 
 
 def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
-    """Return the same two-way distance (m) between two mapped boundaries."""
+    """Return the mean of both distances (m) between two mapped boundaries."""
     forth = boundary_distances(second, mapped_points(first))
     back = boundary_distances(first, mapped_points(second))
     return 0.5 * (mean_of(forth) + mean_of(back))
@@ -272,27 +271,17 @@ class GhostSettings(Positive):
 def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> dict[str, float]:
     """Return the landmarks p and the metres of curve with min_q |p - q| > distance, q on the true curve.
 
-    The true curve is that of the same boundary. A boundary without any true cone is a ghost as a whole. The
-    share is of all landmarks and points of curves, NaN where nothing is mapped. Duplicates are landmarks that
-    are nearest to a true cone that already has one.
+    The true curve is that of the same boundary. A boundary without any true cone is a ghost as a whole.
     """
     settings = settings or GhostSettings()
-    landmarks = duplicates = 0
-    metres, all_ghosts = 0.0, [np.zeros(0, dtype=bool)]
+    landmarks, metres = 0, 0.0
     for label, boundary in track.boundaries.items():
         points, curve = mapped_points(boundary), true_curve(truth, label)
         is_ghost = np.ones(len(points), dtype=bool)
         if len(curve) and len(points):
             is_ghost = np.asarray(KDTree(curve).query(points)[0] > settings.distance)
-        all_ghosts.append(is_ghost)
         if isinstance(boundary, SplineBoundary):
             metres += float(np.mean(is_ghost)) * boundary.spline.length()
-            continue
-        landmarks += int(is_ghost.sum())
-        cones = cones_of(truth, label)
-        if len(cones) and boundary.size:
-            distances, nearest = KDTree(cones).query(boundary.points)
-            matched = np.asarray(nearest)[np.asarray(distances) <= settings.distance]
-            duplicates += len(matched) - len(np.unique(matched))
-    found = {"ghost_landmarks": landmarks, "ghost_metres": metres}
-    return found | {"ghost_share": mean_of(np.concatenate(all_ghosts)), "duplicates": duplicates}
+        else:
+            landmarks += int(is_ghost.sum())
+    return {"ghost_landmarks": landmarks, "ghost_metres": metres}

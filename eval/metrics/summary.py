@@ -27,7 +27,7 @@ from .accuracy import LapMetrics, lap_metrics, root_mean_square, true_lap_ends
 from .consistency import consistency_at_cones
 from .trajectory import position_rms, trajectory_errors
 
-GATE: Final = ("dropped", "late", "refused")  # counts of the gate in each cycle
+GATE: Final = ("dropped", "refused")  # counts of the gate in each cycle
 
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:

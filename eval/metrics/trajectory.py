@@ -56,7 +56,7 @@ def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
     known = t[(t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])]
     largest = float(np.linalg.norm(errors[:, :2], axis=1).max())
     end = position_rms(errors[known >= known[-1] - 1.0])
-    return {"error_max": largest, "error_end": end, "lost_at_end": end > LOST}
+    return {"error_max": largest, "lost_at_end": end > LOST}
 
 
 def longest_divergence(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:

@@ -1,1 +1,1 @@
-"""What the boundary estimators are compared with: landmarks, the paper's filters, and one centre line."""
+"""What the spline estimators are compared with: landmark graphs, and the paper's filters."""

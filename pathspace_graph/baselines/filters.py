@@ -32,7 +32,7 @@ from pathspace_graph.spline.knots import refit
 
 from .ckf_curves import CurveState, Expansion, in_map
 from .ckf_update import OnCurve, classify, update
-from .landmark_association import ROUGH, Gates, associate, compatible, pair_costs
+from .landmark_association import ROUGH, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 
 REACH: Final = 9.0  # a curve is extended up to this far ahead of the vehicle (m along the predicted path)
@@ -47,7 +47,7 @@ Used = tuple[int, tuple[int, int], bool]  # number of detections that were used,
 
 
 class _Filter:
-    """What both filters share; a late cycle is a ReadingError, since no earlier pose could take it."""
+    """What both filters share."""
 
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
@@ -217,7 +217,7 @@ def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
         cones, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
         foot = boundary.find(known, cones, zero, zero + boundary.confirmed_end)
         boundary.cone_parameters = np.sort(foot.u)
-        periodic, degree = make_periodic(boundary, known, settings, settings.ckf.knots), boundary.degree
+        periodic, degree = make_periodic(boundary, known, settings, "curvature"), boundary.degree
         points = np.concatenate([periodic.points, periodic.points[:degree]])
         curve = BSpline(periodic.knots, points, degree, periodic=True)
         matrix = refit(state.spline(label), curve, periodic.overlap.new_parameter).new_from_old
@@ -260,7 +260,7 @@ class LandmarkCkf(_Filter):
             covariances = seen.covariance.reshape(k, POINT, k, POINT)[np.arange(k), :, np.arange(k)]
         cost = pair_costs(detections.points_vehicle, detections.covariances, predicted, covariances)
         cost[~compatible(detections.labels, self.labels[nearby])] = np.inf
-        column, is_new = associate(cost, Gates.of(self.settings.landmark))
+        column, is_new = associate(cost)
         matched = column != UNASSOCIATED
         landmark = np.full(len(detections.labels), UNASSOCIATED, np.intp)
         landmark[matched] = nearby[column[matched]]

@@ -1,7 +1,6 @@
 """Which detection is of which landmark, by the Hungarian assignment, and which landmarks are one cone."""
 
 from collections.abc import Callable
-from functools import cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.tentative import nearest_within
-from pathspace_graph.settings.mapper import LandmarkSettings, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import GrowthSettings
 
 from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother, LandmarkState, two_rows
@@ -28,13 +27,13 @@ class Gates(NamedTuple):
     match: float  # below it, a detection may be associated with a landmark
     create: float  # above it for every compatible landmark, a detection may create one
 
-    @staticmethod
-    @cache
-    def of(settings: LandmarkSettings) -> "Gates":
-        return Gates(chi2_quantile(settings.match, POINT), chi2_quantile(settings.create, POINT))
+
+MATCH: Final = 0.95  # probability of the gate inside which a detection may be of a landmark
+CREATE: Final = 0.99  # probability of the gates of all landmarks outside of which a detection may be new
+GATES: Final = Gates(chi2_quantile(MATCH, POINT), chi2_quantile(CREATE, POINT))
 
 
-def associate(cost: Array, gates: Gates) -> tuple[IntArray, BoolArray]:
+def associate(cost: Array, gates: Gates = GATES) -> tuple[IntArray, BoolArray]:
     """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
     cost (m, n) are squared Mahalanobis distances of detections to landmarks, infinite for other labels.
@@ -63,7 +62,7 @@ def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_co
     return squared_mahalanobis(innovations, predicted_covariances[None] + covariances[:, None])
 
 
-def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates) -> Array:
+def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates = GATES) -> Array:
     """Return the costs, where `held` pairs stay in the match gate up to the create gate, lest they flip."""
     inside = (1.0 - HELD_MARGIN) * gates.match
     return np.where(held & (cost < gates.create), np.minimum(cost, inside), cost)
@@ -74,40 +73,38 @@ def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
     return np.asarray((labels[:, None] == landmark_labels[None]) | (labels == UNKNOWN)[:, None])
 
 
-def associate_newest(
-    smoother: LandmarkSmoother, new: slice, eligible: BoolArray, cycle: int | None = None
-) -> None:
-    """Associate the rows `new` of the newest pose, or late ones of a `cycle`, with eligible (n,) landmarks.
+def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray) -> None:
+    """Associate the rows `new` of the newest pose with eligible (n,) landmarks.
 
     A detection between the gates becomes AMBIGUOUS, and so does one in the match gate of a landmark with
     another label, for whose own label it votes.
     """
-    detections, state, settings = smoother.map.detections, smoother.map.state, smoother.map.settings.landmark
+    detections, state = smoother.map.detections, smoother.map.state
     rows = np.arange(new.start, new.stop)
     points = detections.points_map(rows, smoother.variables)
     near = nearest_within(state.landmarks, points, ROUGH)[1]
     landmarks = np.flatnonzero(near & eligible)
-    gates, numbers = Gates.of(settings), state.numbers[landmarks]
-    predicted = predict(smoother, landmarks, cycle)
+    numbers = state.numbers[landmarks]
+    predicted = predict(smoother, landmarks)
     any_label = pair_costs(detections.point[rows], detections.covariance[rows], *predicted)
     same_label = compatible(detections.label[rows], state.labels[landmarks])
-    landmark, is_new = associate(np.where(same_label, any_label, np.inf), gates)
+    landmark, is_new = associate(np.where(same_label, any_label, np.inf))
     matched = landmark != UNASSOCIATED
     detections.take(rows[matched], numbers[landmark[matched]])
-    explained = (any_label < gates.match).any(axis=1)
+    explained = (any_label < GATES.match).any(axis=1)
     detections.landmark[rows[~matched & (~is_new | explained)]] = AMBIGUOUS
     if explained.any():
         state.vote(detections.label[rows[explained]], numbers[any_label[explained].argmin(axis=1)])
 
 
-def predict(smoother: LandmarkSmoother, landmarks: IntArray, cycle: int | None = None) -> tuple[Array, Array]:
-    """Return where landmarks (k,), by position, should be detected from the newest or a given cycle's pose.
+def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> tuple[Array, Array]:
+    """Return where landmarks (k,), by position, should be detected from the newest pose.
 
     The places (k, 2) are in m, vehicle frame, with covariances `H_j Sigma H_j'` (k, 2, 2), Sigma that of pose
     and landmark in the last step, zero before the first one.
     """
     state, k = smoother.map.state, len(landmarks)
-    cycles = np.full(k, smoother.next_cycle - 1 if cycle is None else cycle)
+    cycles = np.full(k, smoother.next_cycle - 1)
     poses, zero = smoother.variables.poses_at(cycles), np.zeros((k, POINT))
     expected = landmark_residuals(poses, state.landmarks[landmarks], zero)
     if smoother.last_step is None or k == 0:
@@ -146,7 +143,7 @@ def find_duplicates(
         return newer, older
     spread = difference_covariances(covariance(state.keys[involved]), *index.reshape(2, -1))
     offset = state.landmarks[newer] - state.landmarks[older]
-    same = compatible_pairs(newer, older, offset, spread, settings.landmark)
+    same = compatible_pairs(newer, older, offset, spread)
     return newer[same], older[same]
 
 
@@ -165,14 +162,12 @@ def difference_covariances(joint: Array, i: IntArray, j: IntArray) -> Array:
     return np.asarray(spread + SIGMA_MERGE**2 * np.eye(POINT))
 
 
-def compatible_pairs(
-    newer: IntArray, older: IntArray, offset: Array, covariances: Array, settings: LandmarkSettings
-) -> IntArray:
+def compatible_pairs(newer: IntArray, older: IntArray, offset: Array, covariances: Array) -> IntArray:
     """Return the indices of the pairs (k,) in the match gate, nearest first, one for each landmark."""
     distance = squared_mahalanobis(offset, covariances)
     taken: set[int] = set()
     chosen = []
-    for row in np.argsort(distance)[: int((distance < Gates.of(settings).match).sum())].tolist():
+    for row in np.argsort(distance)[: int((distance < GATES.match).sum())].tolist():
         pair = {int(newer[row]), int(older[row])}
         if taken.isdisjoint(pair):
             taken |= pair

@@ -32,7 +32,7 @@ from pathspace_graph.scale import log_at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from . import landmark_association as association
-from .landmark_association import Gates, find_duplicates
+from .landmark_association import GATES, find_duplicates
 from .landmark_fixed_lag import LandmarkFixedLag
 from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
 
@@ -172,7 +172,6 @@ class Reassociation:
     def __init__(self, state: LandmarkState, system: LandmarkSystem, settings: MapperSettings) -> None:
         self.state, self.detections, self.settings = state, system.detections, settings
         self.problem, self.stamps = system.eliminated(state), system.chain.stamps
-        self.gates = Gates.of(settings.landmark)
         self.points_map = self.detections.points_map(slice(None), state.variables)
 
     def run(self) -> None:
@@ -180,15 +179,15 @@ class Reassociation:
         rows, landmarks, distances = self._nearby_pairs()
         cost = self._costs(rows, landmarks)
         held = detections.landmark[rows] == self.state.numbers[landmarks]
-        cost = association.hysteresis_costs(cost, held, self.gates)
-        relabel(self.state, detections.label, rows, landmarks, cost, self.gates.match)
+        cost = association.hysteresis_costs(cost, held)
+        relabel(self.state, detections.label, rows, landmarks, cost, GATES.match)
         detections.landmark[:] = UNASSOCIATED
         free = np.ones(len(detections), bool)
         starts = np.searchsorted(detections.cycle[rows], np.arange(len(self.stamps) + 1))
         for begin, end in pairwise(starts.tolist()):
             self._assign_cycle(rows[begin:end], landmarks[begin:end], cost[begin:end], free)
         # a landmark with another label explains it, or one that a new landmark would be merged with
-        known = (cost < self.gates.match) | (distances < self.settings.growth.merge_radius)
+        known = (cost < GATES.match) | (distances < self.settings.growth.merge_radius)
         free[rows[known]] = False
         self._create(np.flatnonzero(free & ~detections.used))
 
@@ -199,7 +198,7 @@ class Reassociation:
         table[i, j] = cost
         same_label = association.compatible(self.detections.label[detected], self.state.labels[candidates])
         table[~same_label] = np.inf
-        landmark, free[detected] = association.associate(table, self.gates)
+        landmark, free[detected] = association.associate(table)
         matched = landmark != UNASSOCIATED
         self.detections.take(detected[matched], self.state.numbers[candidates[landmark[matched]]])
 

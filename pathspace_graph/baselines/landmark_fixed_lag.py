@@ -4,7 +4,6 @@ The loop closes where enough of the landmarks seen now are those of the beginnin
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import chi2_quantile
-from pathspace_graph.front_end.front_end import FrontEnd, at_nearest_pose
+from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections, Odometry
@@ -29,7 +28,7 @@ from pathspace_graph.scale import at_scale
 from pathspace_graph.settings.mapper import MapperSettings
 
 from . import landmark_association as association
-from .landmark_association import Gates, difference_covariances, find_duplicates, squared_mahalanobis
+from .landmark_association import CREATE, GATES, difference_covariances, find_duplicates, squared_mahalanobis
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 
 UNSEEN: Final = 40.0  # path (m) without a detection after which a landmark is not associated near the start
@@ -61,9 +60,7 @@ class LandmarkFixedLag:
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         watch = Stopwatch()
-        cycle = self.front_end.admit(odometry, detections, self.smoother.times)
-        if cycle.late:
-            return cycle.counted(self._use_late(cycle.detections, watch))
+        cycle = self.front_end.admit(odometry, detections)
         reading = self.front_end.update(cycle.odometry, cycle.detections)
         motion, detections = reading.motion, reading.detections
         predict(self.smoother, self.path, motion, detections.t)
@@ -81,21 +78,11 @@ class LandmarkFixedLag:
         watch.lap("marginalize")
         return cycle.counted(self._result(detections.t, watch.laps))
 
-    def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
-        detections = self.front_end.use_late(detections, self.smoother.times)
-        late, cycle, twist = at_nearest_pose(self.smoother, detections, self.settings.motion)
-        new = self.smoother.map.detections.append(late, cycle, twist)
-        self.smoother.map.correct()
-        self._use(new, detections.t, watch, cycle)
-        watch.lap("update")
-        used = int(self.smoother.map.detections.used[new].sum())
-        return replace(self._result(detections.t, watch.laps), readings=used)
-
-    def _use(self, new: slice, t: float, watch: Stopwatch, cycle: int | None = None) -> None:
+    def _use(self, new: slice, t: float, watch: Stopwatch) -> None:
         eligible = np.ones(len(self.smoother.map.state), bool)
         if not self.closed and self._near_start():  # one detection can't tell which old landmark it shows
             eligible = ~self._old()
-        association.associate_newest(self.smoother, new, eligible, cycle)
+        association.associate_newest(self.smoother, new, eligible)
         watch.lap("associate")
         created = self._create(new, t)
         watch.lap("create")
@@ -251,7 +238,7 @@ def detect_loop(
     old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
         return None
-    gate = Gates.of(settings.landmark).match
+    gate = GATES.match
     test = JointCompatibility(smoother, recent, old, settings.closing.prior_scale)
     seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
     if len(seeds) == 0:
@@ -265,7 +252,7 @@ def detect_loop(
     i, j = np.array(pairs, np.intp).T
     labels = state.labels[recent[i]]
     enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
-    fits = distance < chi2_quantile(settings.landmark.create, POINT * len(labels))
+    fits = distance < chi2_quantile(CREATE, POINT * len(labels))
     return (recent[i], old[j]) if enough and len(labels) >= MIN_PAIRS and fits else None
 
 

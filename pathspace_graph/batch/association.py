@@ -15,7 +15,7 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
-from pathspace_graph.settings.mapper import AssociationSettings, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION
 
 DENSITY_STEP: Final = 0.1  # step at which the density of detections along a curve is sampled (m)
@@ -26,6 +26,9 @@ SHARP_SHARE: Final = 0.1  # share of so certain detections below which all of th
 MIN_SHARE: Final = 0.1  # least size of a cone's cluster as a share of the median cluster's
 MIN_SHARE_BESIDE: Final = 0.3  # `MIN_SHARE` of a cluster beside a curve, whose detections aren't used
 MIN_CONES: Final = 4  # least number of cones of a curve, below which none is removed
+STEP: Final = 1.0  # at which the curve's point nearest to a pose is searched for, m along the curve
+DIRECTION_PENALTY: Final = 100.0  # distance added in quadrature where the curve runs against a heading, m
+ROOM: Final = 2.0  # by which two poses may be farther apart along an open curve than was driven, m
 FOLD_COSINE: Final = 0.5  # a row of cones folds back where the cosine of its turn is less than minus this
 FOLD_DISTANCE: Final = 1.5  # from its nearer neighbour (m), below which a cone at such a turn is a duplicate
 
@@ -33,10 +36,10 @@ FOLD_DISTANCE: Final = 1.5  # from its nearer neighbour (m), below which a cone 
 # --- poses along the curves ------------------------------------------------------------------------------
 
 
-def add_drive(state: State, poses: Array, calibration: Array, settings: AssociationSettings) -> None:
+def add_drive(state: State, poses: Array, calibration: Array) -> None:
     """Add the poses (P, 3) of all cycles to a state that has its curves already."""
     insert_drive(state.variables, calibration, poses)
-    locate_poses(state, settings)
+    locate_poses(state)
 
 
 def insert_drive(variables: Variables, calibration: Array, poses: Array) -> None:
@@ -45,7 +48,7 @@ def insert_drive(variables: Variables, calibration: Array, poses: Array) -> None
     variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
 
 
-def locate_poses(state: State, settings: AssociationSettings) -> None:
+def locate_poses(state: State) -> None:
     """Set `pose_u`: the parameter of each curve's nearest point that runs in the direction of each pose.
 
     On a closed curve it goes on from lap to lap. No pose is beside a stretch that an open curve has drifted
@@ -53,18 +56,18 @@ def locate_poses(state: State, settings: AssociationSettings) -> None:
     """
     poses = state.poses
     for label, boundary in state.boundaries.items():
-        count = int(np.ceil(boundary.length / settings.step))
+        count = int(np.ceil(boundary.length / STEP))
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
         position, tangent = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
         tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
         square = (poses[:, :1] - position[:, 0]) ** 2
         square += (poses[:, 1:2] - position[:, 1]) ** 2
         against = headings(poses) @ tangent.T < SAME_DIRECTION
-        np.add(square, settings.direction_penalty**2, out=square, where=against)
+        np.add(square, DIRECTION_PENALTY**2, out=square, where=against)
         if boundary.periodic:
             state.pose_u[label] = np.unwrap(u[square.argmin(axis=1)], period=boundary.length)
         else:
-            driven = np.hypot(*np.diff(poses[:, :2], axis=0).T) + settings.room
+            driven = np.hypot(*np.diff(poses[:, :2], axis=0).T) + ROOM
             state.pose_u[label] = u[_along(square, driven * count / boundary.length)]
 
 

@@ -129,7 +129,7 @@ def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem
         state = State()
         for label, spline in start.splines.items():
             state.add_boundary(label, *boundary_of(spline, settings))
-        add_drive(state, start.poses, start.calibration, settings.batch.association)
+        add_drive(state, start.poses, start.calibration)
     effort = effort or (FROM_ODOMETRY if isinstance(start, Revisit) else FROM_MAP)
     return system, *Optimizer(system, effort).find(state)
 

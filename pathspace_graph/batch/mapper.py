@@ -132,19 +132,16 @@ def bending_of(gauge: CurveGauge, row: int) -> Terms:
     return replace(gauge, keys=gauge.keys[chosen], cycle=np.zeros(3, np.intp), smoothness=smoothness).bending
 
 
-def factor_beside(
-    points: IntArray, cycle: int, size: int, terms: Terms, dimension: int = POINT
-) -> gtsam.CustomFactor:
+def factor_beside(points: IntArray, cycle: int, size: int, terms: Terms) -> gtsam.CustomFactor:
     """Return the factor of `size` whitened residuals of control points (k,) as the pose of a cycle sees them.
 
     GTSAM's tangents of a pose are in its own frame.
     """
     keys = [*points.tolist(), pose_key(cycle)]
-    read = gtsam.Values.atPoint2 if dimension == POINT else gtsam.Values.atPoint3
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
         pose = values.atPose2(keys[-1])
-        at = np.array([read(values, key) for key in keys[:-1]])
+        at = np.array([values.atPoint2(key) for key in keys[:-1]])
         residual, by_points, by_pose = terms(at, pose_array(pose)[None])
         if H is not None:
             by_pose[..., :2] = by_pose[..., :2] @ rotation(pose.theta())

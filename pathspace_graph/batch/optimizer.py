@@ -89,7 +89,7 @@ class Optimizer:
         """Return the state after Gauss-Newton steps of the poses alone, beside its map and calibration."""
         self.system.begin(state)
         for _ in range(steps):
-            locate_poses(state, self.settings.association)
+            locate_poses(state)
             state = moved(state, self.system.poses_alone(self._refreshed(state, gate, False)))
         return state
 
@@ -104,7 +104,7 @@ class Optimizer:
         With `stations`, cones of closed curves hold the detections along them.
         """
         system = self.system
-        locate_poses(state, self.settings.association)
+        locate_poses(state)
         system.begin(state, stations)
         self._last_step, tolerance = None, (ROUGH_TOLERANCE if rough else 1.0) * self.effort.tolerance
         cost, done, searched, search = np.inf, 0, 0, max(min(SEARCH, rounds // 2), 1)
@@ -114,7 +114,7 @@ class Optimizer:
             system.kernel = Biweight(gate)
             held, searched = searched >= search, searched + strict
             if not strict and done > 1:
-                locate_poses(state, self.settings.association)
+                locate_poses(state)
             before = self._refreshed(state, gate, strict, held)
             at = self._step(before)
             state, gain, cost = at.state, abs(cost - at.cost), at.cost

@@ -3,7 +3,7 @@
 Simplification: the optimum's curves on few knots, their covariance, and how far cones lie from them.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Final
 
 import numpy as np
@@ -13,7 +13,7 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.graph.variables import CONTROL_LETTERS, POINT, Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
+from pathspace_graph.settings.mapper import ExactSplineSettings, MapperSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
@@ -85,9 +85,9 @@ def boundary_of(spline: BSpline, settings: MapperSettings) -> tuple[Boundary, Ar
     return boundary, spline.distinct_control_points
 
 
-def exact_settings(spline: SplineSettings) -> SplineSettings:
+def exact_settings(spline: SplineSettings) -> ExactSplineSettings:
     """Return a curve's settings with foot points that are more exact than online: an optimum needs it."""
-    return replace(spline, refine_iterations=2, refine_room=8.0, search_iterations=4)
+    return ExactSplineSettings(**{entry.name: getattr(spline, entry.name) for entry in fields(spline)})
 
 
 def own_settings(settings: MapperSettings) -> MapperSettings:
@@ -116,7 +116,7 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
         new, new_points = few.boundaries[label], few.control_points(label)
         F = new_from_old(boundary, state.control_points(label), new, new_points)
         change[map_block(few, label), map_block(state, label)] = np.kron(F, np.eye(POINT))
-    locate_poses(few, settings.batch.association)
+    locate_poses(few)
     associate(few, detections, settings, settings.batch.gate, strict=True)
     return few, change
 

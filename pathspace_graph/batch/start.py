@@ -71,7 +71,7 @@ def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
     poses = unwrap(np.concatenate([corrected, run.trajectory[len(corrected) :]]))
     vehicle = mapper.vehicle_state()
     calibration = np.concatenate([vehicle.calibration, vehicle.sensor])
-    add_drive(state, poses, calibration, mapper.settings.batch.association)
+    add_drive(state, poses, calibration)
     return state, run
 
 
@@ -99,7 +99,7 @@ def start_odometry(
     lap = length_of_lap(aligned.poses, revisits[0]) if revisits else np.inf
     for label in BOUNDARIES:
         _begin_boundary(state, label, aligned.poses, lap, detections, settings)
-    add_drive(state, aligned.poses, calibration, settings.batch.association)
+    add_drive(state, aligned.poses, calibration)
     return state
 
 

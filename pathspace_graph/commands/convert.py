@@ -1,4 +1,4 @@
-"""`convert`: a ROS bag, CSV files of one's own or a known data set as a log."""
+"""`convert`: a ROS bag, CSV files of one's own or JSON lines as a log."""
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -13,8 +13,7 @@ from pathspace_graph.convert.bag import BagOptions, read_bag
 from pathspace_graph.convert.recording import Recording, rate, to_log, windowed
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Window
 from pathspace_graph.convert.text_files import read_csv, read_json_lines
-from pathspace_graph.convert.victoria_park import read_victoria_park
-from pathspace_graph.errors import InputError, PathspaceError, SettingsError
+from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, write_log
@@ -28,20 +27,20 @@ from pathspace_graph.scale import scale_of
 from .estimate import tell
 from .simulate import describe
 
-Kind = Literal["bag", "csv", "jsonl", "victoria-park"]
+Kind = Literal["bag", "csv", "jsonl"]
 SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}  # of several in a folder
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convert:
-    """Write a ROS bag, CSV files, JSON lines or a known data set as a log, and say what was left out.
+    """Write a ROS bag, CSV files or JSON lines as a log, and say what was left out.
 
     A log is in order of time and in the vehicle frame. A folder of several records becomes a folder of logs.
     """
 
-    source: Positional[Path | None] = None
+    source: Positional[Path]
     """Bag (a file, or a folder with metadata.yaml), folder of CSV files, file of JSON lines, or a folder of
-    several of these. `victoria-park` needs none, since GTSAM brings its file."""
+    several of these."""
     out: Path
     """Folder of the log; an earlier log there is kept as a numbered backup."""
     kind: Annotated[Kind, arg(name="from")] = "bag"
@@ -85,7 +84,7 @@ class Convert:
     def _records(self) -> list[Path]:
         """Return the records in the source where it is a folder of several, none where it is one itself."""
         folder = self.source
-        if folder is None or not folder.is_dir() or (folder / "metadata.yaml").exists():
+        if not folder.is_dir() or (folder / "metadata.yaml").exists():
             return []
         if self.kind == "csv":
             file = self.topics.odometry or ODOMETRY_FILE
@@ -94,23 +93,17 @@ class Convert:
         bags = [one.parent for one in folder.glob("*/metadata.yaml")] if self.kind == "bag" else []
         return sorted({*known, *bags})
 
-    def _convert(self, source: Path | None, out: Path) -> None:
+    def _convert(self, source: Path, out: Path) -> None:
         check_target(out, LOG_FILE)
         rule = LabelRule(self.labels, self.label_field)
         with progress("converting"):
-            file = source or Path(self.kind)
-            record = windowed(self._read(source, rule), self.window, file)
-            log = with_measured_noise(to_log(record, self.frames, self.noise, file))
-            write_checked(log, out, file)
+            record = windowed(self._read(source, rule), self.window, source)
+            log = with_measured_noise(to_log(record, self.frames, self.noise, source))
+            write_checked(log, out, source)
         report(record.notes, rule, log, out)
         tell(hints(log))
 
-    def _read(self, source: Path | None, rule: LabelRule) -> Recording:
-        if self.kind == "victoria-park":
-            return read_victoria_park(source)
-        if source is None:
-            expected = f"expected a SOURCE to read, which --from {self.kind} needs"
-            raise SettingsError(f"convert: {expected}, found none")
+    def _read(self, source: Path, rule: LabelRule) -> Recording:
         if self.kind == "jsonl":
             return read_json_lines(source, rule)
         if self.kind == "csv":

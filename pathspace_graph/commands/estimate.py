@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rich.table import Table
 from rich.text import Text
@@ -16,7 +16,7 @@ from pathspace_graph import estimators
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
-from pathspace_graph.estimators import DEFAULT, DEFAULT_BATCH, MapKind, for_map
+from pathspace_graph.estimators import DEFAULT, DEFAULT_BATCH
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.reference import gap
@@ -24,9 +24,11 @@ from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.map import MAP_FILE
+from pathspace_graph.io.map import MAP_FILE, Map
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
+from pathspace_graph.io.ribbon import as_ribbon
 from pathspace_graph.labels import NAMES
+from pathspace_graph.lengths import scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
@@ -36,6 +38,8 @@ from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 from pathspace_graph.spline.crossing import crossings_told
 
+MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or one centre line with a width
+Run = TypeVar("Run", bound=RunResult)
 NOT_TRUSTED: Final = 3  # exit code of a result that is written, but is not the optimum or no map of the drive
 
 
@@ -68,17 +72,16 @@ class Online:
 
     def run(self) -> None:
         estimators.check_online(self.estimator)
-        name = for_map(self.estimator, self.map)
         check_target(self.out, MAP_FILE)
-        self._check_snapshots(name)
+        self._check_snapshots()
         viewing = self._viewing()
         if viewing is not None:
             viewing.check_watchers(self)
         log, hints = read_plausible_log(self.log, self.settings.limits)
         tell(hints)
-        log, estimator = self._begin(log, name)
+        log, estimator = self._begin(log)
         with nullcontext([]) if viewing is None else viewing.watchers(self, log) as observers:
-            result = map_online(log, estimator, name, observers)
+            result = of_kind(map_online(log, estimator, self.estimator, observers), self.map, self.settings)
             write_result(self.out, result, summarize(result, log, hints))
         if self.save is not None and isinstance(estimator, FixedLagMapper):
             estimator.save(self.save)
@@ -93,21 +96,21 @@ class Online:
         asked = self.view or self.save_view is not None or self.animate is not None
         return import_module("pathspace_graph.eval.view.recording") if asked else None
 
-    def _check_snapshots(self, estimator: str) -> None:
+    def _check_snapshots(self) -> None:
         """Raise a SettingsError where a snapshot is asked for that cannot be, before anything is mapped."""
         for name in ("save", "resume"):
-            if getattr(self, name) is not None and estimator != DEFAULT:
-                raise SettingsError(f"--{name}: expected --estimator {DEFAULT}, found {estimator}")
+            if getattr(self, name) is not None and self.estimator != DEFAULT:
+                raise SettingsError(f"--{name}: expected --estimator {DEFAULT}, found {self.estimator}")
         if self.resume is not None and self.settings != MapperSettings():
             expected = "expected no settings, since the saved mapper has its own"
             raise SettingsError(f"--resume: {expected}, found some")
         if self.save is not None:
             check_file_target(self.save)
 
-    def _begin(self, log: Log, name: str) -> tuple[Log, OnlineEstimator]:
+    def _begin(self, log: Log) -> tuple[Log, OnlineEstimator]:
         """Return a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
         if self.resume is None:
-            return log, estimators.make_online(name, self.settings, log)
+            return log, estimators.make_online(self.estimator, self.settings, log)
         mapper = FixedLagMapper.restore(self.resume)
         times = mapper.smoother.times
         cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])
@@ -136,16 +139,15 @@ class Batch:
 
     def run(self) -> None:
         estimators.check_batch(self.estimator)
-        name = for_map(self.estimator, self.map)
-        if self.start == "odometry" and name != DEFAULT_BATCH:
-            raise SettingsError(f"--start: expected online for {name}, found {self.start}")
+        if self.start == "odometry" and self.estimator != DEFAULT_BATCH:
+            raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
         check_target(self.out, MAP_FILE)
         log, hints = read_plausible_log(self.log, self.settings.limits)
         tell(hints)
         with progress("optimizing") as advance:
-            estimator = estimators.make_batch(name, self.settings, log)
+            estimator = estimators.make_batch(self.estimator, self.settings, log)
             options = (self.start, advance) if isinstance(estimator, BatchMapper) else ()
-            result: BatchRun = estimator.solve(log, *options)
+            result: BatchRun = of_kind(estimator.solve(log, *options), self.map, self.settings)
         write_result(self.out, result, summarize_batch(result, log, hints))
         report(result, log)
         say(f"written to {self.out}")
@@ -156,6 +158,30 @@ class Batch:
         objections = [known.objection if known else "", crossings_told(crossings_of(result))]
         wrong += [f"not a map of the drive: {objection}" for objection in objections if objection]
         end_untrusted(wrong)
+
+
+def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
+    """Return a result with maps of this kind; where no line fits, the boundaries stay, as an error says."""
+    if kind == "boundaries":
+        return result
+
+    def line(track: Map) -> Map:
+        found = as_ribbon(scaled(track, 1.0 / result.scale), settings.spline.sigma_shape)
+        return scaled(found, result.scale)
+
+    def line_if_any(track: Map) -> Map:
+        try:
+            return line(track)
+        except SettingsError:
+            return track
+
+    try:
+        last = line(result.map)
+    except SettingsError as error:
+        note(f"--map {kind}: {error}, and the map is of boundaries")
+        return result
+    laps = tuple((lap, line_if_any(track)) for lap, track in result.lap_maps)
+    return replace(result, map=last, lap_maps=laps, snapshots=tuple(map(line_if_any, result.snapshots)))
 
 
 def end_untrusted(wrong: Sequence[str]) -> None:

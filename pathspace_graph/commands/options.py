@@ -29,14 +29,9 @@ SETTINGS_TEXT: Final = (
     "TOML file of settings, or the summary.json of a run; options on the command line override it."
 )
 ESSENTIAL: Final = (  # settings of the estimators that `--help` explains; the others are in `--help-all`
-    *("lag", "max_poses", "steps", "noise", "scale"),
-    *("limits.silence", "limits.range_max"),
-    *("spline.degree", "spline.spacing", "spline.size_share", "spline.knots", "spline.sigma_model"),
-    *("gate.chi", "gate.huber", "gate.view_ahead", "growth.sightings"),
-    *("motion.doubt", "sides.colourless", "batch.start"),
-    *("odometry.scale", "odometry.bias", "odometry.sigma_scale", "odometry.sigma_bias"),
-    *("calibration.sensor", "calibration.trust", "calibration.yaw", "calibration.lateral"),
-    *("calibration.latency", "calibration.range_scale", "calibration.range_bias"),
+    *("lag", "noise", "scale", "limits.range_max", "spline.degree", "spline.size_share"),
+    *("motion.doubt", "sides.colourless", "batch.start", "odometry.sigma_scale"),
+    *("calibration.sensor", "calibration.trust"),
 )
 COLUMN: Final = 38  # column of the short help in which the texts begin
 MOST_COLUMNS: Final = 120

@@ -1,20 +1,18 @@
-"""`plot`, `figures` and `verify`: pictures of a map, the paper's isolated tests, and a check of files."""
+"""`plot` and `verify`: a picture of a map, and a check of files."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 from tyro.conf import Positional
 
-from pathspace_graph.console import progress, say
+from pathspace_graph.console import say
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.figures.isolated import FIGURES, MARKER, write_figures
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import check_plot_file, save_plot
 from pathspace_graph.frames import read_cycles
-from pathspace_graph.io.files import check_file_target, check_target
+from pathspace_graph.io.files import check_file_target
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
@@ -49,20 +47,6 @@ class Plot:
         look: dict[str, Any] = {"band_scale": self.band_scale, "title": self.title}
         look |= {"trajectory": trajectory, "smoothed": smoothed, "health": [*cycles.get("health", [])]}
         save_plot(plot_map(track, log=log, **look), self.out)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Figures:
-    """Draw the paper's isolated tests: uncertainty, expansion, the fit of S_z and simplification."""
-
-    out: Path
-    """Folder for the figures and their captions; earlier ones there are kept as a numbered backup."""
-
-    def run(self) -> None:
-        check_target(self.out, MARKER)
-        with progress("drawing", len(FIGURES)) as advance, threadpool_limits(limits=1):
-            write_figures(self.out, advance)
-        say(f"{', '.join(FIGURES)}: {self.out}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,8 @@
 """A record in any order as a log, and arriving messages as cycles; what was left out is counted."""
 
+from bisect import insort
 from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +15,7 @@ from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
-from pathspace_graph.io.log import Detections, Log, Odometry, Truth
+from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .messages import Points, points_of, stamp_of, twist_of
@@ -39,20 +41,14 @@ class Recording:
     scans: list[Points]  # detections of each message, in the frame of the sensor
     source: dict[str, str]  # where the record comes from, in words
     notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, with the number of times
-    truth: Truth | None = None  # what is known of the drive, for evaluation only
-    odometry_sigma: Array | None = None  # (3,) sigmas of a twist (m/s, m/s, rad/s), where they are stated
     mounting: tuple[float, float, float] | None = None  # sensor's pose (m, m, rad), where it is stated
-
-
-def twists_of(moves: Array) -> Array:
-    """Return the logarithm (n, 3) of relative poses (n, 3): the twists that lead there in 1 s."""
-    return np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
 
 
 def twists_between(t: Array, poses: Array) -> Array:
     """Return the constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
-    moves = np.array([relative(one, other) for one, other in pairwise(poses)])
-    return twists_of(moves) / np.diff(t)[:, None]
+    moves = [relative(one, other) for one, other in pairwise(poses)]
+    logarithms = np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
+    return logarithms / np.diff(t)[:, None]
 
 
 def rate(count: int, seconds: float) -> str:
@@ -101,7 +97,7 @@ def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None
 
 
 def windowed(record: Recording, window: Window, file: Path) -> Recording:
-    """Return the part of a record that counts; a later beginning, where the map begins, has no truth."""
+    """Return the part of a record that counts."""
     notes, record = record.notes, _near(record, window.range_max, record.notes)
     scan_t = record.scan_t + window.time_offset
     clocks = elapsed(record.t), elapsed(scan_t)
@@ -116,11 +112,8 @@ def windowed(record: Recording, window: Window, file: Path) -> Recording:
     notes["odometry samples outside --start and --end were left out"] += int((~kept).sum())
     notes["messages with detections outside --start and --end were left out"] += int((~seen).sum())
     scans = [scan for scan, one in zip(record.scans, seen.tolist(), strict=True) if one]
-    truth = record.truth
-    if truth is not None and window != Window():
-        truth = None if window.start else replace(truth, associations=None)
     t, twists = record.t[kept], record.twists[kept]
-    return replace(record, t=t, twists=twists, scan_t=scan_t[seen], scans=scans, truth=truth)
+    return replace(record, t=t, twists=twists, scan_t=scan_t[seen], scans=scans)
 
 
 def _near(record: Recording, most: float | None, notes: Counter[str]) -> Recording:
@@ -138,7 +131,7 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
     """Return a record in order of time, in the vehicle frame; InputError of `file` if nothing is usable."""
     frames = replace(frames, mounting=frames.mounting or record.mounting)
     odometry = _odometry(record, frames, file)
-    stated = record.odometry_sigma if noise.sigma_odometry is None else noise.sigma_odometry
+    stated = noise.sigma_odometry
     return Log(
         odometry,
         _cycles(record, odometry, frames, noise, file),
@@ -146,7 +139,6 @@ def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) 
         source=record.source,
         odometry_stated=stated is not None,
         detections_stated=noise.states_detections or not record.notes[ASSUMED],
-        truth=record.truth,
     )
 
 
@@ -277,14 +269,20 @@ BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexErr
 
 
 class MessageStream:
-    """Buffer of twists, which gives each message with detections those up to it; refused ones are counted."""
+    """Buffer of messages, which gives cycles in order, each with its twists; refused ones are counted.
 
-    def __init__(self, frames: Frames | None = None) -> None:
+    A cycle waits for older ones until a message is newer by `wait` (s), as an estimator takes none that is
+    late.
+    """
+
+    def __init__(self, frames: Frames | None = None, wait: float = 0.0) -> None:
         self.frames, self.noise, self.rule = frames or Frames(), NoiseSettings(), LabelRule()
         self.refused: Counter[str] = Counter()  # number of messages for each reason
         self._twists: deque[tuple[float, list[float]]] = deque(maxlen=MAX_BUFFERED)
         self._first = np.inf  # the stamp (s) of the first twist
-        self._newest = -np.inf  # the stamp (s) of the newest cycle in order
+        self._wait = wait
+        self._waiting = list[Detections]()  # in order of their stamps
+        self._newest = -np.inf  # the stamp (s) of the newest message with detections
 
     def take_odometry(self, message: Any, received: float) -> None:
         """Buffer the twist of a message that was received at this time (s)."""
@@ -300,8 +298,8 @@ class MessageStream:
         except BROKEN as error:
             self.refused[str(error)] += 1
 
-    def take_detections(self, message: Any, received: float) -> tuple[Odometry, Detections] | None:
-        """Return a perception cycle with the twists since the last in `use`, none for a late one, or None."""
+    def take_detections(self, message: Any, received: float) -> Iterator[tuple[Odometry, Detections]]:
+        """Yield the cycles that have waited for long enough, with the twists since the last in `use`."""
         try:
             points = usable(points_of(message, self.rule), self.refused)
             t = stamp_of(message) or received
@@ -310,13 +308,18 @@ class MessageStream:
             cycle = in_vehicle_frame(t, points, self.frames, self.noise, self.refused)
         except BROKEN as error:
             self.refused[str(error)] += 1
-            return None
-        rows = [] if t <= self._newest else [row for row in self._twists if row[0] <= t]
+            return
+        self._newest = max(self._newest, t)
+        insort(self._waiting, cycle, key=lambda one: one.t)
+        while self._waiting and self._waiting[0].t <= self._newest - self._wait:
+            yield self._with_twists(self._waiting.pop(0))
+
+    def _with_twists(self, cycle: Detections) -> tuple[Odometry, Detections]:
+        rows = [row for row in self._twists if row[0] <= cycle.t]
         twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
         return Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
 
     def use(self, t: float) -> None:
         """Drop the twists that a cycle at t (s) has used, but for the last one, which is held."""
-        self._newest = max(self._newest, t)
-        while len(self._twists) > 1 and self._twists[1][0] <= self._newest:
+        while len(self._twists) > 1 and self._twists[1][0] <= t:
             self._twists.popleft()

@@ -9,17 +9,12 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
-from pathspace_graph.factors.odometry import odometry_residuals
-from pathspace_graph.factors.se2 import left_of, move_points, rotation, se2_exp
-from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.window import MapRows
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.results import RunNoise
-from pathspace_graph.labels import POINTS, UNKNOWN
+from pathspace_graph.labels import POINTS
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import MotionSettings
 
 from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained
@@ -66,15 +61,9 @@ class FrontEnd:
         self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
 
-    def admit(self, odometry: Odometry, detections: Detections, window: Sequence[float] = ()) -> Admitted:
-        """Return a usable cycle, maybe a late one between the `window`'s stamps, or a ReadingError."""
-        return self.gate.admit(odometry, detections, self._motion.newest, window)
-
-    def use_late(self, detections: Detections, window: Sequence[float]) -> Detections:
-        """Return the detections of a late cycle with the labels of their sides; it counts as used."""
-        self.gate.use_late(detections.t, window)
-        detections = detections.where(~is_orange(detections))
-        return self._sides.relabelled(detections, np.full(len(detections.labels), UNKNOWN))
+    def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
+        """Return a usable cycle, or raise a ReadingError."""
+        return self.gate.admit(odometry, detections, self._motion.newest)
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Return the judged readings of a cycle: the twists since the last one, and its detections."""
@@ -170,32 +159,3 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
         labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
         cycles.append(SeenCycle(labelled, check.pose, motion.odometry.twist))
     return cycles, twists
-
-
-def at_nearest_pose(
-    smoother: FixedLagSmoother[MapRows], detections: Detections, settings: MotionSettings
-) -> tuple[Detections, int, Array]:
-    """Return late detections as they would be seen from the pose of the window that is nearest in time.
-
-    Also return the cycle of that pose, and the mean twist (3,) of the vehicle then (m/s, m/s, rad/s), which
-    is constant between the poses around the stamp. With T the motion from the nearest pose to the late one, a
-    detection z with covariance K becomes `T z` with `R (K + G Q G') R'`, where `G = [I | J z]` and J is the
-    quarter turn. Q is the covariance of the odometry for the share of the interval, and of a changing twist:
-    half the acceleration times the times to both poses. Errors count as independent, though one motion has
-    moved them all.
-    """
-    times, poses, t = smoother.times, smoother.variables.poses, detections.t
-    after = int(np.searchsorted(times, t))
-    before, duration = after - 1, times[after] - times[after - 1]
-    (motion,), _, _ = odometry_residuals(poses[before, None], poses[after, None], np.zeros((1, 3)))
-    share = (t - times[before]) / duration
-    nearest, share = (before, share) if share < 0.5 else (after, share - 1.0)
-    moved, whitener = se2_exp(share * motion[None])[0], smoother.window.odometry.whiteners[before]
-    bend = 0.5 * (t - times[before]) * (times[after] - t) * np.array(settings.accelerations)
-    spread = abs(share) * np.linalg.inv(whitener.T @ whitener) + np.diag(bend**2)
-    z, turn = detections.points_vehicle, rotation(moved[2])
-    by_motion = np.zeros((len(z), 2, 3))
-    by_motion[:, :, :2], by_motion[:, :, 2] = np.eye(2), left_of(z)
-    covariances = turn @ (detections.covariances + by_motion @ spread @ by_motion.transpose(0, 2, 1)) @ turn.T
-    seen = replace(detections, points_vehicle=move_points(moved, z), covariances=covariances)
-    return seen, smoother.first_cycle + nearest, motion / duration

@@ -4,7 +4,6 @@ A wrong stamp, shape, label or twist makes the whole cycle useless, which is a R
 nothing. A single detection that is impossible is dropped: a detector may fail for one cone.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
@@ -58,38 +57,33 @@ class Newest:
 class Admitted:
     """A perception cycle that may be used, in arrays of its own."""
 
-    odometry: Odometry  # twists in force from the newest cycle in order to this one; a late cycle has none
+    odometry: Odometry  # twists in force from the newest cycle to this one
     detections: Detections
     dropped: int = 0
-    late: bool = False  # whether the cycle is older than the newest one, and is used at its own time
     refused: int = 0  # number of cycles that were refused since the last one that was used
     notice: str = ""  # what was dropped, in the first of the cycles in which that happens
 
     def counted(self, result: CycleResult) -> CycleResult:
         """Return the result of the cycle with what was counted at the gate."""
-        if not (self.dropped or self.late or self.refused):
+        if not (self.dropped or self.refused):
             return result
         notice = joined([self.notice, result.notice])
-        return replace(result, notice=notice, dropped=self.dropped, late=self.late, refused=self.refused)
+        return replace(result, notice=notice, dropped=self.dropped, refused=self.refused)
 
 
 class Gate:
-    """Check of each cycle, which counts refused cycles, and remembers the late ones that were used."""
+    """Check of each cycle, which counts refused cycles."""
 
     def __init__(self, limits: LimitSettings) -> None:
         self.limits = limits
         self.refused = 0  # number of cycles that were refused since the last one that was used
         self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
-        self._late: list[float] = []  # the stamps (s) of late cycles in the window that were used
         self._dropping = False
 
-    def admit(
-        self, odometry: Odometry, detections: Detections, newest: Newest, window: Sequence[float] = ()
-    ) -> Admitted:
+    def admit(self, odometry: Odometry, detections: Detections, newest: Newest) -> Admitted:
         """Return a cycle as an estimator may use it; otherwise raise a ReadingError and count it as refused.
 
-        A late cycle is admitted between the stamps (s) of the `window`, unless it was used before. Each twist
-        is held until the next one, and what was in force before the newest cycle is left out.
+        Each twist is held until the next one, and what was in force before the newest cycle is left out.
         """
         refused, before, said = self.refused, self._refused_at, getattr(detections, "t", None)
         now = float(said) if isinstance(said, int | float) and abs(said) < inf else None
@@ -101,24 +95,16 @@ class Gate:
         try:
             possible, notice = possible_detections(detections, t, self.limits)
             stamps, twists = _checked_twists(_of_type(Odometry, odometry, "odometry"), self.limits)
-            late = newest.t is not None and t <= newest.t
-            if late:
-                _check_late(stamps, t, window, self._late)
-                stamps, twists = stamps[:0], twists[:0]
-            else:
-                _check_order(stamps, t, newest.t, silence)
-                stamps, twists = _since(stamps, twists, newest)
+            _check_order(stamps, t, newest.t, silence)
+            stamps, twists = _since(stamps, twists, newest)
         except ReadingError as error:
             raise error.at(t) from None
         dropped, notice = len(detections.labels) - len(possible.labels), "" if self._dropping else notice
         self.refused, self._refused_at, self._dropping = 0, None, dropped > 0
-        return Admitted(Odometry(stamps, twists), possible, dropped, late, refused, notice)
+        return Admitted(Odometry(stamps, twists), possible, dropped, refused, notice)
 
     def refuse(self) -> None:
         self.refused += 1
-
-    def use_late(self, t: float, window: Sequence[float]) -> None:
-        self._late = [stamp for stamp in self._late if stamp >= window[0]] + [t]
 
 
 def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
@@ -153,21 +139,10 @@ def _stamp(value: Any) -> float:
     return t
 
 
-def _check_late(stamps: Array, t: float, window: Sequence[float], used: Sequence[float]) -> None:
-    """Refuse a late cycle at t (s) that is not inside the window, or was used, or brings newer twists."""
-    if not window:
-        raise ReadingError("detections.t", "a stamp later than the newest cycle", t)
-    if t < window[0]:
-        raise ReadingError("detections.t", f"a stamp inside the window, from {window[0]:.12g} s on", t)
-    if t in window or t in used:
-        raise ReadingError("detections.t", "a cycle that was not used before", t)
-    if len(stamps) and stamps[-1] > window[-1]:
-        expected = f"none later than the newest cycle at {window[-1]:.12g} s with a late cycle"
-        raise ReadingError("odometry.t", expected, float(stamps[-1]), len(stamps) - 1)
-
-
 def _check_order(stamps: Array, t: float, newest: float | None, silence: float) -> None:
-    """Refuse twists (k,) that are later than their cycle at t (s), and a silence since the newest one."""
+    """Refuse a cycle at t (s) before the newest one, twists (k,) later than it, and a silence before it."""
+    if newest is not None and t <= newest:
+        raise ReadingError("detections.t", "a stamp later than the newest cycle", t)
     if len(stamps) and stamps[-1] > t:
         row = int(stamps.searchsorted(t, side="right"))
         raise ReadingError("odometry.t", "none later than the cycle", float(stamps[row]), row)

@@ -23,6 +23,7 @@ REACH: Final = 8.0  # length of the predicted path beside which coloured cones s
 MIN_LATERAL: Final = 0.5
 MAX_LATERAL: Final = 8.0  # distances from the path between which it tells the side of a cone, m
 MAJORITY: Final = 2.5  # least ratio of cones on the other colour's side where colours are swapped
+MIN_VOTES: Final = 3  # least number of cones on the other colour's side where colours are swapped
 ENOUGH_VOTES: Final = 30  # number of cones that settles what the colours mean
 REMEMBERED: Final = 0.98  # factor from cycle to cycle of the detections so far in the colourless share
 MIN_DETECTIONS: Final = 6  # least number of detections of which the share is taken
@@ -100,7 +101,7 @@ class SideJudge:
         self._opposing += int((~agree & beside).sum())
         votes = self._opposing, self._agreeing
         winning, losing = votes[::-1] if self.swapped else votes
-        if winning >= self.settings.min_votes and winning > MAJORITY * losing:
+        if winning >= MIN_VOTES and winning > MAJORITY * losing:
             self.swapped = not self.swapped
 
     def _is_colourless(self, labels: IntArray) -> bool:

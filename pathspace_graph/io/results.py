@@ -108,8 +108,6 @@ class CycleRecord:
     """Why the estimate is not good."""
     dropped: int = 0
     """Number of the cycle's detections that were dropped as impossible."""
-    late: bool = False
-    """Whether the cycle came after a newer one, and was used at its own time."""
     refused: int = 0
     """Number of cycles that were refused just before this one."""
 

@@ -171,7 +171,7 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
     smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.sigma_stations)
     _move_poses(state.poses, marginal.poses[first:])
     state.variables.calibrations[:] = marginal.calibration
-    locate_poses(state, settings.batch.association)
+    locate_poses(state)
     keys = np.concatenate([state.variables.calibration_keys, added, pose_keys(np.array([first]))])
     smoother.set_prior(keys, marginal.mean, marginal.information)
     smoother.reassociate()

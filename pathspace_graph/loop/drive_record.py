@@ -93,11 +93,6 @@ class DriveRecord:
         if len(self.stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
-    def measured_late(self, cycle: int, detections: Detections) -> None:
-        """Add detections to those of an earlier cycle, as they would be seen from its pose."""
-        if self.unsolvable is None:
-            self._seen[cycle] = self._seen[cycle].with_others(detections)
-
     def estimated(self, state: State) -> None:
         """Add the newest pose, unless the loop has closed and no batch needs it."""
         if not state.closed or self.unsolvable is None:

@@ -17,7 +17,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, wrap_angle
 from pathspace_graph.graph.gaussian import half_solve
 from pathspace_graph.graph.variables import POSE
-from pathspace_graph.health import Evidence
+from pathspace_graph.health import SHARE_DEGRADED, Evidence
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -163,12 +163,12 @@ def evidence_of(smoother: CurveSmoother, tested: Gating, known: KnownLoop, seen_
     about the vehicle: those not `seen_again` (m,) of all detections of the cycle, those on the curve of the
     other colour, and those beside a gap of the map.
     """
-    detections, settings = smoother.map.detections, smoother.map.settings.health
+    detections = smoother.map.detections
     closed, used = smoother.map.state.closed, detections.used[tested.rows]
     again = seen_again[tested.rows - (len(detections) - len(seen_again))]
     judged = used | ((tested.in_view | closed) & again)
     labels, explained, unmapped = detections.label[tested.rows], used.copy(), np.zeros(len(used), bool)
-    if known.is_whole and used.sum() < settings.share_degraded * judged.sum():
+    if known.is_whole and used.sum() < SHARE_DEGRADED * judged.sum():
         others = np.flatnonzero(judged & ~used)
         rows = tested.rows[others]
         points, loop, label = detections.points_map(rows, smoother.variables), known.get(), labels[others]
@@ -340,7 +340,7 @@ def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) 
     before = state.poses[-1].copy()
     found.motion.move(state.poses)
     smoother.add_pose_prior(smoother.next_cycle - 1, found.covariance * WIDENING**2)
-    locate_poses(state, settings.batch.association)
+    locate_poses(state)
     smoother.reassociate()
     for _ in range(STEPS):
         smoother.step(settings.sigma_step)

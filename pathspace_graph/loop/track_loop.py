@@ -64,7 +64,7 @@ class TrackLoop:
         self.map_repair = MapRepair(smoother)
         self._smoother = smoother
         self._path = path
-        self._monitor = HealthMonitor(self.settings.health)
+        self._monitor = HealthMonitor()
         self._known_loop = KnownLoop(smoother)
         self._search: Search | None = None
         self._lost = Health()  # as it was when the search began

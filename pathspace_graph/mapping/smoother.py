@@ -74,14 +74,6 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         judged = newest & (detections.label[rows] != UNKNOWN)
         return Gating(rows[judged], foot.interior[judged], innovation[judged])
 
-    def associate_late(self, new: slice) -> None:
-        """Put those of the late detections, which are the rows `new`, into use that lie on a curve."""
-        if self.last_step is None:
-            return
-        labels = self.map.state.curves.labels
-        rows, curve = self.map.detections.open_to(labels, np.full(len(labels), new.start))
-        self._associate(rows[rows < new.stop], curve[rows < new.stop])
-
     def reassociate(self) -> None:
         """Associate all detections of the window with new curves, on which the poses have been located.
 

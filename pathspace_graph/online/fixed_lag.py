@@ -10,10 +10,10 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.checkpoint import Recovery
-from pathspace_graph.errors import ReadingError, SettingsError
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
-from pathspace_graph.front_end.front_end import FrontEnd, Reading, at_nearest_pose
+from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.front_end.gate import Admitted
 from pathspace_graph.health import GOOD
 from pathspace_graph.io.log import Detections, Odometry
@@ -83,11 +83,6 @@ class FixedLagMapper(MapperEstimate):
         held until the next one, those in force before the newest cycle are left out, and where some are lost,
         the last one is held.
 
-        A late cycle, with a stamp before the newest one's, is used at its time if that is inside the window,
-        and is refused otherwise. It brings no twists that are newer than the newest cycle, and no factors.
-        Its detections are moved to the pose that is nearest in time (`front_end.front_end`), and may make the
-        curves grow in the next cycle in order. The pose in the result is still the newest one.
-
         Where another process solves the lap as a batch, the call waits for it no longer than the time since
         the cycle before, and the map is replaced in a later cycle if need be. A replay of a log calls `wait`
         before, so that it does not depend on the speed of the machine.
@@ -105,7 +100,7 @@ class FixedLagMapper(MapperEstimate):
         factors = tuple(factors)
         self.recovery.before(self, self.front_end.gate)
         cycle, unused = self._admit(odometry, detections, factors), self._unused
-        if unused is not None and not cycle.late:
+        if unused is not None:
             cycle = replace(cycle, odometry=unused.followed_by(cycle.odometry))
         again = partial(self._process, cycle, factors)
         try:
@@ -113,7 +108,7 @@ class FixedLagMapper(MapperEstimate):
         except Exception as error:  # a vehicle drives on, whatever has failed
             return cycle.counted(self._without(cycle, factors, error))
         self.recovery.called(again)
-        self._unused = unused if cycle.late else None
+        self._unused = None
         return cycle.counted(result)
 
     def _process(
@@ -121,8 +116,6 @@ class FixedLagMapper(MapperEstimate):
     ) -> CycleResult:
         """Take the steps of the paper; a `careful` cycle leaves the loop as it is for some metres."""
         watch = Stopwatch()
-        if cycle.late:
-            return self._use_late(cycle.detections, watch)
         self.smoother.add_factors(factors)
         if factors:
             self.loop.record.give_up("the batch of the lap does not know the user's factors")
@@ -166,7 +159,7 @@ class FixedLagMapper(MapperEstimate):
         The mapper is as it was before the cycle each time. The notice says what has failed.
         """
         self.recovery.failures += 1
-        number, unused, seen = self.recovery.failures, self._unused, cycle.detections
+        number, seen = self.recovery.failures, cycle.detections
         why = f": {type(error).__name__}: {error}" if number == 1 else f" (failure {number})"
         failed = " ".join(f"an update failed{why}".split())
         blind = replace(cycle, detections=seen.where(np.zeros(len(seen.labels), bool)))
@@ -181,10 +174,10 @@ class FixedLagMapper(MapperEstimate):
             except Exception:  # the next attempt does less
                 continue
             self.recovery.called(again)
-            self._unused = unused if cycle.late else None
+            self._unused = None
             return replace(result, notice=joined([failed, consequence, result.notice]))
         self.recovery.take_back(self, self.front_end.gate)
-        self._unused = unused if cycle.late else cycle.odometry
+        self._unused = cycle.odometry
         return self._result(cycle.detections.t, {}, None, f"{failed}; the cycle is not used")
 
     def _admit(
@@ -195,11 +188,7 @@ class FixedLagMapper(MapperEstimate):
         except SettingsError:
             self.front_end.gate.refuse()
             raise
-        cycle = self.front_end.admit(odometry, detections, self.smoother.times)
-        if cycle.late and factors:
-            self.front_end.gate.refuse()
-            raise ReadingError("factors", "none with a late cycle", len(factors), t=cycle.detections.t)
-        return cycle
+        return self.front_end.admit(odometry, detections)
 
     def finish(self) -> None:
         """Take the result of a batch that is under way, where the drive is over and no cycle follows.
@@ -212,23 +201,6 @@ class FixedLagMapper(MapperEstimate):
     def _place_orange(self) -> None:
         window = self.smoother.first_cycle, self.poses
         self.orange.place_again(self.smoother.variables.sensor, (0, self.corrected_poses), window)
-
-    def _use_late(self, detections: Detections, watch: Stopwatch) -> CycleResult:
-        detections = self.front_end.use_late(detections, self.smoother.times)
-        late, cycle, twist = at_nearest_pose(self.smoother, detections, self.settings.motion)
-        table = self.smoother.map.detections
-        new = table.append(late, cycle, twist)
-        self.loop.record.measured_late(cycle, late)
-        if self.boundaries and not self.loop.is_searching:
-            self.smoother.associate_late(new)
-        if not self.closed:
-            self.growth.observe(new, detections.t)
-        watch.lap("classify")
-        for _ in range(self.settings.steps):
-            self.smoother.step(self.settings.sigma_step)
-        watch.lap("update")
-        used = int(table.used[new].sum())
-        return replace(self._result(detections.t, watch.laps, None, ""), readings=used)
 
     # --- the steps of the paper --------------------------------------------------------------------------
 

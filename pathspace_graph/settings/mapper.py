@@ -10,7 +10,6 @@ from .online import (
     CalibrationSettings,
     ClosingSettings,
     GrowthSettings,
-    HealthSettings,
     LimitSettings,
     MotionSettings,
     OdometrySettings,
@@ -41,17 +40,14 @@ class SplineSettings(Positive):
     the offsets, about 0.1 m, since a cone has the same one each time."""
     sigma_shape: float = 0.1
     """Standard deviation of what a curve with few control points cannot follow, m, added in a closed map."""
-    search_iterations: int = 2
-    """Newton steps at the end of a global search for a foot point."""
-    refine_room: float = 2.0
-    """Largest move of a foot point in a Gauss-Newton step, m along the curve."""
-    refine_iterations: int = 1
-    """Newton steps that refine each foot point in a Gauss-Newton step."""
 
     min_size: ClassVar[int] = 8  # least number of control points of a closed boundary
     sigma_simplify: ClassVar[float] = 0.1  # m, of a control point's move by simplification: a looser prior
     confirmed_margin: ClassVar[float] = 0.5  # m past its last cone up to which an open curve is believed
     search_step: ClassVar[float] = 1.0  # m along the curve, of the grid of a global search for foot points
+    search_iterations: ClassVar[int] = 2  # Newton steps at the end of that search
+    refine_room: ClassVar[float] = 2.0  # m along the curve, of a foot point's move in a Gauss-Newton step
+    refine_iterations: ClassVar[int] = 1  # Newton steps that refine a foot point in a Gauss-Newton step
     fit_smoothness: ClassVar[float] = 0.1  # weight of second differences in the fit to tentative tracks
     fit_held: ClassVar[int] = 4  # points of the known curve's end that this fit passes, to keep its shape
 
@@ -61,6 +57,15 @@ class SplineSettings(Positive):
             raise SettingsError(
                 f"spline.linear_baseline: expected a share of at most 1, found {self.linear_baseline}"
             )
+
+
+@dataclass(frozen=True)
+class ExactSplineSettings(SplineSettings, group="spline"):
+    """The same curves with foot points that are more exact than online, as an optimum needs them."""
+
+    search_iterations: ClassVar[int] = 4
+    refine_room: ClassVar[float] = 8.0
+    refine_iterations: ClassVar[int] = 2
 
 
 @dataclass(frozen=True)
@@ -133,18 +138,6 @@ class RelinearizeSettings(Positive):
 
 
 @dataclass(frozen=True)
-class AssociationSettings(Positive, group="batch.association"):
-    """Places of poses and detections along the curves."""
-
-    step: float = 1.0
-    """Step at which nearest points of a curve are first searched for (m along the curve)."""
-    direction_penalty: float = 100.0
-    """Distance added in quadrature to a stretch of curve that runs against a pose's heading (m)."""
-    room: float = 2.0
-    """Most by which two poses may be farther apart along an open curve than was driven between them (m)."""
-
-
-@dataclass(frozen=True)
 class ClosureSettings(Positive, group="batch.closure"):
     """When a closed loop is believed."""
 
@@ -185,20 +178,15 @@ class BatchSettings(Positive):
     odometry where cones are met again and nothing speaks against the closed loop, else an online run."""
     size_share: float = 0.43
     """Most control points as a share of the distinct cones that were detected (the paper has 0.44)."""
-    dense_share: float = 1.0
-    """Control points for each cone of the curves that are solved for, which the map's are fitted to."""
-    sigma_model: float = 0.05
-    """Standard deviation (m) of a cone's distance from the curves that are solved for; `spline.sigma_model`
-    online, where they have fewer control points."""
     sigma_smoothness: float = 0.4
     """Standard deviation of the second difference of control points, as a share of their spacing: smaller
     than online, so that a curve between cones that were never detected has one best shape."""
-    sigma_slide: float = 0.2
-    """Standard deviation of a control point's slide along its curve from beside its first pose (m)."""
-    gate: float = 4.0
-    """Width of Tukey's loss: distance beyond which a detection has no weight, in standard deviations."""
-    association: AssociationSettings = field(default_factory=AssociationSettings)
     closure: ClosureSettings = field(default_factory=ClosureSettings)
+
+    dense_share: ClassVar[float] = 1.0  # control points for each cone of the curves that are solved for
+    sigma_model: ClassVar[float] = 0.05  # m, of a cone's distance from these; online they have fewer points
+    sigma_slide: ClassVar[float] = 0.2  # m, of a control point's slide along its curve
+    gate: ClassVar[float] = 4.0  # sigmas, width of Tukey's loss: beyond it a detection has no weight
 
 
 @dataclass(frozen=True)
@@ -219,30 +207,8 @@ class CkfSettings(Positive):
     """Standard deviation of the second difference of the control points that an extension moves or adds, as a
     share of their spacing. A large value gives the filter as it is published, whose uncertainty multiplies
     with each extension."""
-    knots: Knots = "curvature"
-    """What the knots of a closed boundary follow; curvature in the paper."""
     sightings: int = 3
     """Detections that make a landmark of the baseline filter; 1, as it is described, takes every one."""
-
-
-@dataclass(frozen=True)
-class LandmarkSettings(Positive):
-    """The Hungarian landmark graph."""
-
-    match: float = 0.95
-    """Probability of the gate inside which a detection may be of a landmark."""
-    create: float = 0.99
-    """Probability of the gates of all landmarks of its colour outside of which a detection may be new."""
-
-
-@dataclass(frozen=True)
-class CenterlineSettings(Positive):
-    """The estimators that map a track as one centre line with a width."""
-
-    spacing: float = 3.0
-    """Distance of the knots of the centre line (m)."""
-    sigma_width: float = 0.3
-    """Standard deviation (m) of the second difference of the half widths at neighbouring control points."""
 
 
 @dataclass(frozen=True)
@@ -272,7 +238,6 @@ class MapperSettings(Positive):
     growth: GrowthSettings = field(default_factory=GrowthSettings)
     closing: ClosingSettings = field(default_factory=ClosingSettings)
     open_lap: OpenLapSettings = field(default_factory=OpenLapSettings)
-    health: HealthSettings = field(default_factory=HealthSettings)
     far: FarSettings = field(default_factory=FarSettings)
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
@@ -280,9 +245,7 @@ class MapperSettings(Positive):
     odometry: OdometrySettings = field(default_factory=OdometrySettings)
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     batch: BatchSettings = field(default_factory=BatchSettings)
-    landmark: LandmarkSettings = field(default_factory=LandmarkSettings)
     ckf: CkfSettings = field(default_factory=CkfSettings)
-    centerline: CenterlineSettings = field(default_factory=CenterlineSettings)
 
     sigma_step: ClassVar[float] = 0.5  # of a control point's move in a step, m: damps sliding along the curve
 

@@ -1,4 +1,4 @@
-"""Settings of the online mapper: growth of open ends, closing, health, the front end, and constant errors."""
+"""Settings of the online mapper: growth of open ends, closing, the front end, and constant errors."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -24,14 +24,13 @@ class GrowthSettings(Positive):
     """Distance within which detections of one label belong to one tentative track (m)."""
     forget_after: float = 6.0
     """Time without a detection after which a tentative track is dropped (s)."""
-    threshold: float = 0.7
-    """Distance from the end of the curve below which a tentative track does not extend it (m)."""
-    max_lateral: float = 10.0
-    """Distance from the driven path at which tracks begin a boundary (m); circuits are up to 15 m wide."""
     max_size: float = 5000.0
     """Number of control points from which on an open curve grows no further."""
     max_unseen: float = 500.0
     """Longest stretch of an open curve without any cone (m)."""
+
+    threshold: ClassVar[float] = 0.7  # m from a curve's end below which a tentative track does not extend it
+    max_lateral: ClassVar[float] = 10.0  # m from the path at which tracks begin a boundary: half a wide road
 
 
 @dataclass(frozen=True)
@@ -76,36 +75,6 @@ class ClosingSettings(Positive):
 
 
 @dataclass(frozen=True)
-class HealthSettings(Positive):
-    """Limits of a good, a degraded and a lost estimate, by the share of detections that the map explains.
-
-    A coloured detection in the view of the curves is explained if it is in use, or lies on a closed curve of
-    its colour farther along: in a hairpin the sensor sees the next stretch across the infield.
-    """
-
-    window: float = 1.0
-    """Age up to which detections are judged together (s)."""
-    min_offered: int = 12
-    """Least number of detections that are judged, older ones if the window holds fewer."""
-    blind: float = 2.0
-    """Time without detections from which on the estimate is degraded (s)."""
-    share_degraded: float = 0.8
-    """Share of explained detections on a closed map below which the estimate is degraded."""
-    share_lost: float = 0.55
-    """Share of explained detections on a closed map below which the vehicle is lost."""
-    open_degraded: float = 0.35
-    """Share of explained detections below which the estimate is degraded while the loop is open, low since
-    detections of stretches that are not mapped yet lie beside the curves."""
-    innovation: float = 1.2
-    """Largest mean squared distance of detections in use from their curve in a good estimate, before the
-    update, by its variance; one sigma of the mean over the cones in view is added."""
-    sigma_degraded: float = 1.0
-    """Position's largest standard deviation on a closed map beyond which an estimate is degraded (m)."""
-    sigma_lost: float = 5.0
-    """The same standard deviation beyond which the vehicle is lost (m)."""
-
-
-@dataclass(frozen=True)
 class LimitSettings(Positive, group="limits"):
     """What a vehicle and its sensors can do at most, at scale 1.
 
@@ -133,23 +102,15 @@ class MotionSettings(Positive):
 
     doubt: float = 5.0
     """Contradiction from which the odometry is not believed, standard deviations; `inf` to believe it."""
-    acceleration: float = 5.0
-    """Growth of the speeds' uncertainty where a twist is held for longer than usual, m/s^2."""
-    angular_acceleration: float = 1.5
-    """Growth of the yaw rate's uncertainty there, rad/s^2."""
 
-    @property
-    def accelerations(self) -> tuple[float, float, float]:
-        """How fast the twist of a vehicle changes (m/s^2, m/s^2, rad/s^2)."""
-        return self.acceleration, self.acceleration, self.angular_acceleration
+    accelerations: ClassVar = (5.0, 5.0, 1.5)
+    """Growth of the twist's uncertainty where one is held for longer than usual (m/s^2, m/s^2, rad/s^2)."""
 
 
 @dataclass(frozen=True)
 class SidesSettings(Positive):
     """How the side of a cone is told from the way driven."""
 
-    min_votes: int = 3
-    """Least number of cones on the side of the other colour from which the colours are swapped."""
     colourless: float = 0.7
     """Share of detections without a colour from which sides are told from the rows of cones; 1 for never."""
 

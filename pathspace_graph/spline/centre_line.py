@@ -13,12 +13,13 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.residuals import RIBBON, greville, smoothness_coefficients
+from pathspace_graph.factors.residuals import greville, smoothness_coefficients
 from pathspace_graph.factors.se2 import left_of, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .bspline import BSpline, dot, segments_cross
 
+RIBBON: Final = 3  # entries of a ribbon's control point: x, y (m, map frame) and half the width h (m)
 SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line on which the edge of each label is
 SAMPLE_STEP: Final = 0.5  # distance of the samples of boundaries, of lines, and of edges that are fitted (m)
 _EDGE_BREAKS: Final = 2  # knot intervals of an edge for each of the ribbon: it is no B-spline itself

@@ -11,13 +11,12 @@ import numpy as np
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.residuals import RIBBON
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.settings.output import SpeedSettings
 
 from .ahead import MOST_POINTS, TrackAhead, check_length
 from .bspline import BSpline, cross, dot
-from .centre_line import CentreCurve, Crossing, find_line, sparse_rows
+from .centre_line import RIBBON, CentreCurve, Crossing, find_line, sparse_rows
 
 if TYPE_CHECKING:
     import pandas as pd  # imported when it is asked for: a planner has no use for it

@@ -39,7 +39,7 @@ def small_system() -> tuple[BatchSystem, State]:
     system = BatchSystem(detections, chain, settings, Biweight(settings.batch.gate))
     system.begin(state)
     state = moved(state, np.random.default_rng(2).normal(0.0, 0.01, state.variables.layout.size))
-    locate_poses(state, settings.batch.association)
+    locate_poses(state)
     associate(state, detections, settings, 8.0, False)
     system.evaluate(state, hold=True)
     return system, state

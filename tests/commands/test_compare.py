@@ -60,7 +60,7 @@ def test_the_command_writes_tables_figures_and_maps(
     assert json.loads((out / "rings" / "summary.json").read_text())["laps"][1]["size"] == 32
     table = rows(out / "table.csv")
     assert [row["lap"] for row in table] == ["1", "2", "1", "2", "2"]
-    assert {"log", "estimator", "scope", "lap", "rmse", "two_way"} <= set(rows(out / "metrics.csv")[0])
+    assert {"log", "estimator", "scope", "lap", "rmse", "missed_1m"} <= set(rows(out / "metrics.csv")[0])
     assert json.loads((out / "comparison.json").read_text())["failures"] == []
 
 

@@ -80,7 +80,6 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
     monkeypatch.setattr("os.fsync", lambda _: None)  # the killer loses what was not flushed
     picture = Figure()
     monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).write_bytes(b"picture"))
-    figures = dict.fromkeys(("fit", "expansion"), lambda: (picture, "It shows."))
     answers = {
         "commands.simulate.simulate": recorded.log,
         "commands.compare.simulate": recorded.log,
@@ -108,7 +107,6 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
     answers |= {f"{room}.summarize": {} for room in rooms}
     for name, answer in answers.items():
         monkeypatch.setattr(f"pathspace_graph.{name}", lambda *_, _answer=answer, **__: _answer)
-    monkeypatch.setattr("pathspace_graph.eval.figures.isolated.FIGURES", figures)
     monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
 
 
@@ -134,7 +132,6 @@ def commands(recorded: Recorded) -> dict[str, list[str]]:
         "batch": [log, "--estimator", "rings-batch"],
         "compare": [log, "--estimators", "rings", "gaps"],
         "scale": ["--estimators", "rings"],
-        "figures": [],
         "demo": [],
         "plot": [track],
     }
@@ -170,7 +167,7 @@ def place(target: Path, like: Contents) -> None:
 
 @pytest.mark.parametrize("old", [False, True], ids=["first", "again"])
 @pytest.mark.parametrize(
-    "name", ["simulate", "convert", "online", "batch", "scale", "figures", "plot", *map(slow, LONG)]
+    "name", ["simulate", "convert", "online", "batch", "scale", "plot", *map(slow, LONG)]
 )
 def test_a_kill_at_any_step_leaves_the_old_or_the_new(
     name: str, old: bool, recorded: Recorded, tmp_path: Path

@@ -20,7 +20,8 @@ from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
 SCREEN = 50
 """Lines of a screen."""
-MOST_SETTINGS = 120
+MOST_SETTINGS = 88
+MOST_ESSENTIAL = 12
 ONLINE = ["LOG", "--out", "MAP"]
 
 
@@ -165,6 +166,7 @@ def test_a_setting_is_only_named_where_it_is_near() -> None:
 def test_the_estimators_have_few_settings() -> None:
     """A number that neither a user nor a study changes is a constant."""
     assert len(leaves(MapperSettings())) <= MOST_SETTINGS
+    assert len(ESSENTIAL) <= MOST_ESSENTIAL
 
 
 # --- what every command takes ----------------------------------------------------------------------------

@@ -53,10 +53,8 @@ def with_entry(array: np.ndarray[Any, Any], index: Any, value: Any) -> np.ndarra
     return changed
 
 
-def through(
-    twists: Any = None, cycle: Any = None, newest: Newest = NEWEST, window: tuple[float, ...] = ()
-) -> Admitted:
-    return Gate(LIMITS).admit(twists or odometry(), cycle or detections(), newest, window)
+def through(twists: Any = None, cycle: Any = None, newest: Newest = NEWEST) -> Admitted:
+    return Gate(LIMITS).admit(twists or odometry(), cycle or detections(), newest)
 
 
 # --- what is used ----------------------------------------------------------------------------------------
@@ -77,7 +75,7 @@ def test_a_good_cycle_goes_through_as_it_is_in_arrays_of_its_own() -> None:
         (admitted.detections.labels, cycle.labels),
     ):
         assert not np.shares_memory(mine, theirs)
-    assert (admitted.dropped, admitted.late, admitted.refused, admitted.notice) == (0, False, 0, "")
+    assert (admitted.dropped, admitted.refused, admitted.notice) == (0, 0, "")
 
 
 def test_the_first_cycle_may_have_any_stamp_and_no_twist() -> None:
@@ -373,39 +371,6 @@ def test_refused_cycles_are_counted_until_one_is_used() -> None:
             gate.admit(odometry(), detections(np.nan), NEWEST)
     assert gate.admit(odometry(), detections(), NEWEST).refused == 3
     assert gate.admit(odometry(STAMPS + 1), detections(2.1), Newest(2.0)).refused == 0
-
-
-# --- late cycles -----------------------------------------------------------------------------------------
-
-WINDOW = (0.5, 0.7, 1.0)
-
-
-def test_a_late_cycle_inside_the_window_is_used_without_its_twists() -> None:
-    admitted = through(odometry(STAMPS - 0.3), detections(0.8), window=WINDOW)
-    assert admitted.late
-    assert len(admitted.odometry.t) == 0
-
-
-@pytest.mark.parametrize(
-    ("t", "twists", "text"),
-    [
-        (0.4, NONE, "inside the window, from 0.5 s on"),
-        (0.7, NONE, "was not used before"),
-        (1.0, NONE, "was not used before"),
-        (0.8, odometry(), "none later than the newest cycle at 1 s with a late cycle"),
-    ],
-)
-def test_other_late_cycles_are_refused(t: float, twists: Odometry, text: str) -> None:
-    with pytest.raises(ReadingError, match=text):
-        through(twists, detections(t), window=WINDOW)
-
-
-def test_a_late_cycle_is_used_once() -> None:
-    gate = Gate(LIMITS)
-    assert gate.admit(NONE, detections(0.8), NEWEST, WINDOW).late
-    gate.use_late(0.8, WINDOW)
-    with pytest.raises(ReadingError, match="was not used before"):
-        gate.admit(NONE, detections(0.8), NEWEST, WINDOW)
 
 
 # --- logs ------------------------------------------------------------------------------------------------

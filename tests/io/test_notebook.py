@@ -7,6 +7,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from pathspace_graph.io.brief import brief
 
 from ..scenes.drives import short_drive
 
-NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebook.ipynb"
+PAGES = Path(__file__).parents[2] / "docs"
 LONGEST = 400
 """Most characters of a record's text."""
 
@@ -108,15 +109,80 @@ def test_records_are_drawn() -> None:
     assert plt.get_fignums() == []
 
 
-def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not NOTEBOOK.exists():
+def cells_of(notebook: str) -> list[dict[str, Any]]:
+    """The cells of code of one of the pages."""
+    if not (PAGES / notebook).exists():
         pytest.skip("there are no pages beside an installed package")
-    monkeypatch.chdir(tmp_path)
-    content = json.loads(NOTEBOOK.read_text())
-    cells = ["".join(cell["source"]) for cell in content["cells"] if cell["cell_type"] == "code"]
-    assert not any(cell.get("outputs") for cell in content["cells"])
+    cells = json.loads((PAGES / notebook).read_text())["cells"]
+    return [cell for cell in cells if cell["cell_type"] == "code"]
+
+
+def names_of(notebook: str) -> dict[str, Any]:
+    """What a notebook of the pages has defined at its end."""
     names: dict[str, Any] = {}
-    for cell in cells:
-        exec(compile(cell, NOTEBOOK.name, "exec"), names)  # the notebook is ours
+    for cell in cells_of(notebook):
+        exec(compile("".join(cell["source"]), notebook, "exec"), names)  # the notebook is ours
+    plt.close("all")
+    return names
+
+
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert not any(cell["outputs"] for cell in cells_of("notebook.ipynb"))
+    names = names_of("notebook.ipynb")
     assert names["result"].map.closed
     assert len(names["growing"]) > 3
+
+
+# --- the paper's isolated tests --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def isolated() -> dict[str, Any]:
+    with mpl.rc_context({"backend": "agg"}):
+        return names_of("isolated.ipynb")
+
+
+def test_a_picture_stands_below_each_isolated_test() -> None:
+    shown = [
+        "image/png" in output["data"] for cell in cells_of("isolated.ipynb") for output in cell["outputs"]
+    ]
+    assert shown == [True] * 4
+
+
+def test_the_joint_covariance_is_the_spread_of_splines_and_the_marginals_are_not(
+    isolated: dict[str, Any],
+) -> None:
+    """The curve is least certain where nothing was seen."""
+    joint, sampled, inner = isolated["joint"], isolated["sampled"], slice(30, 271)
+    np.testing.assert_allclose(joint, sampled, rtol=0.05)
+    assert np.abs(isolated["marginals"] / sampled - 1.0).max() > 0.15
+    assert 0.52 < (30 + joint[inner].argmax()) / len(joint) < 0.74
+
+
+def test_an_expansion_leaves_the_curve_and_the_update_draws_it_to_the_detections(
+    isolated: dict[str, Any],
+) -> None:
+    before, extended, updated = (isolated[name] for name in ("before", "extended", "updated"))
+    np.testing.assert_array_equal(isolated["order"], [2, 3, 4])
+    u = np.linspace(*before.domain, 60)
+    np.testing.assert_allclose(extended.evaluate(u), before.evaluate(u), atol=1e-9)
+    np.testing.assert_allclose(extended.control_points[-1], isolated["detections"][4], atol=1e-9)
+    far, near = (curve.foot_points(isolated["others"]).distance for curve in (extended, updated))
+    assert np.linalg.norm(near) < 0.5 * np.linalg.norm(far)
+    assert np.linalg.eigvalsh(isolated["sigma_extended"] - isolated["sigma_updated"]).min() > -1e-9
+
+
+def test_a_fit_moves_what_the_basis_touches(isolated: dict[str, Any]) -> None:
+    curve, fitted, readings = (isolated[name] for name in ("curve", "fitted", "readings"))
+    before, after = (np.abs(one.foot_points(readings).distance) for one in (curve, fitted))
+    assert (after < 0.3 * before).all()
+    moved = np.linalg.norm(fitted.control_points - curve.control_points, axis=1)
+    touched = isolated["basis"].sum(axis=0) > 0.0
+    assert moved[~touched].max() < 1e-9 and moved[touched].max() > 1.0
+
+
+def test_a_hundred_control_points_become_thirty_two_at_little_cost(isolated: dict[str, Any]) -> None:
+    assert (isolated["old"].size, isolated["weighted"].size, isolated["uniform"].size) == (100, 32, 32)
+    by_curvature, even = (np.sqrt(np.mean(error**2)) for error in isolated["errors"])
+    assert by_curvature < 0.12 and isolated["errors"][0].max() < 0.4 and by_curvature < even

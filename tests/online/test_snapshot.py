@@ -15,7 +15,7 @@ import pytest
 
 from pathspace_graph import FixedLagMapper, InputError, SettingsError
 from pathspace_graph.health import LOST
-from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import LEFT, UNKNOWN
 from pathspace_graph.loop.map_repair import REPAIRED
@@ -31,8 +31,6 @@ from ..scenes.drives import ODOMETRY_SIGMA, ahead, bean_track, beginning, corrid
 from ..scenes.holes import unseen
 from ..scenes.kidnapped import laps_log, pear_track, put_down
 
-Cycles = list[tuple[Odometry, Detections]]
-NO_TWISTS = Odometry(np.zeros(0), np.zeros((0, 3)))
 AFTERWARDS = 30
 """Number of cycles that a mapper which was restored at the last moment goes on: a whole window."""
 
@@ -44,7 +42,6 @@ class Drive:
     log: Log
     moments: dict[str, Callable[[FixedLagMapper, CycleResult], bool]]
     settings: MapperSettings = field(default_factory=MapperSettings)
-    reorder: Callable[[Cycles], Cycles] = lambda cycles: cycles
     registers: bool = True
 
 
@@ -148,42 +145,14 @@ def colours() -> Drive:
     return Drive(replace(log, cycles=tuple(cycles)), every)
 
 
-def late() -> Drive:
-    """A lap of which every seventh cycle comes after the next one."""
-    log = simulate(bean_track(), SimulationSettings(laps=1), seed=4)
-    return Drive(
-        log,
-        {
-            "late": lambda mapper, result: result.late,
-            "after": later_than(3.0),
-            "much later": later_than(9.0),
-        },
-        reorder=every_seventh_late,
-    )
-
-
 def later_than(t: float) -> Callable[[FixedLagMapper, CycleResult], bool]:
     return lambda mapper, result: result.t > t
-
-
-def every_seventh_late(cycles: Cycles) -> Cycles:
-    ordered = list[tuple[Odometry, Detections]]()
-    rest = iter(cycles)
-    for k, (odometry, detections) in enumerate(rest):
-        following = next(rest, None) if k % 7 == 3 else None
-        if following is None:
-            ordered.append((odometry, detections))
-            continue
-        t = np.concatenate([odometry.t, following[0].t])
-        both = Odometry(t, np.concatenate([odometry.twist, following[0].twist]))
-        ordered += [(both, following[1]), (NO_TWISTS, detections)]
-    return ordered
 
 
 def assert_same(result: CycleResult, expected: CycleResult) -> None:
     np.testing.assert_array_equal(result.pose, expected.pose)
     np.testing.assert_array_equal(result.jump, expected.jump)
-    for name in ("t", "sizes", "readings", "closed", "notice", "health", "dropped", "late", "refused"):
+    for name in ("t", "sizes", "readings", "closed", "notice", "health", "dropped", "refused"):
         assert getattr(result, name) == getattr(expected, name), name
 
 
@@ -196,7 +165,7 @@ def assert_same_map(track: Map, expected: Map) -> None:
         np.testing.assert_array_equal(boundary.covariance, known.covariance)
 
 
-@pytest.mark.parametrize("make", [laps, lost, repaired, recurring, revisited, standing, colours, late])
+@pytest.mark.parametrize("make", [laps, lost, repaired, recurring, revisited, standing, colours])
 def test_a_restored_mapper_goes_on_to_the_same_result(
     make: Callable[[], Drive], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,7 +174,7 @@ def test_a_restored_mapper_goes_on_to_the_same_result(
         monkeypatch.setattr(TrackLoop, "may_close", lambda _: False)
     waiting, restored, last = dict(drive.moments), None, 0
     mapper = FixedLagMapper(drive.settings, drive.log.odometry_sigma)
-    for number, cycle in enumerate(drive.reorder([*split_odometry(drive.log)])):
+    for number, cycle in enumerate(split_odometry(drive.log)):
         if not waiting and number > last + AFTERWARDS:
             break
         result = replay(mapper, *cycle)

@@ -58,7 +58,7 @@ def straight(
     state = start_odometry(chain, detections, settings)
     system = BatchSystem(detections, chain, settings, Biweight(LEAST_SQUARES))
     system.begin(state)
-    locate_poses(state, settings.batch.association)
+    locate_poses(state)
     associate(state, detections, settings, settings.batch.gate, True)
     system.evaluate(state, hold=True)
     return system, settled(system, state)
@@ -117,7 +117,7 @@ def state_of(curves: dict[int, Array], poses: Array, periodic: bool = False) -> 
     for label, points in curves.items():
         spline = fit_spline(points, len(points) // 2, periodic)
         state.add_boundary(label, *boundary_of(spline, settings))
-    add_drive(state, poses, np.zeros(2), settings.batch.association)
+    add_drive(state, poses, np.zeros(2))
     return state
 
 

@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from pathspace_graph.baselines.landmark_association import (
+    GATES,
     Gates,
     associate,
     associate_created,
@@ -24,15 +25,12 @@ from pathspace_graph.baselines.landmark_map import AMBIGUOUS, UNASSOCIATED
 from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.settings.mapper import LandmarkSettings
 from pathspace_graph.settings.online import GrowthSettings
 
 from ...scenes.drives import detections
 from .scenes import SPEED, drive_on, driven, with_covariance
 
 Array = NDArray[np.float64]
-
-GATES = Gates.of(LandmarkSettings())
 
 
 def test_gates_are_those_of_two_degrees_of_freedom() -> None:

@@ -120,7 +120,7 @@ def test_detections_with_unknown_labels_are_used_and_create_nothing() -> None:
     assert min(used[20:30]) > 0
 
 
-def test_a_cone_first_detected_with_the_wrong_label_gets_its_own() -> None:
+def test_a_cone_first_detected_with_the_wrong_label_gets_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     cones, labels = corridor(40.0)
     cones = cones + np.array([8.0, 0.0])  # so that no cone leaves the view before it is outvoted
     log = exact_log(ahead(5.0, 5.0), cones, labels)
@@ -128,8 +128,8 @@ def test_a_cone_first_detected_with_the_wrong_label_gets_its_own() -> None:
     swapped = np.array([RIGHT, LEFT, UNKNOWN])
     for i in range(6):
         cycles[i] = replace(cycles[i], labels=swapped[cycles[i].labels])
-    believed = MapperSettings(sides=SidesSettings(min_votes=1000))  # colours are not swapped
-    track = run(with_cycles(log, cycles), believed).map()
+    monkeypatch.setattr("pathspace_graph.front_end.sides.MIN_VOTES", 1000)  # colours are not swapped
+    track = run(with_cycles(log, cycles)).map()
     for label in BOUNDARIES:
         assert (np.sign(points(track, label)[:, 1]) == (1 if label == LEFT else -1)).all()
     assert track.size == run(log).map().size

@@ -19,7 +19,7 @@ from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.settings.mapper import LandmarkSettings, MapperSettings, RelinearizeSettings
+from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 
 from .scenes import QUADRATIC, driven, oracle_system
 
@@ -33,12 +33,12 @@ def test_pairs_have_one_label_and_the_newer_landmark_comes_first() -> None:
 
 def test_a_landmark_is_in_one_pair_only_which_is_the_best() -> None:
     """2 fits 0 better than 1 does; 3 and 0 are too far apart for their covariance."""
-    newer, older, settings = np.array([1, 2, 3]), np.array([0, 0, 0]), LandmarkSettings()
+    newer, older = np.array([1, 2, 3]), np.array([0, 0, 0])
     offset = np.array([[0.3, 0.0], [0.1, 0.0], [0.0, 0.9]])
     covariances = np.tile(0.02 * np.eye(2), (3, 1, 1))
-    np.testing.assert_array_equal(compatible_pairs(newer, older, offset, covariances, settings), [1])
+    np.testing.assert_array_equal(compatible_pairs(newer, older, offset, covariances), [1])
     wide = 9.0 * 0.01 * np.eye(2)[None] + 1.01 * np.eye(2)
-    assert len(compatible_pairs(newer[2:], older[2:], offset[2:], wide, settings)) == 1
+    assert len(compatible_pairs(newer[2:], older[2:], offset[2:], wide)) == 1
 
 
 @pytest.mark.parametrize(("correlation", "known", "expected"), [(0.0, 3, 1), (0.99, 3, 0), (0.0, 2, 0)])

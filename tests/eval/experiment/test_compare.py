@@ -24,14 +24,13 @@ from pathspace_graph.eval.experiment.compare import (
 )
 from pathspace_graph.eval.experiment.plots import find_blind_spot, plot_maps
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.io.log import Log, Truth, read_log
+from pathspace_graph.io.log import Truth, read_log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
-from pathspace_graph.io.results import BatchRun
 from pathspace_graph.labels import LEFT
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 
-from ...scenes.rings import CENTRE, Gaps, Rings, RingsBatch, register, write_logs
+from ...scenes.rings import CENTRE, Gaps, Rings, register, write_logs
 
 pytestmark = pytest.mark.usefixtures("png_only")
 
@@ -126,38 +125,6 @@ def test_differences_are_paired_over_logs(logs: list[NamedLog]) -> None:
     size = found[found["metric"] == "size"].iloc[0]
     assert (size["estimator"], size["reference"], size["pairs"]) == ("rings", "gaps", 2)
     assert (size["mean"], size["low"], size["high"]) == (-4.0, -4.0, -4.0)
-
-
-def test_the_gap_to_the_batch_is_told_where_it_ran(
-    logs: list[NamedLog], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The batch's rings, 0.1 m wider than those of `rings`, and its poses 1 m from theirs."""
-    monkeypatch.setattr(registry, "DEFAULT_BATCH", "far")
-    monkeypatch.setattr(registry, "BATCH", {"far": WiderBatch})
-    assert "gap_curves" not in compare(logs, ["rings", "gaps"]).frame
-    frame = compare(logs, ["rings", "gaps", "broken", "far"]).frame.set_index("estimator")
-    final = frame[frame["scope"] == "log"]
-    np.testing.assert_allclose(final.loc["rings", "gap_curves"], 0.1, atol=0.01)
-    np.testing.assert_allclose(final.loc["rings", "gap_trajectory"], 1.0)
-    assert final.loc["gaps", "gap_curves"].isna().all() and final.loc["gaps", "gap_trajectory"].notna().all()
-    assert final.loc["far", "gap_trajectory"].isna().all()
-    assert frame.loc[frame["scope"] == "lap", "gap_curves"].isna().all()
-
-
-class WiderBatch(RingsBatch):
-    """Another batch."""
-
-    def solve(self, log: Log) -> BatchRun:
-        found = super().solve(log)
-        boundaries = {}
-        for label, boundary in found.map.boundaries.items():
-            assert isinstance(boundary, SplineBoundary)
-            points = boundary.spline.distinct_control_points - CENTRE
-            farther = CENTRE + points * (1.0 + 0.1 / np.hypot(*points[0]))
-            boundaries[label] = SplineBoundary(boundary.spline.with_points(farther), boundary.covariance)
-        return replace(
-            found, map=Map(True, boundaries), trajectory=found.trajectory + np.array([0.6, 0.8, 0.0])
-        )
 
 
 def test_without_truth_only_what_needs_none_is_told(folder: Path) -> None:

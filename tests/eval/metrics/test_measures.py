@@ -75,7 +75,6 @@ def test_poses_and_updates_are_those_of_the_lap() -> None:
     assert lap.values["along"] == pytest.approx(0.0, abs=0.01)
     assert whole.values["ate"] == pytest.approx(np.sqrt((25 * 1.0 + 15 * 4.0) / 40), abs=0.01)
     assert lap.values["ms_mean"] == pytest.approx(13.0) and whole.values["ms_mean"] == pytest.approx(20.5)
-    assert whole.values["ms_median"] == pytest.approx(20.5)
 
 
 def test_a_batch_has_a_row_of_its_last_lap_and_no_update_times() -> None:
@@ -92,7 +91,7 @@ def test_a_batch_has_a_row_of_its_last_lap_and_no_update_times() -> None:
 def test_without_truth_only_what_needs_none_is_measured() -> None:
     true = circle_truth()
     lap, whole = measure(run(true), log(None))
-    keys = {"size", "closed", "bytes", "bytes_covariance", "ms_mean", "ms_median", "ms_p99"}
+    keys = {"size", "closed", "bytes", "bytes_covariance", "ms_mean", "ms_p99"}
     assert set(lap.values) == keys == set(whole.values) - {"closed_at_end"}
     bare = log(Truth(true.pose_t, true.poses, np.zeros((0, 2)), np.zeros(0, dtype=int)))
     assert set(measure(run(true), bare)[0].values) == keys | {"ate", "along", "across"}
@@ -110,7 +109,7 @@ def test_the_whole_run_may_be_left_with_what_no_lap_has() -> None:
 def test_marginals_and_yardsticks_are_measured_where_they_are_asked_for() -> None:
     true = circle_truth()
     (*_, whole) = measure(run(true), log(true), marginals=True)
-    for key in ("nees", "inside", "normalized_error"):  # the map's covariance has no cross terms
+    for key in ("inside", "normalized_error"):  # the map's covariance has no cross terms
         assert whole.values[f"{key}_marginals"] == pytest.approx(whole.values[key])
     # 0.3 m by 0.1 m at both ends, and by 0.1 sqrt(20 / 64) m in the middle
     assert whole.values["normalized_error"] == pytest.approx((9.0 + 9.0 + 28.8) / 3)
@@ -125,7 +124,7 @@ def test_landmarks_have_no_band() -> None:
     (*_, whole) = measure(replace(run(true), map=points), log(true))
     assert np.isnan(whole.values["inside"]) and np.isnan(whole.values["normalized_error"])
     assert whole.values["nees"] == pytest.approx(1 / 6)
-    assert whole.values["nees_low"] < 0.25 and whole.values["nees_inside"] is False
+    assert whole.values["nees_inside"] is False
 
 
 @pytest.mark.parametrize(
@@ -175,9 +174,7 @@ def test_a_metric_is_shown_in_its_unit() -> None:
     assert METRICS["missed"].heading == "missed [%]" and METRICS["size"].heading == "size"
     assert METRICS["missed"].text(0.125) == "12.5" and METRICS["bytes"].text(1640.0) == "1.64"
     assert Metric("k", "t").text(float("nan")) == "–"
-    assert {key for key, metric in METRICS.items() if metric.time} == {
-        *("ms_mean", "ms_median", "ms_p99", "seconds")
-    }
+    assert {key for key, metric in METRICS.items() if metric.time} == {*("ms_mean", "ms_p99", "seconds")}
 
 
 # --- what a run says of itself ---------------------------------------------------------------------------

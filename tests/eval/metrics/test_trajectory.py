@@ -44,7 +44,6 @@ def test_a_vehicle_is_lost_that_is_5_m_off_in_the_last_second() -> None:
         found = end_of_trajectory(t, poses, true)
         assert found == {
             "error_max": pytest.approx(20.0),
-            "error_end": pytest.approx(at_end),
             "lost_at_end": lost,
         }
     assert end_of_trajectory(t + 100.0, path, true) == {}
