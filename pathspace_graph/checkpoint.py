@@ -6,7 +6,6 @@ arrays that cannot be written, and GTSAM's factors.
 
 from collections import deque
 from collections.abc import Callable
-from functools import partial
 from types import MethodType
 from typing import Any, Final
 
@@ -15,42 +14,26 @@ import numpy as np
 
 Memo = dict[int, Any]  # copies by the `id` of what they are copies of
 Copier = Callable[[Any, Memo], Any]
-Call = partial[Any]
 
 
 class Recovery:
-    """Return of an estimator to what it was before its newest call, by a copy and the calls since then."""
-
-    EVERY: Final = 100  # number of calls from one copy to the next, so that its time hardly counts
+    """Return of an estimator to what it was before its newest call, by a copy that each call begins with."""
 
     def __init__(self, failures: int = 0) -> None:
         self.failures = failures
         self._copy: dict[str, Any] | None = None
-        self._calls: list[Call] = []
 
     def before(self, estimator: object, *shared: object) -> None:
-        """Make a copy of an estimator before a call where one is due; it shares itself and some objects."""
-        if self._copy is None or len(self._calls) >= self.EVERY:
-            self._copy, self._calls = self._held(vars(estimator), estimator, shared), []
-
-    def called(self, again: Call) -> None:
-        """Note a call that has changed the estimator."""
-        self._calls.append(again)
+        """Keep a copy of an estimator before a call; it shares itself and some objects."""
+        self._copy = self._held(vars(estimator), estimator, shared)
 
     def take_back(self, estimator: object, *shared: object) -> None:
-        """Take an estimator back to what it was after the last call that was noted."""
+        """Take an estimator back to what it was before the call, as often as another attempt fails."""
         if self._copy is None:
             raise RuntimeError("expected a copy of the estimator, found none")
-        attributes = self._held(self._copy, estimator, shared)  # the copy stays, for the next failure
+        attributes = self._held(self._copy, estimator, shared)
         vars(estimator).clear()
         vars(estimator).update(attributes)
-        for done, again in enumerate(self._calls):
-            try:
-                again()
-            except Exception:  # it did not fail before: something outside has changed
-                self._calls = self._calls[:done]
-                self.take_back(estimator, *shared)
-                return
 
     def _held(self, values: dict[str, Any], estimator: object, shared: tuple[object, ...]) -> dict[str, Any]:
         memo = {id(one): one for one in (self, estimator, *shared)}

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Final, Self
 
@@ -74,7 +73,12 @@ class FixedLagMapper(MapperEstimate):
         self._placed_until = 0.0  # path driven (m) up to which the vehicle is not lost (`is_lost`)
 
     def update(
-        self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor] = ()
+        self,
+        odometry: Odometry,
+        detections: Detections,
+        factors: Sequence[gtsam.NonlinearFactor] = (),
+        *,
+        strict: bool = False,
     ) -> CycleResult:
         """Process one perception cycle: the twists since the last cycle, and its detections.
 
@@ -95,19 +99,20 @@ class FixedLagMapper(MapperEstimate):
 
         Nothing else is raised. Where a step fails, the mapper goes back to before the cycle and takes it
         again with the loop left alone, or without detections, or not at all. The notice says which, and
-        `recovery.failures` counts.
+        `recovery.failures` counts. If `strict`, it goes back, and what was raised is raised again.
         """
         factors = tuple(factors)
         self.recovery.before(self, self.front_end.gate)
         cycle, unused = self._admit(odometry, detections, factors), self._unused
         if unused is not None:
             cycle = replace(cycle, odometry=unused.followed_by(cycle.odometry))
-        again = partial(self._process, cycle, factors)
         try:
-            result = again()
+            result = self._process(cycle, factors)
         except Exception as error:  # a vehicle drives on, whatever has failed
+            if strict:
+                self.recovery.take_back(self, self.front_end.gate)
+                raise
             return cycle.counted(self._without(cycle, factors, error))
-        self.recovery.called(again)
         self._unused = None
         return cycle.counted(result)
 
@@ -163,17 +168,13 @@ class FixedLagMapper(MapperEstimate):
         why = f": {type(error).__name__}: {error}" if number == 1 else f" (failure {number})"
         failed = " ".join(f"an update failed{why}".split())
         blind = replace(cycle, detections=seen.where(np.zeros(len(seen.labels), bool)))
-        attempts = {
-            "the loop is left as it is": partial(self._process, cycle, factors, careful=True),
-            "its detections are not used": partial(self._process, blind, factors, careful=True),
-        }
-        for consequence, again in attempts.items():
+        attempts = {"the loop is left as it is": cycle, "its detections are not used": blind}
+        for consequence, attempt in attempts.items():
             self.recovery.take_back(self, self.front_end.gate)
             try:
-                result = again()
+                result = self._process(attempt, factors, careful=True)
             except Exception:  # the next attempt does less
                 continue
-            self.recovery.called(again)
             self._unused = None
             return replace(result, notice=joined([failed, consequence, result.notice]))
         self.recovery.take_back(self, self.front_end.gate)

@@ -25,6 +25,7 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.sim.vehicle import integrate
 
+from ..scenes.digest import digest
 from ..scenes.drives import (
     CYCLE,
     DT,
@@ -496,3 +497,27 @@ def test_orange_cones_of_a_gate_stay_where_they_are_when_the_loop_closes() -> No
     np.testing.assert_allclose(
         mapper.map().points[BIG_ORANGE].points, truth.cones[truth.cone_labels == BIG_ORANGE], atol=0.1
     )
+
+
+@pytest.mark.failing
+def test_a_strict_update_raises_what_has_failed_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same cycle can be given again then, with the same result as to a mapper that has not failed."""
+    log = exact_log(ahead(6.0, 4.0), *corridor(40.0))
+    mapper, twin = FixedLagMapper(None, log.noise), FixedLagMapper(None, log.noise)
+    *before, (odometry, seen) = list(split_odometry(log))
+    for pair in before:
+        mapper.update(*pair)
+        twin.update(*pair)
+    known = digest(mapper)
+
+    def fails(_: FixedLagMapper) -> None:
+        raise np.linalg.LinAlgError("no convergence")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FixedLagMapper, "_update", fails)
+        with pytest.raises(np.linalg.LinAlgError, match="no convergence"):
+            mapper.update(odometry, seen, strict=True)
+    assert digest(mapper) == known
+    mapper.update(odometry, seen, strict=True)
+    twin.update(odometry, seen)
+    assert digest(mapper) == digest(twin)
