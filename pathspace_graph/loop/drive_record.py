@@ -73,7 +73,7 @@ class DriveRecord:
         self.poses: Array = np.zeros((0, 3))  # of each cycle, map frame, as of then or the newest batch
         self.stamps: list[float] = []  # stamp of each cycle (s)
         self._motions: list[MeasuredMotion] = []  # that lead to each cycle
-        self._seen: list[Detections] = []  # of each cycle, with their stated covariances
+        self._seen: list[Detections] = []  # of each cycle, as they came
         self._orange: list[Detections] = []  # those of orange cones
         self._beside: dict[int, Array] = {}  # (n,) parameter of each cycle on each curve, NaN before it
         self._reckoned: Array = np.zeros((0, 3))  # pose of each cycle by the odometry alone
@@ -85,14 +85,14 @@ class DriveRecord:
         self._motions, self._seen, self._orange = [], [], []
 
     def measured(self, reading: Reading) -> None:
-        """Add the motion that leads to a pose, and the detections there with their stated covariances."""
+        """Add the motion that leads to a pose, and the detections there as they came."""
         self.stamps.append(reading.detections.t)
         if self.unsolvable is not None:
             return
-        seen = reading.detections
+        seen, orange = reading.stated
         self._motions.append(reading.motion)
-        self._seen.append(Detections(seen.t, seen.points_vehicle, reading.stated, seen.labels))
-        self._orange.append(reading.orange)
+        self._seen.append(seen)
+        self._orange.append(orange)
         last = self._reckoned[-1] if len(self._reckoned) else np.zeros(3)
         self._reckoned = _extended(self._reckoned, compose(last, reading.motion.odometry.delta))
         if len(self.stamps) > self.settings.open_lap.max_cycles:
@@ -137,7 +137,8 @@ class DriveRecord:
             seen = [self._seen[k].with_others(self._orange[k]) for k in chosen]
             table = DetectionColumns.of(seen, twists=twists)
             known = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
-            table = replace(table, cycle=cycles[table.cycle], covariance=known.covariances)
+            table = replace(table, measured=known.points_vehicle, covariance=known.covariances)
+            table = replace(table, cycle=cycles[table.cycle])
             table.correct(sensor)
             return table
 
@@ -184,7 +185,7 @@ class DriveRecord:
         chain = chained(self.stamps, self._noise.motions_of_lap(self._motions), settings.odometry)
         table = DetectionTable.of(self._seen, twists=chain.twists)
         seen = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
-        table = replace(table, covariance=seen.covariances)
+        table = replace(table, measured=seen.points_vehicle, covariance=seen.covariances)
         return OpenLap(settings, chain, table, first_kept, start)
 
 
