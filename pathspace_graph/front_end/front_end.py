@@ -92,16 +92,19 @@ class FrontEnd:
         stated = cones, orange
         judged, orange = noise.for_map(cones), noise.for_map(orange)
         # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
-        if not (self._sensor_doubted or noise.of_detections):
-            self._sensor_doubted = check.errors.contradict(self._settings.calibration)
-        fresh, settings = noise.observe(odometry, cones, motion, check.pose), self._settings
+        settings, calibration = self._settings, self._settings.calibration
+        may_doubt = not (self._sensor_doubted or noise.of_detections)
+        if may_doubt and check.errors.contradict(calibration):
+            self._sensor_doubted = True
+            settings = replace(settings, calibration=check.errors.found(calibration))
+        fresh = noise.observe(odometry, cones, motion, check.pose)
         if fresh:
             check.set_noise(noise.twist_sigma)
         if fresh or not self._begun:
-            settings, self._begun = noise.calibrated(settings), True
+            settings, self._begun = noise.calibrated(self._settings), True
         measured = None if settings is self._settings else settings
-        seen, doubted, notice = check.seen_again, self._sensor_doubted, "; ".join(notices)
-        return Reading(motion, judged, seen, orange, stated, doubted, measured, notice)
+        seen, notice = check.seen_again, "; ".join(notices)
+        return Reading(motion, judged, seen, orange, stated, self._sensor_doubted, measured, notice)
 
     @property
     def noise_used(self) -> RunNoise:

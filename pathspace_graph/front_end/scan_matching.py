@@ -8,7 +8,7 @@ by -psi. Detections that are late by tau lie too far ahead by `tau v`, which cha
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -21,7 +21,7 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
 
 ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
-SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
+SIGMAS_ERRORS: Final = (0.1, 0.05)  # rad and s, first: a recorded car's sensor is turned by 6.5 degrees
 SIGMAS_CHANGES: Final = (0.001, 0.005)  # their change in a minute, rad and s
 MINUTE: Final = 60.0
 
@@ -209,6 +209,14 @@ class SensorErrors:
         limit, prior = settings.doubt**2, (settings.sigma_yaw, settings.sigma_latency)
         known = zip(self.mean.tolist(), self.covariance.diagonal().tolist(), prior, strict=True)
         return any(mean**2 > limit * (variance + sigma**2) for mean, variance, sigma in known)
+
+    def found(self, settings: CalibrationSettings) -> CalibrationSettings:
+        """Return wide priors of the sensor about the yaw and the latency that matches show.
+
+        About zero they leave most of a yaw of some degrees to the bias of the yaw rate, which bends the map.
+        """
+        yaw, latency = self.mean.tolist()
+        return replace(settings.widened(), yaw=yaw, latency=latency)
 
     def follow(self, velocity: Array, dt: float) -> None:
         """Take the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""
