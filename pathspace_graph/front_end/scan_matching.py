@@ -21,7 +21,7 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
 
 ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
-SIGMAS_ERRORS: Final = (0.1, 0.05)  # rad and s, first: a recorded car's sensor is turned by 6.5 degrees
+SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
 SIGMAS_CHANGES: Final = (0.001, 0.005)  # their change in a minute, rad and s
 MINUTE: Final = 60.0
 
@@ -214,9 +214,10 @@ class SensorErrors:
         """Return wide priors of the sensor about the yaw and the latency that matches show.
 
         About zero they leave most of a yaw of some degrees to the bias of the yaw rate, which bends the map.
+        The first matches find about half of a large yaw (`SIGMAS_ERRORS`), so its sigma is as large.
         """
-        yaw, latency = self.mean.tolist()
-        return replace(settings.widened(), yaw=yaw, latency=latency)
+        (yaw, latency), wide = self.mean.tolist(), settings.widened()
+        return replace(wide, yaw=yaw, latency=latency, sigma_yaw=max(wide.sigma_yaw, abs(yaw)))
 
     def follow(self, velocity: Array, dt: float) -> None:
         """Take the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""
