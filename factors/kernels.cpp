@@ -1975,7 +1975,7 @@ py::tuple followed(const Ints& begins, const Array& stamps, const Array& places,
 // --- measured noise ---------------------------------------------------------------------------------------
 
 py::tuple centred(const Ints& begins, const Array& information, const Array& columns, const Array& points) {
-  constexpr Index kErrors = 6, kBoth = kErrors + 1;
+  constexpr Index kErrors = kSensor + 2, kBoth = kErrors + 1;
   const Index cones = begins.size(), n = points.shape(0);
   expect(information.size() == 4 * n && columns.size() == 2 * kErrors * n && points.size() == 2 * n);
   Array moved(Shape{n, 2, kErrors}), off(Shape{n, 2}), own(Shape{cones, kErrors, kErrors});
@@ -2023,8 +2023,8 @@ py::tuple centred(const Ints& begins, const Array& information, const Array& col
 }
 
 Array by_constants(const Array& seen, const Array& twists, const Array& poses, const Array& by_bias,
-                   const Ints& first) {
-  const Index n = seen.shape(0), width = kSensor + 1;
+                   const Ints& first, double bends_from) {
+  const Index n = seen.shape(0), width = kSensor + 2;
   expect(seen.size() == 2 * n && twists.size() == 3 * n && poses.size() == 3 * n);
   expect(by_bias.size() == 3 * n && first.size() == n);
   Array columns(Shape{n, 2, width});
@@ -2042,8 +2042,12 @@ Array by_constants(const Array& seen, const Array& twists, const Array& poses, c
       out[width + k] = turn.s * C[0][k] + turn.c * C[1][k];
     }
     const double x = turn.c * z[0] - turn.s * z[1], y = turn.s * z[0] + turn.c * z[1], turned = bias[2] - then[2];
-    out[kSensor] = bias[0] - then[0] + then[2] * (pose[1] - began[1]) - turned * y;
-    out[width + kSensor] = bias[1] - then[1] - then[2] * (pose[0] - began[0]) + turned * x;
+    const double distance = std::hypot(z[0], z[1]), beyond = std::max(distance - bends_from, 0.0);
+    const double bend = beyond * beyond / std::max(distance, bends_from);
+    out[kSensor] = -bend * x;
+    out[width + kSensor] = -bend * y;
+    out[kSensor + 1] = bias[0] - then[0] + then[2] * (pose[1] - began[1]) - turned * y;
+    out[width + kSensor + 1] = bias[1] - then[1] - then[2] * (pose[0] - began[0]) + turned * x;
   }
   return columns;
 }

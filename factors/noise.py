@@ -8,7 +8,7 @@ import numpy as np
 
 from .arrays import Array
 from .se2 import left_of
-from .sensor import SENSOR_SIZE, shifted
+from .sensor import SENSOR_SIZE, by_bend, shifted
 
 
 def whiteners(covariances: Array) -> Array:
@@ -97,6 +97,7 @@ class MeasuredNoise:
         "across": 0,
         "sensor": (0, 1, 0, 0, 1),
         "sensor_sigma": (0, 1, 0, 0, 1),
+        "range_bend": -1,
     }
 
     odometry: Array  # (3,) white noise of a twist from sample to sample: m/s, m/s, rad/s, one sigma
@@ -111,6 +112,8 @@ class MeasuredNoise:
     """(5,) Constant errors of the sensor (`factors.sensor:SENSOR`), while the odometry's scale is held."""
     sensor_sigma: Array = field(default_factory=lambda: np.full(SENSOR_SIZE, np.inf))
     """(5,) Their standard deviations; infinite where nothing was measured."""
+    range_bend: float = 0.0
+    """Bend of the ranges (1/m), see `factors.sensor:by_bend`; 0 where it is not beyond doubt."""
     seconds: float = 0.0  # time of driving that was measured on, s
 
     @property
@@ -156,9 +159,15 @@ class MeasuredNoise:
         """Errors (5,) of the sensor of more than `SURE` sigmas; the others are zero."""
         return np.where(np.abs(self.sensor) > SURE * self.sensor_sigma, self.sensor, 0.0)
 
+    def unbent(self, points: Array) -> Array:
+        """Return detections at points (m, 2), vehicle frame, with their ranges free of `range_bend`."""
+        if self.range_bend == 0.0:
+            return points
+        return points - self.range_bend * by_bend(points)[:, None] * points
+
     def corrected(self, points: Array, twist: Array, *, shown: bool = False) -> Array:
         """Return detections at points (m, 2), vehicle frame, without all constant errors or those `shown`."""
-        errors = self.shown if shown else self.sensor
+        errors, points = self.shown if shown else self.sensor, self.unbent(points)
         if not errors.any():
             return points
         return shifted(points, np.broadcast_to(twist, (len(points), 3)), errors)

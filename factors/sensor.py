@@ -16,6 +16,7 @@ SENSOR = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 their stamps (s), scale error (-) and bias (m) of ranges."""
 SENSOR_SIZE = len(SENSOR)
 RANGE = slice(3, 5)  # errors of the ranges
+BENDS_FROM = 8.0  # range from which on ranges may bend: cones beside the vehicle are nearer (m)
 
 
 @compiled
@@ -38,6 +39,16 @@ def by_sensor(points_vehicle: Array, twists: Array) -> Array:
     columns[:, :, 3] = -points_vehicle
     columns[:, :, 4] = -points_vehicle / distance[:, None]
     return columns
+
+
+def by_bend(points_vehicle: Array) -> Array:
+    """Return the derivative (m,) of `|z'| / |z|` by the bend k of the ranges, for detections z (m, 2).
+
+    A range r beyond b = `BENDS_FROM` reads `k (r - b)^2` too long, so the derivative is `(r - b)^2 / r`.
+    Such an error of the depth grows by the square: that of a detector whose scale and bias fit near cones.
+    """
+    distance = np.hypot(points_vehicle[:, 0], points_vehicle[:, 1])
+    return np.asarray(np.maximum(distance - BENDS_FROM, 0.0) ** 2 / np.maximum(distance, BENDS_FROM))
 
 
 def corrected(measured: Array, twists: Array, sensor: Array) -> Array:

@@ -108,6 +108,7 @@ def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
         sigmas = (f"{name}_sigma" for name in SENSOR)
         values |= dict(zip(SENSOR, measured.sensor.tolist(), strict=True))
         values |= dict(zip(sigmas, measured.sensor_sigma.tolist(), strict=True))
+        values["range_bend"] = measured.range_bend
     return sources | {"measured": values}
 
 

@@ -44,7 +44,7 @@ class Reading:
     detections: Detections  # detections of cones that bound the road
     seen_again: BoolArray  # (m,) whether each of them lies where the cycles just before had one
     orange: Detections  # detections of orange cones, which bound no road
-    stated: Array  # (m, 2, 2) covariances of the detections in m^2 as stated, before any noise was measured
+    stated: tuple[Detections, Detections]  # those of both kinds as they came, before any noise was measured
     sensor_doubted: bool = False  # whether readings contradict the prior of the sensor's yaw or latency
     measured: MapperSettings | None = None  # with priors of calibrations that were measured in this cycle
     notice: str = ""  # what the labels mean from now on, where that has changed
@@ -77,19 +77,23 @@ class FrontEnd:
         labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane).labels
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
-        cones = Detections(cones.t, cones.points_vehicle, cones.covariances, labels)
+        cones = replace(cones, labels=labels)
+        stated = cones, orange
         judged, orange = noise.for_map(cones), noise.for_map(orange)
         # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
-        if not (self._sensor_doubted or noise.of_detections):
-            self._sensor_doubted = check.errors.contradict(self._settings.calibration)
-        fresh, settings = noise.observe(odometry, cones, motion, check.pose), self._settings
+        settings, calibration = self._settings, self._settings.calibration
+        may_doubt = not (self._sensor_doubted or noise.of_detections)
+        if may_doubt and check.errors.contradict(calibration):
+            self._sensor_doubted = True
+            settings = replace(settings, calibration=check.errors.found(calibration))
+        fresh = noise.observe(odometry, cones, motion, check.pose)
         if fresh:
             check.set_noise(noise.twist_sigma)
         if fresh or not self._begun:
-            settings, self._begun = noise.calibrated(settings), True
+            settings, self._begun = noise.calibrated(self._settings), True
         measured = None if settings is self._settings else settings
-        seen, doubted, notice = check.seen_again, self._sensor_doubted, "; ".join(notices)
-        return Reading(motion, judged, seen, orange, cones.covariances, doubted, measured, notice)
+        seen, notice = check.seen_again, "; ".join(notices)
+        return Reading(motion, judged, seen, orange, stated, self._sensor_doubted, measured, notice)
 
     @property
     def noise_used(self) -> RunNoise:

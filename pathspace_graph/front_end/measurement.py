@@ -13,9 +13,9 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights
+from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, ray_axes
 from pathspace_graph.factors.se2 import in_vehicle, left_of, rotations, to_map
-from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor
+from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE, by_bend, by_sensor
 
 from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, ConeTracker, SeenCycle, Sightings, TwistRecord
 
@@ -24,8 +24,11 @@ DRIFT: Final = np.array([0.05, 0.05, 0.0017])
 
 It cannot be measured on an open drive: a cone stays in view for some 3 s, in which an error of the speed of
 less than 0.05 m/s is lost in the noise of its detections."""
-PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02])
-"""Weak priors of the sensor's errors (rad, m, s, -, m) and of the yaw rate's bias (rad/s), one sigma."""
+PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02, 0.02])
+"""Weak priors of the sensor's errors (rad, m, s, -, m), of the bend of its ranges (1/m) and of the yaw rate's
+bias (rad/s), one sigma. Without the bend, yaw, lateral offset and scale would take it up."""
+CONSTANTS: Final = len(PRIOR)
+BEND: Final = SENSOR_SIZE  # place of the bend among them
 FIRST_ALONG: Final = (0.1, 0.04)
 FIRST_ACROSS: Final = (0.05, 0.016)  # noise that the iteration begins with: m and m/m, then m and rad
 PASSES: Final = 4  # times that cones are followed
@@ -48,6 +51,8 @@ FIRST_SHARE: Final = 0.5  # share of a cone's error that stays with it, unless c
 FIRST_CONES: Final = 8.0  # number of cones that `FIRST_SHARE` counts as much as
 LEAST: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
 
+Rays = tuple[RayNoise, RayNoise]
+"""Noise along the ray and across it."""
 Lagged = tuple[IntArray, IntArray, Array, IntArray]
 """Pairs of sightings of one cone, by index, their lags (s), and the number of the edge before in `LAGS`."""
 
@@ -59,11 +64,10 @@ class _Cones:
     table: Sightings
     begins: IntArray  # (c,) row of each cone's first sighting
     counts: IntArray  # (c,) number of its sightings
-    ranges: Array  # (n,) range of the cone as the sensor measures it, without noise (m)
-    ray: Array  # (n, 2) unit vector along the ray, map frame
-    side: Array
+    axes: Array  # (2, n, 2) unit vectors along the ray and across it, map frame
     points: Array
-    columns: Array  # (n, 2, 6) derivatives by the sensor's errors and by the bias of the yaw rate
+    ranges: Array  # (n,) range of the cone as the sensor measures it, without noise (m)
+    columns: Array  # (n, 2, 7) derivatives by the constants (`PRIOR`)
 
     def without(self, off: Array) -> Self:
         """Return the sightings with ranges and derivatives where they would be without their errors (n, 2).
@@ -71,16 +75,21 @@ class _Cones:
         With the noise in them weights would prefer short sightings, and errors come out too small.
         """
         seen = self.table.point - in_vehicle(off, self.table.pose)
-        ranges = np.maximum(np.hypot(*seen.T), np.finfo(float).tiny)
-        return replace(
-            self, ranges=ranges, columns=_columns(self.table, np.repeat(self.begins, self.counts), seen)
-        )
+        columns = _columns(self.table, np.repeat(self.begins, self.counts), seen)
+        return replace(self, ranges=np.hypot(*seen.T), columns=columns)
 
-    def sums(self, values: Array) -> Array:
-        return np.asarray(np.add.reduceat(values, self.begins, axis=0))
+    def on_axes(self, off: Array, rows: IntArray | slice = slice(None)) -> Array:
+        """Return offsets (k, 2), map frame, of sightings at rows (k,) along and across their rays (2, k)."""
+        return np.array([(off * axis[rows]).sum(axis=1) for axis in self.axes])
 
-    def spread(self, values: Array) -> Array:
-        return np.repeat(values, self.counts, axis=0)
+    def sigmas(self, noise: Rays) -> Array:
+        """Return the standard deviations (2, n) of the sightings along and across their rays (m)."""
+        return np.array([one.sigmas(self.ranges) for one in noise])
+
+    def information(self, noise: Rays, weights: Array) -> Array:
+        by_ray, by_side = self.axes[:, :, :, None] * self.axes[:, :, None, :]
+        along, across = (weights / self.sigmas(noise) ** 2)[:, :, None, None]
+        return np.asarray(along * by_ray + across * by_side)
 
 
 def _cones(sightings: Sightings) -> _Cones | None:
@@ -92,46 +101,45 @@ def _cones(sightings: Sightings) -> _Cones | None:
     if len(chosen) < MIN_ROWS:
         return None
     table = sightings.where(chosen[np.argsort(sightings.cone[chosen], kind="stable")])
-    begins = np.flatnonzero(np.diff(table.cone, prepend=-1))
-    counts = np.diff(np.append(begins, len(table.cone)))
-    ranges = np.maximum(np.hypot(*table.point.T), np.finfo(float).tiny)
-    turn = rotations(table.pose[:, 2])
-    ray = np.einsum("nij,nj->ni", turn, table.point / ranges[:, None])
-    known = ranges, ray, left_of(ray), to_map(table.point, table.pose)
+    begins, counts = _runs(table.cone)
+    axes = np.einsum("nij,nkj->kni", rotations(table.pose[:, 2]), ray_axes(table.point))
+    points, ranges = to_map(table.point, table.pose), np.hypot(*table.point.T)
     columns = _columns(table, np.repeat(begins, counts), table.point)
-    return _Cones(table, begins, counts, *known, columns)
+    return _Cones(table, begins, counts, axes, points, ranges, columns)
 
 
 def _columns(table: Sightings, first: IntArray, seen: Array) -> Array:
-    return _by_constants(seen, table.twist, table.pose, table.by_bias, first)
+    return _by_constants(seen, table.twist, table.pose, table.by_bias, first, BENDS_FROM)
+
+
+def _runs(groups: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the first row and the size (c,) of each group; groups (n,) of equal number are neighbours."""
+    begins = np.flatnonzero(np.diff(groups, prepend=-1))
+    return begins, np.diff(np.append(begins, len(groups)))
 
 
 @compiled
-def _by_constants(seen: Array, twists: Array, poses: Array, by_bias: Array, first: IntArray) -> Array:
-    """Return the derivatives (n, 2, 6) of sightings at points (n, 2), vehicle frame, in the map frame.
+def _by_constants(
+    seen: Array, twists: Array, poses: Array, by_bias: Array, first: IntArray, bends_from: float
+) -> Array:
+    """Return the derivatives (n, 2, 7) of sightings at points (n, 2), vehicle frame, in the map frame.
 
-    They are by the sensor's errors and by the bias of the yaw rate. This one counts from each cone's first
-    sighting, at rows (n,): before, it turns all of the cone's alike.
+    They are by the constants (`PRIOR`). The bias of the yaw rate counts from each cone's first sighting, at
+    rows (n,): before, it turns all of the cone's alike.
     """
     then, moved = by_bias[first], poses[:, :2] - poses[first, :2]
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     (x, y), (ahead, left) = by_sensor(seen, twists).transpose(1, 0, 2), np.hsplit(seen, 2)
-    columns, turned = np.empty((len(seen), 2, SENSOR_SIZE + 1)), by_bias - then
+    columns, turned = np.empty((len(seen), 2, CONSTANTS)), by_bias - then
     columns[:, 0, :SENSOR_SIZE], columns[:, 1, :SENSOR_SIZE] = c * x - s * y, s * x + c * y
     in_map = np.concatenate([c * ahead - s * left, s * ahead + c * left], axis=1)
+    columns[:, :, BEND] = -by_bend(seen)[:, None] * in_map
     columns[:, :, -1] = turned[:, :2] - then[:, 2:] * left_of(moved) + turned[:, 2:] * left_of(in_map)
     return columns
 
 
-def _information(cones: _Cones, along: RayNoise, across: RayNoise, weights: Array) -> Array:
-    by_ray = cones.ray[:, :, None] * cones.ray[:, None, :] / (along.sigmas(cones.ranges) ** 2)[:, None, None]
-    by_side = cones.side[:, :, None] * cones.side[:, None, :]
-    by_side /= (across.sigmas(cones.ranges) ** 2)[:, None, None]
-    return np.asarray((by_ray + by_side) * weights[:, None, None])
-
-
 def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
-    """Return errors b (6,), both covariances of them, and what is left (n, 2) of the sightings.
+    """Return constants b (7,), both covariances of them, and what is left (n, 2) of the sightings.
 
     The cones' places, weighted means of `p + A b`, are eliminated. One covariance is `_clustered`.
     """
@@ -146,9 +154,9 @@ def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Arra
 def _centred(
     begins: IntArray, information: Array, columns: Array, points: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return columns A (n, 2, 6) and points p (n, 2) less each cone's weighted mean, and its sums.
+    """Return columns A (n, 2, 7) and points p (n, 2) less each cone's weighted mean, and its sums.
 
-    Those are `A' W A` (c, 6, 6) and `A' W p` (c, 6), with information W (n, 2, 2) of the sightings of cones
+    Those are `A' W A` (c, 7, 7) and `A' W p` (c, 7), with information W (n, 2, 2) of the sightings of cones
     that begin at rows (c,).
     """
     counts = np.diff(np.append(begins, len(points)))
@@ -161,12 +169,12 @@ def _centred(
 
 
 def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
-    """Return the covariance (6, 6) of the errors by how much the stretches of the drive disagree.
+    """Return the covariance (7, 7) of the constants by how much the stretches of the drive disagree.
 
-    With the scores g (c, 6) of the cones summed over `STRETCH` seconds it is `P (sum g g') P` (White's
+    With the scores g (c, 7) of the cones summed over `STRETCH` seconds it is `P (sum g g') P` (White's
     estimator for clusters), which has the errors of the odometry in it.
     """
-    middle = cones.sums(cones.table.t) / cones.counts
+    middle = np.add.reduceat(cones.table.t, cones.begins) / cones.counts
     _, stretch = np.unique(np.floor(middle / STRETCH), return_inverse=True)
     count = int(stretch.max()) + 1
     summed = np.zeros((count, scores.shape[1]))
@@ -174,20 +182,17 @@ def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
     return np.asarray(covariance @ (summed.T @ summed) @ covariance * count / max(count - 1, 1))
 
 
-def _residuals(
-    cones: _Cones, errors: Array, noise: tuple[RayNoise, RayNoise], odometry: Array
-) -> tuple[IntArray, Array, Array]:
+def _residuals(cones: _Cones, errors: Array, noise: Rays, odometry: Array) -> tuple[IntArray, Array, Array]:
     """Return rows (k,) of far sightings, and what is left of them about nearer ones of the same cone.
 
     The offsets (2, k) along and across the ray (m) are without the constant errors. With them come the
     variances (2, k) of reference and odometry (m^2), with the drift (3,) by root of s of white noise.
     """
-    points, sigmas = cones.points + cones.columns @ errors, [one.sigmas(cones.ranges) for one in noise]
-    weight = 1.0 / (0.5 * (sigmas[0] ** 2 + sigmas[1] ** 2))
+    points, sigmas = cones.points + cones.columns @ errors, cones.sigmas(noise)
+    weight = 1.0 / (sigmas**2).mean(axis=0)
     values, sought = np.column_stack([points, *sigmas]), (NEAR, NEAR_TIME)
     rows, counts, means = _references(cones.table.cone, cones.table.t, cones.ranges, weight, values, sought)
-    off, lag = points[rows] - means[:, 1:3], means[:, 0]
-    offsets = np.array([(off * axis[rows]).sum(axis=1) for axis in (cones.ray, cones.side)])
+    offsets, lag = cones.on_axes(points[rows] - means[:, 1:3], rows), means[:, 0]
     across = odometry[1] ** 2 + (odometry[2] * cones.ranges[rows]) ** 2
     known = np.array([odometry[0] ** 2 * lag, across * lag])
     for axis, one in enumerate(noise):
@@ -208,8 +213,8 @@ def _references(
     i, j = pairs(cone)
     chosen = (np.abs(t[j] - t[i]) < time) & (ranges[j] < share * ranges[i])
     i, j = i[chosen], j[chosen]
-    begins = np.flatnonzero(np.diff(i, prepend=-1))
-    rows, counts = i[begins], np.diff(np.append(begins, len(i)))
+    begins, counts = _runs(i)
+    rows = i[begins]
     both, total = np.column_stack([np.abs(t[j] - t[i]), values[j]]), np.add.reduceat(weight[j], begins)
     means = np.add.reduceat(weight[j, None] * both, begins) / total[:, None]
     enough = counts >= 2
@@ -218,8 +223,7 @@ def _references(
 
 def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
     """Return all ordered pairs of rows of one group, by index; groups (n,) of equal number are neighbours."""
-    begins = np.flatnonzero(np.diff(groups, prepend=-1))
-    counts = np.diff(np.append(begins, len(groups)))
+    begins, counts = _runs(groups)
     repeats = np.repeat(counts, counts)
     i = np.repeat(np.arange(len(groups)), repeats)
     nth = np.arange(len(i)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
@@ -332,11 +336,9 @@ class Measurement:
 
     def _round(self, cones: _Cones) -> MeasuredNoise | None:
         walk, noise = self._found.odometry * np.sqrt(self._found.interval), self._noise
-        errors, *covariances, off = _solve(cones, _information(cones, *noise, self._weights))
+        errors, *covariances, off = _solve(cones, cones.information(noise, self._weights))
         cones = self._cones = cones.without(off)
-        square = ((off * cones.ray).sum(axis=1) / noise[0].sigmas(cones.ranges)) ** 2
-        square += ((off * cones.side).sum(axis=1) / noise[1].sigmas(cones.ranges)) ** 2
-        self._weights = huber_weights(np.sqrt(square), HUBER) ** 2
+        self._weights = huber_weights(np.hypot(*(cones.on_axes(off) / cones.sigmas(noise))), HUBER) ** 2
         self._weights[cones.ranges > COUNTED * MAX_RANGE] = HARDLY
         rows, (along, across), (by_along, by_across) = _residuals(cones, errors, noise, walk)
         if len(rows) < MIN_ROWS:
@@ -350,7 +352,7 @@ class Measurement:
         return None if self._rounds else self._passed(self._result(cones, errors, *covariances))
 
     def _result(self, cones: _Cones, errors: Array, covariance: Array, clustered: Array) -> MeasuredNoise:
-        """Return what was found, with errors (6,) and both covariances (6, 6) of them.
+        """Return what was found, with constants (7,) and both covariances (7, 7) of them.
 
         What stays of a cone's errors shifts its place; only what changes is taken for an error of the sensor.
         """
@@ -359,6 +361,8 @@ class Measurement:
         period = float(np.median(np.diff(stamps)))
         stays = max(one.inflation_of_slope(count, period) for one in self._noise)
         sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
+        sigmas = np.hypot(sigmas, MODEL_ERROR * np.abs(errors))
+        is_bent = np.abs(errors[BEND]) > SURE * sigmas[BEND]
         return replace(
             self._found,
             along=self._noise[0],
@@ -367,7 +371,8 @@ class Measurement:
             period=period,
             per_cycle=len(sightings.t) / len(stamps),
             sensor=errors[:SENSOR_SIZE],
-            sensor_sigma=np.hypot(sigmas, MODEL_ERROR * np.abs(errors))[:SENSOR_SIZE],
+            sensor_sigma=sigmas[:SENSOR_SIZE],
+            range_bend=float(errors[BEND]) if is_bent else 0.0,
             seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
         )
 

@@ -90,14 +90,14 @@ class NoiseLearner:
         return Detections(detections.t, corrected, covariances, detections.labels)
 
     def for_map(self, detections: Detections) -> Detections:
-        """Return detections whose covariances say what each adds to the others of its cone."""
+        """Return unbent detections whose covariances say what each adds to the others of its cone."""
         measured, points = self.measured, detections.points_vehicle
         if not self.of_sensor or measured is None:
             return detections
         covariances = measured.covariances(points, inflated=True) if self.of_detections else None
         if covariances is None:
             covariances = measured.inflated(points, detections.covariances)
-        return Detections(detections.t, points, covariances, detections.labels)
+        return Detections(detections.t, measured.unbent(points), covariances, detections.labels)
 
     def motions_of_lap(self, motions: Sequence[MeasuredMotion]) -> Sequence[MeasuredMotion]:
         """Return the motions of a drive with the noise that is known now.

@@ -8,7 +8,7 @@ by -psi. Detections that are late by tau lie too far ahead by `tau v`, which cha
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -209,6 +209,15 @@ class SensorErrors:
         limit, prior = settings.doubt**2, (settings.sigma_yaw, settings.sigma_latency)
         known = zip(self.mean.tolist(), self.covariance.diagonal().tolist(), prior, strict=True)
         return any(mean**2 > limit * (variance + sigma**2) for mean, variance, sigma in known)
+
+    def found(self, settings: CalibrationSettings) -> CalibrationSettings:
+        """Return wide priors of the sensor about the yaw and the latency that matches show.
+
+        About zero they leave most of a yaw of some degrees to the bias of the yaw rate, which bends the map.
+        The first matches find about half of a large yaw (`SIGMAS_ERRORS`), so its sigma is as large.
+        """
+        (yaw, latency), wide = self.mean.tolist(), settings.widened()
+        return replace(wide, yaw=yaw, latency=latency, sigma_yaw=max(wide.sigma_yaw, abs(yaw)))
 
     def follow(self, velocity: Array, dt: float) -> None:
         """Take the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""

@@ -28,6 +28,7 @@ _DETECTIONS: Final = {
     **{"count": (1, 1.0), "period": (1, POSITIVE), "per_cycle": (1, POSITIVE)},
     **dict.fromkeys(SENSOR, (2, -MAX_NOISE)),
 }
+_BEND: Final = {"range_bend": (1, -MAX_NOISE)}  # beside these where ranges bend
 
 
 class Header:
@@ -73,6 +74,7 @@ class Header:
 
     def _measured(self) -> MeasuredNoise:
         entries = _ODOMETRY | (_DETECTIONS if "along" in self.section(MEASURED) else {}) | _SECONDS
+        entries |= _BEND if "range_bend" in self.section(MEASURED) else {}
         values = {name: self.numbers(MEASURED, name, *expected) for name, expected in entries.items()}
         noisy = values["odometry"] + values["drift"] > 0.0
         self._require(noisy, "a twist with some noise as odometry or drift")
@@ -129,5 +131,5 @@ def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | N
     values = vars(measured) | dict(zip(SENSOR, errors, strict=True))
     for name in _RAYS if rays else ():
         values[name] = [*values[name].sigma, values[name].share, values[name].time]
-    entries = [*_ODOMETRY, *(_DETECTIONS if rays else ()), *_SECONDS]
+    entries = [*_ODOMETRY, *(_DETECTIONS if rays else ()), *_SECONDS, *(_BEND if measured.range_bend else ())]
     return {"noise": section, MEASURED: {name: np.asarray(values[name]).tolist() for name in entries}}

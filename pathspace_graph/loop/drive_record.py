@@ -72,7 +72,7 @@ class DriveRecord:
         self.poses: Array = np.zeros((0, 3))  # of each cycle, map frame, as of then or the newest batch
         self.stamps: list[float] = []  # stamp of each cycle (s)
         self._motions: list[MeasuredMotion] = []  # that lead to each cycle
-        self._seen: list[Detections] = []  # of each cycle, with their stated covariances
+        self._seen: list[Detections] = []  # of each cycle, as they came
         self._orange: list[Detections] = []  # those of orange cones
         self._prepared = False
 
@@ -82,14 +82,14 @@ class DriveRecord:
         self._motions, self._seen, self._orange = [], [], []
 
     def measured(self, reading: Reading) -> None:
-        """Add the motion that leads to a pose, and the detections there with their stated covariances."""
+        """Add the motion that leads to a pose, and the detections there as they came."""
         self.stamps.append(reading.detections.t)
         if self.unsolvable is not None:
             return
-        seen = reading.detections
+        seen, orange = reading.stated
         self._motions.append(reading.motion)
-        self._seen.append(Detections(seen.t, seen.points_vehicle, reading.stated, seen.labels))
-        self._orange.append(reading.orange)
+        self._seen.append(seen)
+        self._orange.append(orange)
         if len(self.stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
@@ -122,7 +122,8 @@ class DriveRecord:
             seen = [self._seen[k].with_others(self._orange[k]) for k in chosen]
             table = DetectionColumns.of(seen, twists=twists)
             known = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
-            table = replace(table, cycle=cycles[table.cycle], covariance=known.covariances)
+            table = replace(table, measured=known.points_vehicle, covariance=known.covariances)
+            table = replace(table, cycle=cycles[table.cycle])
             table.correct(sensor)
             return table
 
@@ -148,7 +149,7 @@ class DriveRecord:
         chain = chained(self.stamps, self._noise.motions_of_lap(self._motions), settings.odometry)
         table = DetectionTable.of(self._seen, twists=chain.twists)
         seen = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
-        table = replace(table, covariance=seen.covariances)
+        table = replace(table, measured=seen.points_vehicle, covariance=seen.covariances)
         return OpenLap(settings, chain, table, first_kept, start)
 
 

@@ -153,7 +153,8 @@ class TrackLoop:
             return ""
         before = self._inflated
         self._inflated = inflate_priors(self._smoother, before, reading.sensor_doubted, reading.measured)
-        is_new = before == self.settings != self._inflated and reading.measured is None
+        contradicted = reading.sensor_doubted or reading.measured is None
+        is_new = before == self.settings != self._inflated and contradicted
         return LEARNED if is_new else ""
 
     # --- the batch of the open lap -----------------------------------------------------------------------

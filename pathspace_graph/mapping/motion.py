@@ -135,7 +135,8 @@ def inflate_priors(
         settings = replace(settings, odometry=measured.odometry, calibration=measured.calibration)
     if sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
-    if smoother.last_step is not None and smoother.next_cycle % DOUBT_CYCLES == 0:
+    is_due = measured is None and smoother.next_cycle % DOUBT_CYCLES == 0  # else old priors made the estimate
+    if smoother.last_step is not None and is_due:
         variables = smoother.variables
         variance = np.diag(smoother.last_covariance(variables.calibration_keys))
         settings = with_inflated_priors(variables.calibrations, variance, settings)

@@ -281,13 +281,14 @@ CASES: dict[str, Arguments] = {
     "centred": lambda rng: (
         np.arange(0, COUNT, 5),
         covariances(rng),
-        rng.normal(size=(COUNT, 2, 6)),
+        rng.normal(size=(COUNT, 2, 7)),
         rng.normal(size=(COUNT, 2)),
     ),
     "by_constants": lambda rng: (
         9.0 * rng.normal(size=(COUNT, 2)),
         *(poses(rng) for _ in range(3)),
         np.arange(COUNT) // 3 * 3,
+        8.0,
     ),
     "references": lambda rng: (
         np.sort(rng.integers(0, 3, COUNT)),

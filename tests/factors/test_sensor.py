@@ -8,9 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import compose, inverse, rotation, se2_exp, to_map
 from pathspace_graph.factors.sensor import (
     SENSOR,
+    by_bend,
     by_range,
     by_sensor,
     in_vehicle,
@@ -48,6 +50,15 @@ def test_each_error_is_corrected_by_hand(name: str, value: float, seen: list[flo
     sensor[SENSOR.index(name)] = value
     C = by_sensor(np.array([seen]), np.array([[10.0, 0.0, 0.0]]))
     np.testing.assert_allclose(np.array(seen) + C[0] @ sensor, [10.0, 2.0], atol=5e-3)  # to first order
+
+
+def test_ranges_bend_beyond_eight_metres() -> None:
+    """By 0.01 per m, a cone at 18 m is seen at 19 m: `10^2 0.01` too far."""
+    near, far = np.array([[4.8, 6.4], [-1.0, 2.0]]), np.array([[10.8, 14.4]])
+    np.testing.assert_array_equal(by_bend(near), 0.0)
+    np.testing.assert_allclose(far * (1.0 + 0.01 * by_bend(far)[:, None]), [[11.4, 15.2]])
+    unbent = MeasuredNoise(np.ones(3), np.ones(3), 0.02, range_bend=0.01).unbent(np.array([[18.0, 0.0]]))
+    np.testing.assert_allclose(unbent, [[17.0, 0.0]])
 
 
 @given(st.integers(0, 10**6))

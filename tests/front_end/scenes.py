@@ -36,6 +36,8 @@ class Camera:
     across: RayNoise
     errors: Array = field(default_factory=lambda: np.zeros(5))
     """(5,) The sensor has these constant errors (`factors.sensor:SENSOR`)."""
+    bend: float = 0.0
+    """A range r beyond 9 m reads this (1/m) times `(r - 9)^2` longer."""
     seconds: float = 60.0
 
     def drive(self, seed: int) -> tuple[list[SeenCycle], TwistRecord]:
@@ -67,7 +69,7 @@ class Camera:
         """Returns the detections of cones, of which the corrected ones are where they are plus noise."""
         ranges = np.hypot(*true.T)
         ray = true / ranges[:, None]
-        noisy = true.copy()
+        noisy = true + self.bend * np.maximum(ranges - 9.0, 0.0)[:, None] ** 2 * ray
         directions = (ray, np.column_stack([-ray[:, 1], ray[:, 0]]))
         for k, noise in enumerate((self.along, self.across)):
             unit = np.sqrt(noise.share) * slow[k] + np.sqrt(1.0 - noise.share) * white[k]

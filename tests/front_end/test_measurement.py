@@ -11,15 +11,21 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
+from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.sensor import BENDS_FROM
+from pathspace_graph.front_end import measurement
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import (
+    BEND,
     FOLLOWED,
     MIN_ROWS,
     MODEL_ERROR,
     PASSES,
+    PRIOR,
     ROUNDS,
     ROUNDS_AGAIN,
     Measurement,
+    _by_constants,
     measure,
 )
 from pathspace_graph.front_end.sightings import TwistRecord
@@ -84,6 +90,37 @@ def test_errors_that_stay_with_a_cone_are_told_from_white_ones(axis: str) -> Non
     shares = {name: np.mean([getattr(one, axis).share for one in found(name)]) for name in CAMERAS}
     assert shares["white"] < 0.25 and shares["white, errors"] < 0.25
     assert shares["staying, errors"] > 0.3
+
+
+BENT = Camera(RayNoise(np.array([0.05, 0.01])), RayNoise(np.array([0.0, 0.012])), ERRORS, bend=-0.005)
+
+
+def test_ranges_that_bend_do_not_spoil_the_other_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Yaw and scale are right in the mean of the drives; where no bend is allowed, the scale is not."""
+    bent = [BENT.found(seed) for seed in SEEDS]
+    yaw, _, _, scale, _ = np.mean([one.sensor for one in bent], axis=0)
+    assert yaw == pytest.approx(0.02, abs=0.0015)
+    assert scale == pytest.approx(0.05, abs=0.01)
+    assert np.mean([one.range_bend for one in bent]) == pytest.approx(-0.005, abs=0.001)
+    monkeypatch.setattr(measurement, "PRIOR", np.where(np.arange(7) == BEND, 1e-9, PRIOR))
+    straight = BENT.found(0)
+    assert abs(straight.sensor[3] - 0.05) > 0.02
+    assert straight.range_bend == 0.0
+
+
+def test_a_bend_is_used_only_where_it_is_beyond_doubt() -> None:
+    assert [one.range_bend for one in found("white")] == [0.0] * len(SEEDS)
+
+
+def test_columns_are_derivatives_in_the_map_of_corrected_detections() -> None:
+    """By the five errors and the bend."""
+    rng = np.random.default_rng(0)
+    seen, (poses, twists) = rng.normal(scale=12.0, size=(9, 2)), rng.normal(size=(2, 9, 3))
+    columns = _by_constants(seen, twists, poses, np.zeros((9, 3)), np.zeros(9, np.intp), BENDS_FROM)
+    for k, step in enumerate(1e-6 * np.eye(6)):
+        known = MeasuredNoise(np.ones(3), np.ones(3), 0.02, sensor=step[:5], range_bend=step[5])
+        moved = to_map(known.corrected(seen, twists), poses) - to_map(seen, poses)
+        np.testing.assert_allclose(columns[:, :, k], moved / 1e-6, atol=1e-6)
 
 
 def test_the_drive_itself_is_told_too() -> None:
@@ -160,9 +197,9 @@ def test_a_biased_yaw_rate_is_not_taken_for_a_turned_sensor(bias: float) -> None
 def test_in_steps_it_is_the_same_and_none_is_long() -> None:
     cycles, twists = CAMERAS["white"].drive(0)
     whole = measure(cycles, twists, None)
-    steps, measurement = 0, Measurement.of(cycles, twists, None)
-    assert measurement is not None and whole is not None
-    while (found := measurement.advance()) is None:
+    steps, parts = 0, Measurement.of(cycles, twists, None)
+    assert parts is not None and whole is not None
+    while (found := parts.advance()) is None:
         steps += 1
     np.testing.assert_array_equal(found.sensor, whole.sensor)
     follows = -(-len(cycles) // FOLLOWED)

@@ -84,6 +84,14 @@ def test_noise_is_measured_where_nobody_has_stated_it_or_where_that_is_asked_for
     assert known.is_settled
 
 
+def test_detections_lose_the_bend_of_their_ranges() -> None:
+    """One at 18 m by a bend of 0.01 per m, `10^2 0.01` m too far, for the map and for comparisons."""
+    seen = detections(0.0, np.array([[0.0, 18.0], [5.0, 0.0]]), np.zeros(2, np.intp))
+    known = learner(replace(noise(), range_bend=0.01))
+    for found in (known.for_map(seen), known.for_check(seen, np.zeros(3))):
+        np.testing.assert_allclose(found.points_vehicle, [[0.0, 17.0], [5.0, 0.0]], atol=1e-12)
+
+
 def test_for_comparisons_detections_are_single_and_without_constant_errors() -> None:
     errors, twist = np.array([0.02, 0.1, 0.05, 0.1, 0.2]), np.array([8.0, 0.0, 0.4])
     seen = detections(0.0, np.array([[10.0, 0.0]]), np.zeros(1, np.intp))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.se2 import relative, to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end import scan_matching
-from pathspace_graph.front_end.front_end import judge_log
+from pathspace_graph.front_end.front_end import FrontEnd, judge_log
 from pathspace_graph.front_end.motion import MotionCheck
 from pathspace_graph.front_end.scan_matching import (
     ERRORS,
@@ -141,6 +141,19 @@ def test_a_drive_shows_the_errors_of_its_sensor(
     assert (np.sqrt(np.diag(check.errors.covariance)) < 0.2 * np.array(SIGMAS_ERRORS)).all()
     assert (np.abs(check.errors.mean - expected) < (0.003, 0.006)).all()
     assert check.errors.contradict(CalibrationSettings()) == bool(faults)
+
+
+def test_priors_of_a_turned_sensor_lie_about_its_yaw_from_the_cycle_on_that_shows_it() -> None:
+    """A recorded car's sensor is turned by 6.5 degrees, of which a prior about zero would hide the most."""
+    log, settings = drive(yaw=0.1134), MapperSettings()
+    front_end = FrontEnd(settings, log.noise)
+    readings = (front_end.update(*cycle) for cycle in split_odometry(log))
+    first = next(reading for reading in readings if reading.sensor_doubted)
+    assert first.measured is not None
+    found = first.measured.calibration
+    assert found.sigma_yaw == found.yaw > settings.calibration.widened().sigma_yaw
+    assert found.yaw == pytest.approx(0.1134, abs=1.5 * found.sigma_yaw)
+    assert first.measured.odometry == settings.odometry
 
 
 def test_the_prior_of_a_sensor_becomes_wide_for_a_batch_where_the_drive_contradicts_it() -> None:

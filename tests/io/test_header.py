@@ -46,6 +46,7 @@ def measured() -> MeasuredNoise:
         per_cycle=11.0 / 7.0,
         sensor=rng.normal(size=5),
         sensor_sigma=rng.uniform(size=5),
+        range_bend=-1e-3 / 3.0,
         seconds=100.0 / 3.0,
     )
 

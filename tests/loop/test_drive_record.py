@@ -53,7 +53,7 @@ def driven(laps: float, drift: float) -> DriveRecord:
         step = integrate_odometry(Odometry(np.array([t - CYCLE]), twist), t, np.full(3, 0.01))
         nothing = Detections(t, *NOTHING)
         motion, none = MeasuredMotion(step, twist), np.zeros(0, bool)
-        record.measured(Reading(motion, nothing, none, nothing, nothing.covariances))
+        record.measured(Reading(motion, nothing, none, nothing, (nothing, nothing)))
         state.poses[-1] = np.append(on_circle(np.array([angle]))[0], angle)
         state.pose_u = {LEFT: np.array([angle * (RADIUS - 2.0)]), RIGHT: np.array([angle * (RADIUS + 2.0)])}
         record.estimated(state)
