@@ -21,6 +21,7 @@ using Shape = std::vector<Index>;
 namespace {
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
+constexpr double kTurn = 6.283185307179586;
 constexpr Index kOwn = -2;  // a detection that is the first one of a new cone
 
 double clipped(double v, double low, double high) { return std::min(std::max(v, low), high); }
@@ -1334,13 +1335,15 @@ struct LayLimits {  // mapping.constellation:LIMITS
   explicit LayLimits(const py::tuple& limits)
       : sigma(limits[0].cast<double>()), gate(limits[1].cast<double>()), cell(limits[2].cast<double>()),
         turn(limits[3].cast<double>()), apart(limits[4].cast<double>()),
-        places(static_cast<Index>(limits[5].cast<double>())) {}
+        places(static_cast<Index>(limits[5].cast<double>())), unseen(limits[6].cast<double>()),
+        failed(limits[7].cast<double>()) {}
   double sigma, gate, cell, turn, apart;
   Index places;
+  double unseen, failed;
 };
 
 struct LaidPose {
-  double pose[3], information[9], cost, share;
+  double cost, pose[3], information[9], misfit, count;
 };
 
 struct LayStart {
@@ -1385,22 +1388,33 @@ std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known
                          mean[1] + (best[k] % width - half) * limits.cell, heading}});
   }
   std::stable_sort(starts.begin(), starts.end(), [](const LayStart& a, const LayStart& b) { return a.votes > b.votes; });
+  starts.insert(starts.begin(), {0, {mean[0], mean[1], mean[2]}});
   return starts;
 }
 
 constexpr double kLayGates[] = {4.0, 4.0, 2.0, 1.0, 1.0, 1.0};
 constexpr double kLayRegular[] = {1e-2, 1e-2, 1.0};
 
+bool lay_in_view(double x, double y, const Array& views) {
+  const double* view = views.data();
+  for (Index k = 0; k < views.shape(0); ++k, view += 5) {
+    const double dx = x - view[0], dy = y - view[1];
+    if (!(std::hypot(dx, dy) < view[3])) continue;
+    if (std::abs(std::remainder(std::atan2(dy, dx) - view[2], kTurn)) < view[4]) return true;
+  }
+  return false;
+}
+
 // The pose after Gauss-Newton steps on the sum of capped squares, and what the cones say of it there.
-LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const double* start, const double* mean,
-                     const double* prior, const LayLimits& limits) {
+LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Array& views, const double* start,
+                     const double* mean, const double* prior, const LayLimits& limits) {
   LaidPose out;
   std::copy_n(start, 3, out.pose);
   const double floor = limits.sigma * limits.sigma;
   for (int step = 0; step <= 6; ++step) {
     const double limit = limits.gate * (step < 6 ? kLayGates[step] : 1.0);
     const Turn turn(out.pose[2]);
-    double A[3][3] = {}, g[3] = {}, cost = 0.0, sharp = 0.0, on = 0.0;
+    double A[3][3] = {}, g[3] = {}, cost = 0.0, count = 0.0;
     for (Index i = 0; i < seen.n; ++i) {
       const double *p = seen.point.data() + 2 * i, *K = seen.covariance.data() + 4 * i;
       const double arm[2] = {turn.c * p[0] - turn.s * p[1], turn.s * p[0] + turn.c * p[1]};
@@ -1425,10 +1439,9 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const doub
           std::copy_n(inverse, 4, weight);
         }
       }
-      const double own = 1.0 / (floor + 0.5 * (K[0] + K[3]));
-      sharp += own, cost += std::min(least, limits.gate);
+      if (step == 6 && (least < limit || lay_in_view(arm[0] + out.pose[0], arm[1] + out.pose[1], views)))
+        ++count, cost += std::min(least, limits.gate);
       if (!(least < limit)) continue;
-      on += own;
       const double share = 1.0 - least / limit, w = step < 6 ? share * share : 1.0;
       const double by[2][3] = {{1.0, 0.0, -arm[1]}, {0.0, 1.0, arm[0]}};
       for (int a = 0; a < 3; ++a)
@@ -1446,23 +1459,22 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const doub
       continue;
     }
     std::copy_n(&A[0][0], 9, out.information);
-    const double pi = std::acos(-1.0);
     double away[3], square = 0.0;
     for (int k = 0; k < 3; ++k) away[k] = out.pose[k] - mean[k];
-    away[2] = std::remainder(away[2], 2.0 * pi);
+    away[2] = std::remainder(away[2], kTurn);
     for (int a = 0; a < 3; ++a)
       for (int b = 0; b < 3; ++b) square += away[a] * prior[3 * a + b] * away[b];
-    out.cost = cost + std::min(square, limits.gate);
-    out.share = on / sharp;
+    out.cost = cost + limits.unseen * (static_cast<double>(seen.n) - count) + std::min(square, limits.failed);
+    out.misfit = cost / std::max(count, 1.0), out.count = count;
   }
   return out;
 }
 
-py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, const Array& mean, const Array& prior,
-               const py::tuple& reach, const py::tuple& tuple) {
+py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, const Array& views, const Array& mean,
+               const Array& prior, const py::tuple& reach, const py::tuple& tuple) {
   const ConePoints seen(seen_columns), known(known_columns);
   const LayLimits limits(tuple);
-  expect(mean.size() == 3 && prior.size() == 9);
+  expect(mean.size() == 3 && prior.size() == 9 && views.size() == 5 * views.shape(0));
   const double within[2] = {reach[0].cast<double>(), reach[1].cast<double>()};
   std::vector<LayStart> tried;
   std::vector<LaidPose> found;
@@ -1473,7 +1485,7 @@ py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, co
     });
     if (is_near) continue;
     tried.push_back(start);
-    found.push_back(lay_refined(seen, known, start.pose, mean.data(), prior.data(), limits));
+    found.push_back(lay_refined(seen, known, views, start.pose, mean.data(), prior.data(), limits));
     if (static_cast<Index>(tried.size()) == 3 * limits.places) break;
   }
   if (found.empty())
@@ -1486,7 +1498,7 @@ py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, co
     if (std::hypot(one.pose[0] - best.pose[0], one.pose[1] - best.pose[1]) > limits.apart)
       next = std::min(next, one.cost);
   return py::make_tuple(Array(Shape{3}, best.pose), Array(Shape{3, 3}, best.information),
-                        py::make_tuple(best.cost, best.share, next - best.cost));
+                        py::make_tuple(best.misfit, best.count, next - best.cost));
 }
 
 // --- odometry and path ------------------------------------------------------------------------------------

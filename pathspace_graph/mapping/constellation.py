@@ -7,13 +7,13 @@ in many places. A sure place is a relative pose of two cycles, the measurement o
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from typing import Final, Self
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import (
     compose,
@@ -44,25 +44,29 @@ TURN: Final = 0.05  # step of the headings that are tried (rad)
 APART: Final = 1.0  # least distance of two different places (m)
 PLACES: Final = 10  # most places of each heading, and a third of the most that are refined
 RANGE: Final = 16.0  # farthest detections that are merged (m)
-NEWEST: Final = (10.0, 40.0)  # least and most of the newest path whose cones are laid on earlier ones (m)
+VIEWED: Final = 0.95  # share of the detections within the range and the bearing of a view
+VIEWS: Final = 1.0  # step at which the views along a path are looked at (m)
+NEWEST: Final = 40.0  # newest path whose cones are laid on earlier ones (m)
 BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
-MIN_CONES: Final = 6  # least number of cones that tell a place
-MIN_SHARE: Final = 0.8  # least share of the cones that lie on earlier ones, by their information
-MISFIT: Final = 2.0  # most mean capped square of the cones: that of cones that agree, in two dimensions
-ODDS: Final = 20.0  # least difference of cost to the next place: twice the logarithm of the odds
-ODDS_NEARBY: Final = 6.0  # the same where the place is known to a metre
+MIN_CONES: Final = 6  # least number of cones in view that tell a place
+MISFIT: Final = 2.0  # most mean capped square of these: that of cones that agree, in two dimensions
+UNSEEN: Final = 1.0  # cost of a cone where nothing was in view, which speaks neither for nor against a place
+FAILED: Final = 20.0  # cost of odometry that has failed: twice the logarithm of the odds against it
+ODDS: Final = 14.0  # least difference of cost to the next place: odds of a thousand
 SIGHTINGS: Final = 3  # least number of detections of a cone
 BEGINNING: Final = 40.0  # length of the beginning of a drive that closes a lap (m)
 NEWEST_LAP: Final = 60.0  # length of the newest path that crosses the start, if a lap is closed (m)
 TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
 SAME_ROAD: Final = 2.5  # largest distance of both passes across their road, by the cones (m)
 SAME_HEADING: Final = 0.5  # largest angle between both passes, by the cones (rad)
-LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES))
+LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES), UNSEEN, FAILED)
 
 
 Cones = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
 NO_CONES: Final[Cones] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
+EVERYWHERE: Final[Array] = np.array([[0.0, 0.0, 0.0, inf, inf]])
+"""The view of a constellation that lacks no cone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,8 @@ class Constellation:
     points: Array  # (n, 2) in m
     covariances: Array  # (n, 2, 2) in m^2
     labels: IntArray  # (n,)
+    views: Array = field(default_factory=EVERYWHERE.copy)
+    """(k, 5) poses that have looked for cones, and the range and the largest bearing of their view (m, rad)."""
 
     @classmethod
     def of(cls, table: DetectionColumns, poses: Array, settings: GrowthSettings) -> Self:
@@ -88,7 +94,8 @@ class Constellation:
             seen = counts >= SIGHTINGS
             covariance = np.asarray(np.linalg.inv(information[seen]), np.float64)
             found.append((places[seen], covariance, np.full(len(covariance), label)))
-        return cls(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        cones = (np.concatenate(column) for column in zip(*found, strict=True))
+        return cls(*cones, _views(poses[np.unique(table.cycle)], point[rows]))
 
     @property
     def cones(self) -> Cones:
@@ -106,26 +113,14 @@ class Laid:
 
     pose: Array  # (3,) map frame
     information: Array  # (3, 3) about it, from the cones that lie on others
-    cost: float  # sum of the capped squares of the cones and of the prior
-    count: int  # number of cones
-    share: float  # share of the cones that lie on others, by their information
+    count: int  # number of cones where an earlier one would have been seen
+    misfit: float  # mean capped square of these
     odds: float  # cost of the next place less that of this one; infinite if there is none
-    away: float  # square of the pose's distance from where it was expected (sigmas^2)
 
     @property
     def is_sure(self) -> bool:
-        """Whether nearly all cones agree, and no other place is nearly as good."""
-        return self.agrees and self.odds >= ODDS
-
-    @property
-    def is_likely(self) -> bool:
-        """Whether nearly all cones agree about where they were expected, and no other place is as good."""
-        return self.agrees and self.odds >= ODDS_NEARBY and self.away < GATE
-
-    @property
-    def agrees(self) -> bool:
-        """Whether nearly all of enough cones lie on earlier ones."""
-        return self.count >= MIN_CONES and self.share >= MIN_SHARE and self.cost <= MISFIT * self.count
+        """Whether nearly all of enough cones lie on earlier ones, and no other place is nearly as good."""
+        return self.count >= MIN_CONES and self.misfit <= MISFIT and self.odds >= ODDS
 
 
 def lay(
@@ -134,28 +129,27 @@ def lay(
     """Lay cones on known ones, in the frames of a vehicle and of the map; None where they are too few.
 
     The pose is searched within a `reach` (m, rad) of its `mean` (3,). The square of the difference from the
-    mean, by its `information` (3, 3), is capped as well, since odometry may have failed.
+    mean, by its `information` (3, 3), counts up to `FAILED`.
     """
     if min(len(seen.labels), len(known.labels)) < MIN_CONES:
         return None
-    pose, about, (cost, share, odds) = _laid(seen.cones, known.cones, mean, information, reach, LIMITS)
-    if not np.isfinite(cost):
-        return None
-    off = pose - mean
-    off[2] = wrap_angle(off[2:])[0]
-    return Laid(pose, about, cost, len(seen.labels), share, odds, float(off @ information @ off))
+    pose, about, (misfit, count, odds) = _laid(
+        seen.cones, known.cones, known.views, mean, information, reach, LIMITS
+    )
+    return Laid(pose, about, int(count), misfit, odds) if count else None
 
 
 @compiled
 def _laid(
     seen: Cones,
     known: Cones,
+    views: Array,
     mean: Array,
     prior: Array,
     reach: tuple[float, float],
     limits: tuple[float, ...],
 ) -> tuple[Array, Array, tuple[float, float, float]]:
-    """Return the pose (3,) of `lay`, the information (3, 3) about it, and its cost, share and odds."""
+    """Return the pose (3,) of `lay`, the information (3, 3) about it, and its misfit, count and odds."""
     apart, places = limits[4], int(limits[5])
     tried, found = list[Array](), []
     for start in _starts(seen, known, mean, reach, limits):
@@ -163,21 +157,24 @@ def _laid(
         if any(distance < apart and turn < 1.5 * limits[3] for distance, turn in off):
             continue
         tried.append(start)
-        found.append(_refined(seen, known, start, mean, prior, limits))
+        found.append(_refined(seen, known, views, start, mean, prior, limits))
         if len(tried) == 3 * places:
             break
     if not found:
         return mean, np.zeros((3, 3)), (inf, 0.0, 0.0)
-    pose, information, cost, share = min(found, key=lambda one: one[2])
-    others = [one[2] for one in found if np.hypot(*(one[0] - pose)[:2]) > apart]
-    return pose, information, (cost, share, min(others, default=inf) - cost)
+    cost, pose, information, misfit, count = min(found, key=lambda one: one[0])
+    others = [one[0] for one in found if np.hypot(*(one[1] - pose)[:2]) > apart]
+    return pose, information, (misfit, count, min(others, default=inf) - cost)
 
 
 def _starts(
     seen: Cones, known: Cones, mean: Array, reach: tuple[float, float], limits: tuple[float, ...]
 ) -> list[Array]:
-    """Return poses (3,), most votes first: each pair of cones votes for a cell and the eight around it."""
-    _, _, size, step, _, places = limits
+    """Return poses (3,): the mean, since few cones may have been met again, and those with most votes.
+
+    Each pair of cones votes for a cell and the eight around it.
+    """
+    size, step, places = limits[2], limits[3], limits[5]
     i, j = np.nonzero(seen[2][:, None] == known[2])
     half, turns, starts = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step)), []
     for turn in range(-turns, turns + 1):
@@ -196,14 +193,20 @@ def _starts(
             a, b = divmod(number, 2 * half + 1)
             place = mean[0] + (a - half) * size, mean[1] + (b - half) * size
             starts.append((votes[a, b], np.array([*place, heading])))
-    return [start for _, start in sorted(starts, key=lambda one: -one[0])]
+    return [mean, *(start for _, start in sorted(starts, key=lambda one: -one[0]))]
 
 
 def _refined(
-    seen: Cones, known: Cones, start: Array, mean: Array, prior: Array, limits: tuple[float, ...]
-) -> tuple[Array, Array, float, float]:
-    """Return the pose (3,) after Gauss-Newton steps, its information (3, 3), its cost and its share."""
-    sigma, gate, pose = limits[0], limits[1], start
+    seen: Cones,
+    known: Cones,
+    views: Array,
+    start: Array,
+    mean: Array,
+    prior: Array,
+    limits: tuple[float, ...],
+) -> tuple[float, Array, Array, float, float]:
+    """Return the cost after Gauss-Newton steps, the pose (3,), its information (3, 3), its misfit and count."""
+    (sigma, gate), (unseen, failed), pose = limits[:2], limits[6:], start
     for factor in (*GATES, None):
         turn, limit = rotation(pose[2]), gate * (factor or 1.0)
         arm = seen[0] @ turn.T
@@ -224,10 +227,27 @@ def _refined(
         pose = pose - np.linalg.solve(hessian, np.einsum("mia,mij,mj->a", by, weight, off))
     away = pose - mean
     away[2] = wrap_angle(away[2])
-    cost = np.minimum(square, gate).sum() + min(away @ prior @ away, gate)
-    sharp = 1.0 / (sigma**2 + 0.5 * np.trace(seen[1], axis1=1, axis2=2))
+    asked = on | _in_view(arm + pose[:2], views)
+    cost, count = np.minimum(square[asked], gate).sum(), asked.sum()
+    total = cost + unseen * (~asked).sum() + min(away @ prior @ away, failed)
     information = np.einsum("mia,mij,mjb->ab", by, weight, by)
-    return pose, information, float(cost), float(sharp[on].sum() / sharp.sum())
+    return float(total), pose, information, float(cost / max(count, 1)), float(count)
+
+
+def _in_view(points: Array, views: Array) -> BoolArray:
+    """Return which of the points (m, 2) one of the views (k, 5) has within its range and bearing."""
+    off = points[:, None] - views[:, :2]
+    bearing = np.abs(wrap_angle(np.arctan2(off[:, :, 1], off[:, :, 0]) - views[:, 2]))
+    return ((np.hypot(off[:, :, 0], off[:, :, 1]) < views[:, 3]) & (bearing < views[:, 4])).any(axis=1)
+
+
+def _views(poses: Array, points: Array) -> Array:
+    """Return views (k, 5) from poses (P, 3), `VIEWS` apart, with the limits of what they saw at points (m, 2)."""
+    if len(points) == 0:
+        return np.zeros((0, 5))
+    far, wide = np.quantile(np.abs([np.hypot(*points.T), np.arctan2(*points.T[::-1])]), VIEWED, axis=1)
+    _, first = np.unique(path_lengths(poses) // VIEWS, return_index=True)
+    return np.column_stack([poses[first], np.tile([far, wide], (len(first), 1))])
 
 
 # --- passes of a drive -----------------------------------------------------------------------------------
@@ -307,14 +327,10 @@ def find_return(
 def lay_newest(
     seen_in: SeenIn, poses: Array, place: int, expected: Expected, settings: GrowthSettings
 ) -> Laid | None:
-    """Lay the cones of the newest metres on those about an earlier place, by the poses (P, 3) of all cycles.
-
-    The newest metres are as many as may have been driven again since the first pose, within `NEWEST`.
-    """
+    """Lay the cones of the newest metres on those about an earlier place, by the poses (P, 3) of all cycles."""
     stations = path_lengths(poses)
-    length = float(np.clip(stations[place], *NEWEST))
-    first = int(stations.searchsorted(stations[-1] - length, side="right"))
-    old = np.flatnonzero(np.abs(stations[:first] - stations[place]) < length + BEYOND)
+    first = int(stations.searchsorted(stations[-1] - NEWEST, side="right"))
+    old = np.flatnonzero(np.abs(stations[:first] - stations[place]) < NEWEST + BEYOND)
     known = Constellation.of(seen_in(old), poses, settings)
     seen = Constellation.of(seen_in(np.arange(first, len(poses))), poses, settings).seen_from(poses[-1])
     return lay(seen, known, poses[-1], expected.information, (expected.radius, expected.turn))
