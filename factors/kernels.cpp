@@ -1335,15 +1335,13 @@ struct LayLimits {  // mapping.constellation:LIMITS
   explicit LayLimits(const py::tuple& limits)
       : sigma(limits[0].cast<double>()), gate(limits[1].cast<double>()), cell(limits[2].cast<double>()),
         turn(limits[3].cast<double>()), apart(limits[4].cast<double>()),
-        places(static_cast<Index>(limits[5].cast<double>())), unseen(limits[6].cast<double>()),
-        failed(limits[7].cast<double>()) {}
+        places(static_cast<Index>(limits[5].cast<double>())) {}
   double sigma, gate, cell, turn, apart;
   Index places;
-  double unseen, failed;
 };
 
 struct LaidPose {
-  double cost, pose[3], information[9], misfit, count;
+  double pose[3], information[9], square, count, away;
 };
 
 struct LayStart {
@@ -1408,13 +1406,13 @@ bool lay_in_view(double x, double y, const Array& views) {
 // The pose after Gauss-Newton steps on the sum of capped squares, and what the cones say of it there.
 LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Array& views, const double* start,
                      const double* mean, const double* prior, const LayLimits& limits) {
-  LaidPose out;
+  LaidPose out = {};
   std::copy_n(start, 3, out.pose);
   const double floor = limits.sigma * limits.sigma;
   for (int step = 0; step <= 6; ++step) {
     const double limit = limits.gate * (step < 6 ? kLayGates[step] : 1.0);
     const Turn turn(out.pose[2]);
-    double A[3][3] = {}, g[3] = {}, cost = 0.0, count = 0.0;
+    double A[3][3] = {}, g[3] = {};
     for (Index i = 0; i < seen.n; ++i) {
       const double *p = seen.point.data() + 2 * i, *K = seen.covariance.data() + 4 * i;
       const double arm[2] = {turn.c * p[0] - turn.s * p[1], turn.s * p[0] + turn.c * p[1]};
@@ -1440,7 +1438,7 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Arra
         }
       }
       if (step == 6 && (least < limit || lay_in_view(arm[0] + out.pose[0], arm[1] + out.pose[1], views)))
-        ++count, cost += std::min(least, limits.gate);
+        ++out.count, out.square += std::min(least, limits.gate);
       if (!(least < limit)) continue;
       const double share = 1.0 - least / limit, w = step < 6 ? share * share : 1.0;
       const double by[2][3] = {{1.0, 0.0, -arm[1]}, {0.0, 1.0, arm[0]}};
@@ -1459,13 +1457,11 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Arra
       continue;
     }
     std::copy_n(&A[0][0], 9, out.information);
-    double away[3], square = 0.0;
+    double away[3];
     for (int k = 0; k < 3; ++k) away[k] = out.pose[k] - mean[k];
     away[2] = std::remainder(away[2], kTurn);
     for (int a = 0; a < 3; ++a)
-      for (int b = 0; b < 3; ++b) square += away[a] * prior[3 * a + b] * away[b];
-    out.cost = cost + limits.unseen * (static_cast<double>(seen.n) - count) + std::min(square, limits.failed);
-    out.misfit = cost / std::max(count, 1.0), out.count = count;
+      for (int b = 0; b < 3; ++b) out.away += away[a] * prior[3 * a + b] * away[b];
   }
   return out;
 }
@@ -1488,17 +1484,16 @@ py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, co
     found.push_back(lay_refined(seen, known, views, start.pose, mean.data(), prior.data(), limits));
     if (static_cast<Index>(tried.size()) == 3 * limits.places) break;
   }
-  if (found.empty())
-    return py::make_tuple(mean, Array(Shape{3, 3}, std::vector<double>(9, 0.0).data()),
-                          py::make_tuple(kInfinity, 0.0, 0.0));
-  const LaidPose& best = *std::min_element(found.begin(), found.end(),
-                                           [](const LaidPose& a, const LaidPose& b) { return a.cost < b.cost; });
-  double next = kInfinity;
-  for (const LaidPose& one : found)
-    if (std::hypot(one.pose[0] - best.pose[0], one.pose[1] - best.pose[1]) > limits.apart)
-      next = std::min(next, one.cost);
-  return py::make_tuple(Array(Shape{3}, best.pose), Array(Shape{3, 3}, best.information),
-                        py::make_tuple(best.misfit, best.count, next - best.cost));
+  const Index m = static_cast<Index>(found.size());
+  Array poses({m, Index{3}}), information({m, Index{3}, Index{3}}), squares(m), counts(m), away(m);
+  for (Index k = 0; k < m; ++k) {
+    std::copy_n(found[k].pose, 3, poses.mutable_data() + 3 * k);
+    std::copy_n(found[k].information, 9, information.mutable_data() + 9 * k);
+    squares.mutable_data()[k] = found[k].square;
+    counts.mutable_data()[k] = found[k].count;
+    away.mutable_data()[k] = found[k].away;
+  }
+  return py::make_tuple(poses, information, squares, counts, away);
 }
 
 // --- odometry and path ------------------------------------------------------------------------------------

@@ -50,7 +50,7 @@ NEWEST: Final = 40.0  # newest path whose cones are laid on earlier ones (m)
 BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
 MIN_CONES: Final = 6  # least number of cones in view that tell a place
 MISFIT: Final = 2.0  # most mean capped square of these: that of cones that agree, in two dimensions
-UNSEEN: Final = 1.0  # cost of a cone where nothing was in view, which speaks neither for nor against a place
+UNSEEN: Final = 2.0  # cost of a cone where nothing was in view, which speaks neither for nor against a place
 FAILED: Final = 20.0  # cost of odometry that has failed: twice the logarithm of the odds against it
 ODDS: Final = 14.0  # least difference of cost to the next place: odds of a thousand
 SIGHTINGS: Final = 3  # least number of detections of a cone
@@ -59,11 +59,15 @@ NEWEST_LAP: Final = 60.0  # length of the newest path that crosses the start, if
 TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
 SAME_ROAD: Final = 2.5  # largest distance of both passes across their road, by the cones (m)
 SAME_HEADING: Final = 0.5  # largest angle between both passes, by the cones (rad)
-LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES), UNSEEN, FAILED)
+LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES))
 
 
 Cones = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
+Places = tuple[Array, Array, Array, Array, Array]
+"""Poses (m, 3), map frame, the information (m, 3, 3) about each from the cones that lie on others, the sum (m,)
+of the capped squares of the cones in view, their number (m,), and the square of the pose's difference from the
+mean (m,)."""
 NO_CONES: Final[Cones] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
 EVERYWHERE: Final[Array] = np.array([[0.0, 0.0, 0.0, inf, inf]])
 """The view of a constellation that lacks no cone."""
@@ -133,10 +137,24 @@ def lay(
     """
     if min(len(seen.labels), len(known.labels)) < MIN_CONES:
         return None
-    pose, about, (misfit, count, odds) = _laid(
-        seen.cones, known.cones, known.views, mean, information, reach, LIMITS
-    )
-    return Laid(pose, about, int(count), misfit, odds) if count else None
+    places = _laid(seen.cones, known.cones, known.views, mean, information, reach, LIMITS)
+    return _best(*places, len(seen.labels))
+
+
+def _best(poses: Array, informations: Array, squares: Array, counts: Array, away: Array, total: int) -> Laid:
+    """Return the best of the places of `_laid`, for a total number of cones."""
+    misfit = squares / np.maximum(counts, 1.0)
+    enough = np.where(counts >= MIN_CONES, misfit, inf)
+    unseen = min(float(enough[_apart(poses, int(enough.argmin()))].min(initial=inf)), UNSEEN)
+    costs = squares + unseen * (total - counts) + np.minimum(away, FAILED)
+    best = int(costs.argmin())
+    others = np.append(costs[_apart(poses, best)], FAILED + unseen * total)
+    return Laid(poses[best], informations[best], int(counts[best]), float(misfit[best]), float(others.min() - costs[best]))
+
+
+def _apart(poses: Array, place: int) -> BoolArray:
+    """Return which of the poses (m, 3) are other places than one of them."""
+    return np.asarray(np.hypot(*(poses[:, :2] - poses[place, :2]).T) > APART)
 
 
 @compiled
@@ -148,8 +166,8 @@ def _laid(
     prior: Array,
     reach: tuple[float, float],
     limits: tuple[float, ...],
-) -> tuple[Array, Array, tuple[float, float, float]]:
-    """Return the pose (3,) of `lay`, the information (3, 3) about it, and its misfit, count and odds."""
+) -> Places:
+    """Return the places where seen cones may lie, as `lay` compares them."""
     apart, places = limits[4], int(limits[5])
     tried, found = list[Array](), []
     for start in _starts(seen, known, mean, reach, limits):
@@ -160,11 +178,8 @@ def _laid(
         found.append(_refined(seen, known, views, start, mean, prior, limits))
         if len(tried) == 3 * places:
             break
-    if not found:
-        return mean, np.zeros((3, 3)), (inf, 0.0, 0.0)
-    cost, pose, information, misfit, count = min(found, key=lambda one: one[0])
-    others = [one[0] for one in found if np.hypot(*(one[1] - pose)[:2]) > apart]
-    return pose, information, (misfit, count, min(others, default=inf) - cost)
+    poses, information, squares, counts, away = (np.array(column) for column in zip(*found, strict=True))
+    return poses, information, squares, counts, away
 
 
 def _starts(
@@ -204,9 +219,9 @@ def _refined(
     mean: Array,
     prior: Array,
     limits: tuple[float, ...],
-) -> tuple[float, Array, Array, float, float]:
-    """Return the cost after Gauss-Newton steps, the pose (3,), its information (3, 3), its misfit and count."""
-    (sigma, gate), (unseen, failed), pose = limits[:2], limits[6:], start
+) -> tuple[Array, Array, float, float, float]:
+    """Return a row of `Places` after Gauss-Newton steps from a pose (3,)."""
+    sigma, gate, pose = limits[0], limits[1], start
     for factor in (*GATES, None):
         turn, limit = rotation(pose[2]), gate * (factor or 1.0)
         arm = seen[0] @ turn.T
@@ -228,10 +243,9 @@ def _refined(
     away = pose - mean
     away[2] = wrap_angle(away[2])
     asked = on | _in_view(arm + pose[:2], views)
-    cost, count = np.minimum(square[asked], gate).sum(), asked.sum()
-    total = cost + unseen * (~asked).sum() + min(away @ prior @ away, failed)
     information = np.einsum("mia,mij,mjb->ab", by, weight, by)
-    return float(total), pose, information, float(cost / max(count, 1)), float(count)
+    square = np.minimum(square[asked], gate)
+    return pose, information, float(square.sum()), float(len(square)), float(away @ prior @ away)
 
 
 def _in_view(points: Array, views: Array) -> BoolArray:
@@ -272,7 +286,7 @@ class Expected:
     @classmethod
     def after(cls, length: float, covariance: Array, closing: ClosingSettings) -> Self:
         """Expect a pose with a covariance (3, 3) that has drifted for some length (m)."""
-        information = np.asarray(np.linalg.inv(closing.prior_scale**2 * covariance), np.float64)
+        information = np.asarray(np.linalg.inv(covariance), np.float64)
         return cls(closing.radius + closing.drift * length, TURNED, information)
 
 
