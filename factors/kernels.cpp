@@ -1335,27 +1335,36 @@ struct LayLimits {  // mapping.constellation:LIMITS
   explicit LayLimits(const py::tuple& limits)
       : sigma(limits[0].cast<double>()), gate(limits[1].cast<double>()), cell(limits[2].cast<double>()),
         turn(limits[3].cast<double>()), apart(limits[4].cast<double>()),
-        places(static_cast<Index>(limits[5].cast<double>())) {}
+        places(static_cast<Index>(limits[5].cast<double>())), gain(limits[6].cast<double>()),
+        failed(limits[7].cast<double>()) {}
   double sigma, gate, cell, turn, apart;
   Index places;
+  double gain, failed;
 };
+
+double square3(const double* off, const double* information) {
+  double sum = 0.0;
+  for (int a = 0; a < 3; ++a)
+    for (int b = 0; b < 3; ++b) sum += off[a] * information[3 * a + b] * off[b];
+  return sum;
+}
 
 struct LaidPose {
   double pose[3], information[9], square, count, away;
 };
 
 struct LayStart {
-  Index votes;
-  double pose[3];
+  double score, pose[3];
 };
 
-// The poses with most votes: each pair of cones votes for a cell and the eight around it.
+// The mean and the poses that may cost least: each pair of cones votes for a cell and the eight around it.
 std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known, const double* mean,
-                                 const double* reach, const LayLimits& limits) {
+                                 const double* prior, const double* reach, const LayLimits& limits) {
   const Index half = static_cast<Index>(std::ceil(reach[0] / limits.cell)) + 1, width = 2 * half + 1;
   const Index turns = static_cast<Index>(std::ceil(reach[1] / limits.turn));
-  std::vector<Index> votes(width * width), best;
-  std::vector<LayStart> starts;
+  std::vector<Index> votes(width * width);
+  std::vector<LayStart> starts, best;
+  const auto more = [](const LayStart& a, const LayStart& b) { return a.score > b.score; };
   for (Index turn = -turns; turn <= turns; ++turn) {
     const double heading = mean[2] + turn * limits.turn, c = std::cos(heading), s = std::sin(heading);
     std::fill(votes.begin(), votes.end(), 0);
@@ -1375,18 +1384,17 @@ std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known
       }
     }
     best.clear();
-    for (Index k = 0; k < width * width; ++k)
-      if (votes[k] > 0) best.push_back(k);
-    const auto more = [&](Index a, Index b) { return votes[a] != votes[b] ? votes[a] > votes[b] : a < b; };
-    const Index count = std::min(limits.places, static_cast<Index>(best.size()));
-    std::partial_sort(best.begin(), best.begin() + count, best.end(), more);
-    for (Index k = 0; k < count; ++k)
-      starts.push_back({votes[best[k]],
-                        {mean[0] + (best[k] / width - half) * limits.cell,
-                         mean[1] + (best[k] % width - half) * limits.cell, heading}});
+    for (Index k = 0; k < width * width; ++k) {
+      if (votes[k] == 0) continue;
+      const double off[3] = {(k / width - half) * limits.cell, (k % width - half) * limits.cell, turn * limits.turn};
+      const double score = limits.gain * votes[k] - std::min(square3(off, prior), limits.failed);
+      best.push_back({score, {mean[0] + off[0], mean[1] + off[1], mean[2] + off[2]}});
+    }
+    std::stable_sort(best.begin(), best.end(), more);
+    starts.insert(starts.end(), best.begin(), best.begin() + std::min<std::size_t>(best.size(), limits.places));
   }
-  std::stable_sort(starts.begin(), starts.end(), [](const LayStart& a, const LayStart& b) { return a.votes > b.votes; });
-  starts.insert(starts.begin(), {0, {mean[0], mean[1], mean[2]}});
+  std::stable_sort(starts.begin(), starts.end(), more);
+  starts.insert(starts.begin(), {0.0, {mean[0], mean[1], mean[2]}});
   return starts;
 }
 
@@ -1397,7 +1405,7 @@ bool lay_in_view(double x, double y, const Array& views) {
   const double* view = views.data();
   for (Index k = 0; k < views.shape(0); ++k, view += 5) {
     const double dx = x - view[0], dy = y - view[1];
-    if (!(std::hypot(dx, dy) < view[3])) continue;
+    if (!(dx * dx + dy * dy < view[3] * view[3])) continue;
     if (std::abs(std::remainder(std::atan2(dy, dx) - view[2], kTurn)) < view[4]) return true;
   }
   return false;
@@ -1460,8 +1468,7 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Arra
     double away[3];
     for (int k = 0; k < 3; ++k) away[k] = out.pose[k] - mean[k];
     away[2] = std::remainder(away[2], kTurn);
-    for (int a = 0; a < 3; ++a)
-      for (int b = 0; b < 3; ++b) out.away += away[a] * prior[3 * a + b] * away[b];
+    out.away = square3(away, prior);
   }
   return out;
 }
@@ -1474,7 +1481,7 @@ py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, co
   const double within[2] = {reach[0].cast<double>(), reach[1].cast<double>()};
   std::vector<LayStart> tried;
   std::vector<LaidPose> found;
-  for (const LayStart& start : lay_starts(seen, known, mean.data(), within, limits)) {
+  for (const LayStart& start : lay_starts(seen, known, mean.data(), prior.data(), within, limits)) {
     const bool is_near = std::any_of(tried.begin(), tried.end(), [&](const LayStart& other) {
       return std::hypot(start.pose[0] - other.pose[0], start.pose[1] - other.pose[1]) < limits.apart &&
              std::abs(start.pose[2] - other.pose[2]) < 1.5 * limits.turn;

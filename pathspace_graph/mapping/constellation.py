@@ -45,8 +45,8 @@ APART: Final = 1.0  # least distance of two different places (m)
 PLACES: Final = 10  # most places of each heading, and a third of the most that are refined
 RANGE: Final = 16.0  # farthest detections that are merged (m)
 VIEWED: Final = 0.95  # share of the detections within the range and the bearing of a view
-VIEWS: Final = 1.0  # step at which the views along a path are looked at (m)
-NEWEST: Final = 40.0  # newest path whose cones are laid on earlier ones (m)
+VIEWS: Final = 2.0  # step at which the views along a path are looked at (m)
+NEWEST: Final = 30.0  # newest path whose cones are laid on earlier ones (m)
 BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
 MIN_CONES: Final = 6  # least number of cones in view that tell a place
 MISFIT: Final = 2.0  # most mean capped square of these: that of cones that agree, in two dimensions
@@ -59,7 +59,7 @@ NEWEST_LAP: Final = 60.0  # length of the newest path that crosses the start, if
 TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
 SAME_ROAD: Final = 2.5  # largest distance of both passes across their road, by the cones (m)
 SAME_HEADING: Final = 0.5  # largest angle between both passes, by the cones (rad)
-LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES))
+LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES), UNSEEN, FAILED)
 
 
 Cones = tuple[Array, Array, IntArray]
@@ -170,7 +170,7 @@ def _laid(
     """Return the places where seen cones may lie, as `lay` compares them."""
     apart, places = limits[4], int(limits[5])
     tried, found = list[Array](), []
-    for start in _starts(seen, known, mean, reach, limits):
+    for start in _starts(seen, known, mean, prior, reach, limits):
         off = [(np.hypot(*(start - other)[:2]), abs(start[2] - other[2])) for other in tried]
         if any(distance < apart and turn < 1.5 * limits[3] for distance, turn in off):
             continue
@@ -183,13 +183,13 @@ def _laid(
 
 
 def _starts(
-    seen: Cones, known: Cones, mean: Array, reach: tuple[float, float], limits: tuple[float, ...]
+    seen: Cones, known: Cones, mean: Array, prior: Array, reach: tuple[float, float], limits: tuple[float, ...]
 ) -> list[Array]:
-    """Return poses (3,): the mean, since few cones may have been met again, and those with most votes.
+    """Return poses (3,): the mean, as few cones may have been met again, and those that may cost least.
 
-    Each pair of cones votes for a cell and the eight around it.
+    Each pair of cones votes for a cell and the eight around it, against the distance from the mean.
     """
-    size, step, places = limits[2], limits[3], limits[5]
+    size, step, places, gain, failed = limits[2], limits[3], int(limits[5]), limits[6], limits[7]
     i, j = np.nonzero(seen[2][:, None] == known[2])
     half, turns, starts = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step)), []
     for turn in range(-turns, turns + 1):
@@ -203,11 +203,11 @@ def _starts(
         for a in (-1, 0, 1):
             for b in (-1, 0, 1):
                 np.add.at(votes, (cell[:, 0] + a, cell[:, 1] + b), 1)
-        best = np.argsort(-votes, axis=None, kind="stable")[: int(places)]
-        for number in best[votes.ravel()[best] > 0].tolist():
-            a, b = divmod(number, 2 * half + 1)
-            place = mean[0] + (a - half) * size, mean[1] + (b - half) * size
-            starts.append((votes[a, b], np.array([*place, heading])))
+        a, b = np.nonzero(votes)
+        off = np.column_stack([(a - half) * size, (b - half) * size, np.full(len(a), turn * step)])
+        score = gain * votes[a, b] - np.minimum(np.einsum("ka,ab,kb->k", off, prior, off), failed)
+        best = np.argsort(-score, kind="stable")[:places]
+        starts += zip(score[best].tolist(), mean + off[best], strict=True)
     return [mean, *(start for _, start in sorted(starts, key=lambda one: -one[0]))]
 
 
