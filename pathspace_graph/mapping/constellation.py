@@ -1,9 +1,11 @@
 """Constellations: the newest cones, merged and without identity, laid on earlier ones.
 
 All pairs of a new and an earlier cone of one label vote for the motion that lays one on the other. The places
-with most votes are refined on a sum of capped squares. The place that costs least is sure if nearly all cones
-lie on earlier ones and the next place costs much more: cones stand at regular distances, so a few of them fit
-in many places. A sure place is a relative pose of two cycles, the measurement of every return.
+with most votes near the one that odometry claims are refined on a sum of capped squares. The place that costs
+least is sure if nearly all cones that the earlier path would have seen lie on its cones, and no other place
+costs nearly as little. Cones stand at regular distances, so a few of them fit in many places: the others are
+those, the claimed one, where the vehicle may not be back yet, and new road after odometry has failed. A sure
+place is a relative pose of two cycles, the measurement of every return.
 """
 
 from collections.abc import Callable
@@ -50,7 +52,7 @@ NEWEST: Final = 30.0  # newest path whose cones are laid on earlier ones (m)
 BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
 MIN_CONES: Final = 6  # least number of cones in view that tell a place
 MISFIT: Final = 2.0  # most mean capped square of these: that of cones that agree, in two dimensions
-UNSEEN: Final = 2.0  # cost of a cone where nothing was in view, which speaks neither for nor against a place
+UNSEEN: Final = 2.0  # most cost of a cone where nothing was in view: what one that agrees costs on average
 FAILED: Final = 20.0  # cost of odometry that has failed: twice the logarithm of the odds against it
 ODDS: Final = 14.0  # least difference of cost to the next place: odds of a thousand
 SIGHTINGS: Final = 3  # least number of detections of a cone
@@ -65,9 +67,8 @@ LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES), UNSEEN, FAILED)
 Cones = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
 Places = tuple[Array, Array, Array, Array, Array]
-"""Poses (m, 3), map frame, the information (m, 3, 3) about each from the cones that lie on others, the sum (m,)
-of the capped squares of the cones in view, their number (m,), and the square of the pose's difference from the
-mean (m,)."""
+"""Poses (m, 3), the information (m, 3, 3) about each from the cones that lie on others, the sum (m,) of the
+capped squares of the cones in view, their number (m,), and the square (m,) of the way from the mean."""
 NO_CONES: Final[Cones] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
 EVERYWHERE: Final[Array] = np.array([[0.0, 0.0, 0.0, inf, inf]])
 """The view of a constellation that lacks no cone."""
@@ -81,7 +82,7 @@ class Constellation:
     covariances: Array  # (n, 2, 2) in m^2
     labels: IntArray  # (n,)
     views: Array = field(default_factory=EVERYWHERE.copy)
-    """(k, 5) poses that have looked for cones, and the range and the largest bearing of their view (m, rad)."""
+    """(k, 5) poses that have looked for cones, with the range (m) and the largest bearing (rad) of a view."""
 
     @classmethod
     def of(cls, table: DetectionColumns, poses: Array, settings: GrowthSettings) -> Self:
@@ -98,8 +99,8 @@ class Constellation:
             seen = counts >= SIGHTINGS
             covariance = np.asarray(np.linalg.inv(information[seen]), np.float64)
             found.append((places[seen], covariance, np.full(len(covariance), label)))
-        cones = (np.concatenate(column) for column in zip(*found, strict=True))
-        return cls(*cones, _views(poses[np.unique(table.cycle)], point[rows]))
+        places, covariances, labels = (np.concatenate(column) for column in zip(*found, strict=True))
+        return cls(places, covariances, labels, _views(poses[np.unique(table.cycle)], point[rows]))
 
     @property
     def cones(self) -> Cones:
@@ -119,7 +120,7 @@ class Laid:
     information: Array  # (3, 3) about it, from the cones that lie on others
     count: int  # number of cones where an earlier one would have been seen
     misfit: float  # mean capped square of these
-    odds: float  # cost of the next place less that of this one; infinite if there is none
+    odds: float  # cost of the next place less that of this one
 
     @property
     def is_sure(self) -> bool:
@@ -142,17 +143,23 @@ def lay(
 
 
 def _best(poses: Array, informations: Array, squares: Array, counts: Array, away: Array, total: int) -> Laid:
-    """Return the best of the places of `_laid`, for a total number of cones."""
+    """Return the best of the places of `_laid`, for a total number of cones.
+
+    A cone where nothing was in view costs as much as one in the next best place of those where enough were in
+    view: rows at regular distances, which fit in many places, say little.
+    """
     misfit = squares / np.maximum(counts, 1.0)
     enough = np.where(counts >= MIN_CONES, misfit, inf)
-    unseen = min(float(enough[_apart(poses, int(enough.argmin()))].min(initial=inf)), UNSEEN)
+    others = enough[_are_apart(poses, int(enough.argmin()))]
+    unseen = min(float(others.min(initial=inf)), UNSEEN)
     costs = squares + unseen * (total - counts) + np.minimum(away, FAILED)
     best = int(costs.argmin())
-    others = np.append(costs[_apart(poses, best)], FAILED + unseen * total)
-    return Laid(poses[best], informations[best], int(counts[best]), float(misfit[best]), float(others.min() - costs[best]))
+    new_road = FAILED + unseen * total
+    odds = costs[_are_apart(poses, best)].min(initial=new_road) - costs[best]
+    return Laid(poses[best], informations[best], int(counts[best]), float(misfit[best]), float(odds))
 
 
-def _apart(poses: Array, place: int) -> BoolArray:
+def _are_apart(poses: Array, place: int) -> BoolArray:
     """Return which of the poses (m, 3) are other places than one of them."""
     return np.asarray(np.hypot(*(poses[:, :2] - poses[place, :2]).T) > APART)
 
@@ -183,7 +190,12 @@ def _laid(
 
 
 def _starts(
-    seen: Cones, known: Cones, mean: Array, prior: Array, reach: tuple[float, float], limits: tuple[float, ...]
+    seen: Cones,
+    known: Cones,
+    mean: Array,
+    prior: Array,
+    reach: tuple[float, float],
+    limits: tuple[float, ...],
 ) -> list[Array]:
     """Return poses (3,): the mean, as few cones may have been met again, and those that may cost least.
 
@@ -191,7 +203,8 @@ def _starts(
     """
     size, step, places, gain, failed = limits[2], limits[3], int(limits[5]), limits[6], limits[7]
     i, j = np.nonzero(seen[2][:, None] == known[2])
-    half, turns, starts = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step)), []
+    half, turns = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step))
+    starts = list[tuple[float, Array]]()
     for turn in range(-turns, turns + 1):
         heading = mean[2] + turn * step
         c, s = np.cos(heading), np.sin(heading)
@@ -203,9 +216,11 @@ def _starts(
         for a in (-1, 0, 1):
             for b in (-1, 0, 1):
                 np.add.at(votes, (cell[:, 0] + a, cell[:, 1] + b), 1)
-        a, b = np.nonzero(votes)
-        off = np.column_stack([(a - half) * size, (b - half) * size, np.full(len(a), turn * step)])
-        score = gain * votes[a, b] - np.minimum(np.einsum("ka,ab,kb->k", off, prior, off), failed)
+        at = np.argwhere(votes)
+        off = np.column_stack([(at - half) * size, np.full(len(at), turn * step)])
+        score = gain * votes[at[:, 0], at[:, 1]] - np.minimum(
+            np.einsum("ka,ab,kb->k", off, prior, off), failed
+        )
         best = np.argsort(-score, kind="stable")[:places]
         starts += zip(score[best].tolist(), mean + off[best], strict=True)
     return [mean, *(start for _, start in sorted(starts, key=lambda one: -one[0]))]
@@ -252,11 +267,12 @@ def _in_view(points: Array, views: Array) -> BoolArray:
     """Return which of the points (m, 2) one of the views (k, 5) has within its range and bearing."""
     off = points[:, None] - views[:, :2]
     bearing = np.abs(wrap_angle(np.arctan2(off[:, :, 1], off[:, :, 0]) - views[:, 2]))
-    return ((np.hypot(off[:, :, 0], off[:, :, 1]) < views[:, 3]) & (bearing < views[:, 4])).any(axis=1)
+    in_view = (np.hypot(off[:, :, 0], off[:, :, 1]) < views[:, 3]) & (bearing < views[:, 4])
+    return np.asarray(in_view.any(axis=1))
 
 
 def _views(poses: Array, points: Array) -> Array:
-    """Return views (k, 5) from poses (P, 3), `VIEWS` apart, with the limits of what they saw at points (m, 2)."""
+    """Return views (k, 5) from poses (P, 3), `VIEWS` apart, with the limits of the detections (m, 2)."""
     if len(points) == 0:
         return np.zeros((0, 5))
     far, wide = np.quantile(np.abs([np.hypot(*points.T), np.arctan2(*points.T[::-1])]), VIEWED, axis=1)
@@ -341,7 +357,7 @@ def find_return(
 def lay_newest(
     seen_in: SeenIn, poses: Array, place: int, expected: Expected, settings: GrowthSettings
 ) -> Laid | None:
-    """Lay the cones of the newest metres on those about an earlier place, by the poses (P, 3) of all cycles."""
+    """Lay the cones of the newest metres on those about an earlier place, by the poses (P, 3) of all."""
     stations = path_lengths(poses)
     first = int(stations.searchsorted(stations[-1] - NEWEST, side="right"))
     old = np.flatnonzero(np.abs(stations[:first] - stations[place]) < NEWEST + BEYOND)
