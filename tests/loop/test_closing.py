@@ -51,7 +51,7 @@ def run(log: Log) -> tuple[FixedLagMapper, list[CycleResult]]:
 
 @pytest.fixture(scope="module")
 def snapshot(log: Log, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The mapper a cycle before its curves are met again, as a file; the cones of the beginning don't count."""
+    """The mapper a cycle before its curves are met again, as a file; cones don't count."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pathspace_graph.loop.drive_record.return_to_beginning", lambda *_: None)
         mapper, results = map_log(log)
