@@ -21,6 +21,7 @@ using Shape = std::vector<Index>;
 namespace {
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
+constexpr double kTurn = 6.283185307179586;
 constexpr Index kOwn = -2;  // a detection that is the first one of a new cone
 
 double clipped(double v, double low, double high) { return std::min(std::max(v, low), high); }
@@ -1373,27 +1374,36 @@ struct LayLimits {  // mapping.constellation:LIMITS
   explicit LayLimits(const py::tuple& limits)
       : sigma(limits[0].cast<double>()), gate(limits[1].cast<double>()), cell(limits[2].cast<double>()),
         turn(limits[3].cast<double>()), apart(limits[4].cast<double>()),
-        places(static_cast<Index>(limits[5].cast<double>())) {}
+        places(static_cast<Index>(limits[5].cast<double>())), gain(limits[6].cast<double>()),
+        failed(limits[7].cast<double>()) {}
   double sigma, gate, cell, turn, apart;
   Index places;
+  double gain, failed;
 };
 
+double square3(const double* off, const double* information) {
+  double sum = 0.0;
+  for (int a = 0; a < 3; ++a)
+    for (int b = 0; b < 3; ++b) sum += off[a] * information[3 * a + b] * off[b];
+  return sum;
+}
+
 struct LaidPose {
-  double pose[3], information[9], cost, share;
+  double pose[3], information[9], square, count, away;
 };
 
 struct LayStart {
-  Index votes;
-  double pose[3];
+  double score, pose[3];
 };
 
-// The poses with most votes: each pair of cones votes for a cell and the eight around it.
+// The mean and the poses that may cost least: each pair of cones votes for a cell and the eight around it.
 std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known, const double* mean,
-                                 const double* reach, const LayLimits& limits) {
+                                 const double* prior, const double* reach, const LayLimits& limits) {
   const Index half = static_cast<Index>(std::ceil(reach[0] / limits.cell)) + 1, width = 2 * half + 1;
   const Index turns = static_cast<Index>(std::ceil(reach[1] / limits.turn));
-  std::vector<Index> votes(width * width), best;
-  std::vector<LayStart> starts;
+  std::vector<Index> votes(width * width);
+  std::vector<LayStart> starts, best;
+  const auto more = [](const LayStart& a, const LayStart& b) { return a.score > b.score; };
   for (Index turn = -turns; turn <= turns; ++turn) {
     const double heading = mean[2] + turn * limits.turn, c = std::cos(heading), s = std::sin(heading);
     std::fill(votes.begin(), votes.end(), 0);
@@ -1413,33 +1423,43 @@ std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known
       }
     }
     best.clear();
-    for (Index k = 0; k < width * width; ++k)
-      if (votes[k] > 0) best.push_back(k);
-    const auto more = [&](Index a, Index b) { return votes[a] != votes[b] ? votes[a] > votes[b] : a < b; };
-    const Index count = std::min(limits.places, static_cast<Index>(best.size()));
-    std::partial_sort(best.begin(), best.begin() + count, best.end(), more);
-    for (Index k = 0; k < count; ++k)
-      starts.push_back({votes[best[k]],
-                        {mean[0] + (best[k] / width - half) * limits.cell,
-                         mean[1] + (best[k] % width - half) * limits.cell, heading}});
+    for (Index k = 0; k < width * width; ++k) {
+      if (votes[k] == 0) continue;
+      const double off[3] = {(k / width - half) * limits.cell, (k % width - half) * limits.cell, turn * limits.turn};
+      const double score = limits.gain * votes[k] - std::min(square3(off, prior), limits.failed);
+      best.push_back({score, {mean[0] + off[0], mean[1] + off[1], mean[2] + off[2]}});
+    }
+    std::stable_sort(best.begin(), best.end(), more);
+    starts.insert(starts.end(), best.begin(), best.begin() + std::min<std::size_t>(best.size(), limits.places));
   }
-  std::stable_sort(starts.begin(), starts.end(), [](const LayStart& a, const LayStart& b) { return a.votes > b.votes; });
+  std::stable_sort(starts.begin(), starts.end(), more);
+  starts.insert(starts.begin(), {0.0, {mean[0], mean[1], mean[2]}});
   return starts;
 }
 
 constexpr double kLayGates[] = {4.0, 4.0, 2.0, 1.0, 1.0, 1.0};
 constexpr double kLayRegular[] = {1e-2, 1e-2, 1.0};
 
+bool lay_in_view(double x, double y, const Array& views) {
+  const double* view = views.data();
+  for (Index k = 0; k < views.shape(0); ++k, view += 5) {
+    const double dx = x - view[0], dy = y - view[1];
+    if (!(dx * dx + dy * dy < view[3] * view[3])) continue;
+    if (std::abs(std::remainder(std::atan2(dy, dx) - view[2], kTurn)) < view[4]) return true;
+  }
+  return false;
+}
+
 // The pose after Gauss-Newton steps on the sum of capped squares, and what the cones say of it there.
-LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const double* start, const double* mean,
-                     const double* prior, const LayLimits& limits) {
-  LaidPose out;
+LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Array& views, const double* start,
+                     const double* mean, const double* prior, const LayLimits& limits) {
+  LaidPose out = {};
   std::copy_n(start, 3, out.pose);
   const double floor = limits.sigma * limits.sigma;
   for (int step = 0; step <= 6; ++step) {
     const double limit = limits.gate * (step < 6 ? kLayGates[step] : 1.0);
     const Turn turn(out.pose[2]);
-    double A[3][3] = {}, g[3] = {}, cost = 0.0, sharp = 0.0, on = 0.0;
+    double A[3][3] = {}, g[3] = {};
     for (Index i = 0; i < seen.n; ++i) {
       const double *p = seen.point.data() + 2 * i, *K = seen.covariance.data() + 4 * i;
       const double arm[2] = {turn.c * p[0] - turn.s * p[1], turn.s * p[0] + turn.c * p[1]};
@@ -1464,10 +1484,9 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const doub
           std::copy_n(inverse, 4, weight);
         }
       }
-      const double own = 1.0 / (floor + 0.5 * (K[0] + K[3]));
-      sharp += own, cost += std::min(least, limits.gate);
+      if (step == 6 && (least < limit || lay_in_view(arm[0] + out.pose[0], arm[1] + out.pose[1], views)))
+        ++out.count, out.square += std::min(least, limits.gate);
       if (!(least < limit)) continue;
-      on += own;
       const double share = 1.0 - least / limit, w = step < 6 ? share * share : 1.0;
       const double by[2][3] = {{1.0, 0.0, -arm[1]}, {0.0, 1.0, arm[0]}};
       for (int a = 0; a < 3; ++a)
@@ -1485,47 +1504,42 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const doub
       continue;
     }
     std::copy_n(&A[0][0], 9, out.information);
-    const double pi = std::acos(-1.0);
-    double away[3], square = 0.0;
+    double away[3];
     for (int k = 0; k < 3; ++k) away[k] = out.pose[k] - mean[k];
-    away[2] = std::remainder(away[2], 2.0 * pi);
-    for (int a = 0; a < 3; ++a)
-      for (int b = 0; b < 3; ++b) square += away[a] * prior[3 * a + b] * away[b];
-    out.cost = cost + std::min(square, limits.gate);
-    out.share = on / sharp;
+    away[2] = std::remainder(away[2], kTurn);
+    out.away = square3(away, prior);
   }
   return out;
 }
 
-py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, const Array& mean, const Array& prior,
-               const py::tuple& reach, const py::tuple& tuple) {
+py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, const Array& views, const Array& mean,
+               const Array& prior, const py::tuple& reach, const py::tuple& tuple) {
   const ConePoints seen(seen_columns), known(known_columns);
   const LayLimits limits(tuple);
-  expect(mean.size() == 3 && prior.size() == 9);
+  expect(mean.size() == 3 && prior.size() == 9 && views.size() == 5 * views.shape(0));
   const double within[2] = {reach[0].cast<double>(), reach[1].cast<double>()};
   std::vector<LayStart> tried;
   std::vector<LaidPose> found;
-  for (const LayStart& start : lay_starts(seen, known, mean.data(), within, limits)) {
+  for (const LayStart& start : lay_starts(seen, known, mean.data(), prior.data(), within, limits)) {
     const bool is_near = std::any_of(tried.begin(), tried.end(), [&](const LayStart& other) {
       return std::hypot(start.pose[0] - other.pose[0], start.pose[1] - other.pose[1]) < limits.apart &&
              std::abs(start.pose[2] - other.pose[2]) < 1.5 * limits.turn;
     });
     if (is_near) continue;
     tried.push_back(start);
-    found.push_back(lay_refined(seen, known, start.pose, mean.data(), prior.data(), limits));
+    found.push_back(lay_refined(seen, known, views, start.pose, mean.data(), prior.data(), limits));
     if (static_cast<Index>(tried.size()) == 3 * limits.places) break;
   }
-  if (found.empty())
-    return py::make_tuple(mean, Array(Shape{3, 3}, std::vector<double>(9, 0.0).data()),
-                          py::make_tuple(kInfinity, 0.0, 0.0));
-  const LaidPose& best = *std::min_element(found.begin(), found.end(),
-                                           [](const LaidPose& a, const LaidPose& b) { return a.cost < b.cost; });
-  double next = kInfinity;
-  for (const LaidPose& one : found)
-    if (std::hypot(one.pose[0] - best.pose[0], one.pose[1] - best.pose[1]) > limits.apart)
-      next = std::min(next, one.cost);
-  return py::make_tuple(Array(Shape{3}, best.pose), Array(Shape{3, 3}, best.information),
-                        py::make_tuple(best.cost, best.share, next - best.cost));
+  const Index m = static_cast<Index>(found.size());
+  Array poses({m, Index{3}}), information({m, Index{3}, Index{3}}), squares(m), counts(m), away(m);
+  for (Index k = 0; k < m; ++k) {
+    std::copy_n(found[k].pose, 3, poses.mutable_data() + 3 * k);
+    std::copy_n(found[k].information, 9, information.mutable_data() + 9 * k);
+    squares.mutable_data()[k] = found[k].square;
+    counts.mutable_data()[k] = found[k].count;
+    away.mutable_data()[k] = found[k].away;
+  }
+  return py::make_tuple(poses, information, squares, counts, away);
 }
 
 // --- odometry and path ------------------------------------------------------------------------------------

@@ -199,7 +199,7 @@ def _return_again(seen_in: SeenIn, poses: Array, lap: float, settings: MapperSet
     """Return the newest of poses (P, 3) in the frame of one a lap (m) before, once laps are aligned."""
     last = float(path_lengths(poses)[-1]) - LAP_SHARE * lap
     found = find_return(seen_in, poses, last, NEARBY, settings.growth)
-    if found is None or not found[0].is_likely:
+    if found is None or not found[0].is_sure:
         return None
     return revisit_of(found[0], poses, found[1], len(poses) - 1)
 

@@ -95,7 +95,7 @@ class Revisits:
         smoother = self._smoother
         seen_in = self._record.seen_in(smoother.variables.sensor)
         laid = lay_newest(seen_in, poses, place, NEARBY, smoother.map.settings.growth)
-        if laid is None or not laid.is_likely:
+        if laid is None or not laid.is_sure:
             return None
         keyframes = np.array(smoother.keyframe_cycles)
         return revisit_of(

@@ -1,19 +1,21 @@
 """Constellations: the newest cones, merged and without identity, laid on earlier ones.
 
 All pairs of a new and an earlier cone of one label vote for the motion that lays one on the other. The places
-with most votes are refined on a sum of capped squares. The place that costs least is sure if nearly all cones
-lie on earlier ones and the next place costs much more: cones stand at regular distances, so a few of them fit
-in many places. A sure place is a relative pose of two cycles, the measurement of every return.
+with most votes near the one that odometry claims are refined on a sum of capped squares. The place that costs
+least is sure if nearly all cones that the earlier path would have seen lie on its cones, and no other place
+costs nearly as little. Cones stand at regular distances, so a few of them fit in many places: the others are
+those, the claimed one, where the vehicle may not be back yet, and new road after odometry has failed. A sure
+place is a relative pose of two cycles, the measurement of every return.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from typing import Final, Self
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import (
     compose,
@@ -44,25 +46,32 @@ TURN: Final = 0.05  # step of the headings that are tried (rad)
 APART: Final = 1.0  # least distance of two different places (m)
 PLACES: Final = 10  # most places of each heading, and a third of the most that are refined
 RANGE: Final = 16.0  # farthest detections that are merged (m)
-NEWEST: Final = (10.0, 40.0)  # least and most of the newest path whose cones are laid on earlier ones (m)
+VIEWED: Final = 0.95  # share of the detections within the range and the bearing of a view
+VIEWS: Final = 2.0  # step at which the views along a path are looked at (m)
+NEWEST: Final = 30.0  # newest path whose cones are laid on earlier ones (m)
 BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
-MIN_CONES: Final = 6  # least number of cones that tell a place
-MIN_SHARE: Final = 0.8  # least share of the cones that lie on earlier ones, by their information
-MISFIT: Final = 2.0  # most mean capped square of the cones: that of cones that agree, in two dimensions
-ODDS: Final = 20.0  # least difference of cost to the next place: twice the logarithm of the odds
-ODDS_NEARBY: Final = 6.0  # the same where the place is known to a metre
+MIN_CONES: Final = 6  # least number of cones in view that tell a place
+MISFIT: Final = 2.0  # most mean capped square of these: that of cones that agree, in two dimensions
+UNSEEN: Final = 2.0  # most cost of a cone where nothing was in view: what one that agrees costs on average
+FAILED: Final = 20.0  # cost of odometry that has failed: twice the logarithm of the odds against it
+ODDS: Final = 14.0  # least difference of cost to the next place: odds of a thousand
 SIGHTINGS: Final = 3  # least number of detections of a cone
 BEGINNING: Final = 40.0  # length of the beginning of a drive that closes a lap (m)
 NEWEST_LAP: Final = 60.0  # length of the newest path that crosses the start, if a lap is closed (m)
 TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
 SAME_ROAD: Final = 2.5  # largest distance of both passes across their road, by the cones (m)
 SAME_HEADING: Final = 0.5  # largest angle between both passes, by the cones (rad)
-LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES))
+LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES), UNSEEN, FAILED)
 
 
 Cones = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
+Places = tuple[Array, Array, Array, Array, Array]
+"""Poses (m, 3), the information (m, 3, 3) about each from the cones that lie on others, the sum (m,) of the
+capped squares of the cones in view, their number (m,), and the square (m,) of the way from the mean."""
 NO_CONES: Final[Cones] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
+EVERYWHERE: Final[Array] = np.array([[0.0, 0.0, 0.0, inf, inf]])
+"""The view of a constellation that lacks no cone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +81,8 @@ class Constellation:
     points: Array  # (n, 2) in m
     covariances: Array  # (n, 2, 2) in m^2
     labels: IntArray  # (n,)
+    views: Array = field(default_factory=EVERYWHERE.copy)
+    """(k, 5) poses that have looked for cones, with the range (m) and the largest bearing (rad) of a view."""
 
     @classmethod
     def of(cls, table: DetectionColumns, poses: Array, settings: GrowthSettings) -> Self:
@@ -88,7 +99,8 @@ class Constellation:
             seen = counts >= SIGHTINGS
             covariance = np.asarray(np.linalg.inv(information[seen]), np.float64)
             found.append((places[seen], covariance, np.full(len(covariance), label)))
-        return cls(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        places, covariances, labels = (np.concatenate(column) for column in zip(*found, strict=True))
+        return cls(places, covariances, labels, _views(poses[np.unique(table.cycle)], point[rows]))
 
     @property
     def cones(self) -> Cones:
@@ -106,26 +118,14 @@ class Laid:
 
     pose: Array  # (3,) map frame
     information: Array  # (3, 3) about it, from the cones that lie on others
-    cost: float  # sum of the capped squares of the cones and of the prior
-    count: int  # number of cones
-    share: float  # share of the cones that lie on others, by their information
-    odds: float  # cost of the next place less that of this one; infinite if there is none
-    away: float  # square of the pose's distance from where it was expected (sigmas^2)
+    count: int  # number of cones where an earlier one would have been seen
+    misfit: float  # mean capped square of these
+    odds: float  # cost of the next place less that of this one
 
     @property
     def is_sure(self) -> bool:
-        """Whether nearly all cones agree, and no other place is nearly as good."""
-        return self.agrees and self.odds >= ODDS
-
-    @property
-    def is_likely(self) -> bool:
-        """Whether nearly all cones agree about where they were expected, and no other place is as good."""
-        return self.agrees and self.odds >= ODDS_NEARBY and self.away < GATE
-
-    @property
-    def agrees(self) -> bool:
-        """Whether nearly all of enough cones lie on earlier ones."""
-        return self.count >= MIN_CONES and self.share >= MIN_SHARE and self.cost <= MISFIT * self.count
+        """Whether nearly all of enough cones lie on earlier ones, and no other place is nearly as good."""
+        return self.count >= MIN_CONES and self.misfit <= MISFIT and self.odds >= ODDS
 
 
 def lay(
@@ -134,52 +134,77 @@ def lay(
     """Lay cones on known ones, in the frames of a vehicle and of the map; None where they are too few.
 
     The pose is searched within a `reach` (m, rad) of its `mean` (3,). The square of the difference from the
-    mean, by its `information` (3, 3), is capped as well, since odometry may have failed.
+    mean, by its `information` (3, 3), counts up to `FAILED`.
     """
     if min(len(seen.labels), len(known.labels)) < MIN_CONES:
         return None
-    pose, about, (cost, share, odds) = _laid(seen.cones, known.cones, mean, information, reach, LIMITS)
-    if not np.isfinite(cost):
-        return None
-    off = pose - mean
-    off[2] = wrap_angle(off[2:])[0]
-    return Laid(pose, about, cost, len(seen.labels), share, odds, float(off @ information @ off))
+    places = _laid(seen.cones, known.cones, known.views, mean, information, reach, LIMITS)
+    return _best(*places, len(seen.labels))
+
+
+def _best(poses: Array, informations: Array, squares: Array, counts: Array, away: Array, total: int) -> Laid:
+    """Return the best of the places of `_laid`, for a total number of cones.
+
+    A cone where nothing was in view costs as much as one in the next best place of those where enough were in
+    view: rows at regular distances, which fit in many places, say little.
+    """
+    misfit = squares / np.maximum(counts, 1.0)
+    enough = np.where(counts >= MIN_CONES, misfit, inf)
+    others = enough[_are_apart(poses, int(enough.argmin()))]
+    unseen = min(float(others.min(initial=inf)), UNSEEN)
+    costs = squares + unseen * (total - counts) + np.minimum(away, FAILED)
+    best = int(costs.argmin())
+    new_road = FAILED + unseen * total
+    odds = costs[_are_apart(poses, best)].min(initial=new_road) - costs[best]
+    return Laid(poses[best], informations[best], int(counts[best]), float(misfit[best]), float(odds))
+
+
+def _are_apart(poses: Array, place: int) -> BoolArray:
+    """Return which of the poses (m, 3) are other places than one of them."""
+    return np.asarray(np.hypot(*(poses[:, :2] - poses[place, :2]).T) > APART)
 
 
 @compiled
 def _laid(
     seen: Cones,
     known: Cones,
+    views: Array,
     mean: Array,
     prior: Array,
     reach: tuple[float, float],
     limits: tuple[float, ...],
-) -> tuple[Array, Array, tuple[float, float, float]]:
-    """Return the pose (3,) of `lay`, the information (3, 3) about it, and its cost, share and odds."""
+) -> Places:
+    """Return the places where seen cones may lie, as `lay` compares them."""
     apart, places = limits[4], int(limits[5])
     tried, found = list[Array](), []
-    for start in _starts(seen, known, mean, reach, limits):
+    for start in _starts(seen, known, mean, prior, reach, limits):
         off = [(np.hypot(*(start - other)[:2]), abs(start[2] - other[2])) for other in tried]
         if any(distance < apart and turn < 1.5 * limits[3] for distance, turn in off):
             continue
         tried.append(start)
-        found.append(_refined(seen, known, start, mean, prior, limits))
+        found.append(_refined(seen, known, views, start, mean, prior, limits))
         if len(tried) == 3 * places:
             break
-    if not found:
-        return mean, np.zeros((3, 3)), (inf, 0.0, 0.0)
-    pose, information, cost, share = min(found, key=lambda one: one[2])
-    others = [one[2] for one in found if np.hypot(*(one[0] - pose)[:2]) > apart]
-    return pose, information, (cost, share, min(others, default=inf) - cost)
+    poses, information, squares, counts, away = (np.array(column) for column in zip(*found, strict=True))
+    return poses, information, squares, counts, away
 
 
 def _starts(
-    seen: Cones, known: Cones, mean: Array, reach: tuple[float, float], limits: tuple[float, ...]
+    seen: Cones,
+    known: Cones,
+    mean: Array,
+    prior: Array,
+    reach: tuple[float, float],
+    limits: tuple[float, ...],
 ) -> list[Array]:
-    """Return poses (3,), most votes first: each pair of cones votes for a cell and the eight around it."""
-    _, _, size, step, _, places = limits
+    """Return poses (3,): the mean, as few cones may have been met again, and those that may cost least.
+
+    Each pair of cones votes for a cell and the eight around it, against the distance from the mean.
+    """
+    size, step, places, gain, failed = limits[2], limits[3], int(limits[5]), limits[6], limits[7]
     i, j = np.nonzero(seen[2][:, None] == known[2])
-    half, turns, starts = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step)), []
+    half, turns = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step))
+    starts = list[tuple[float, Array]]()
     for turn in range(-turns, turns + 1):
         heading = mean[2] + turn * step
         c, s = np.cos(heading), np.sin(heading)
@@ -191,18 +216,26 @@ def _starts(
         for a in (-1, 0, 1):
             for b in (-1, 0, 1):
                 np.add.at(votes, (cell[:, 0] + a, cell[:, 1] + b), 1)
-        best = np.argsort(-votes, axis=None, kind="stable")[: int(places)]
-        for number in best[votes.ravel()[best] > 0].tolist():
-            a, b = divmod(number, 2 * half + 1)
-            place = mean[0] + (a - half) * size, mean[1] + (b - half) * size
-            starts.append((votes[a, b], np.array([*place, heading])))
-    return [start for _, start in sorted(starts, key=lambda one: -one[0])]
+        at = np.argwhere(votes)
+        off = np.column_stack([(at - half) * size, np.full(len(at), turn * step)])
+        score = gain * votes[at[:, 0], at[:, 1]] - np.minimum(
+            np.einsum("ka,ab,kb->k", off, prior, off), failed
+        )
+        best = np.argsort(-score, kind="stable")[:places]
+        starts += zip(score[best].tolist(), mean + off[best], strict=True)
+    return [mean, *(start for _, start in sorted(starts, key=lambda one: -one[0]))]
 
 
 def _refined(
-    seen: Cones, known: Cones, start: Array, mean: Array, prior: Array, limits: tuple[float, ...]
-) -> tuple[Array, Array, float, float]:
-    """Return the pose (3,) after Gauss-Newton steps, its information (3, 3), its cost and its share."""
+    seen: Cones,
+    known: Cones,
+    views: Array,
+    start: Array,
+    mean: Array,
+    prior: Array,
+    limits: tuple[float, ...],
+) -> tuple[Array, Array, float, float, float]:
+    """Return a row of `Places` after Gauss-Newton steps from a pose (3,)."""
     sigma, gate, pose = limits[0], limits[1], start
     for factor in (*GATES, None):
         turn, limit = rotation(pose[2]), gate * (factor or 1.0)
@@ -224,10 +257,27 @@ def _refined(
         pose = pose - np.linalg.solve(hessian, np.einsum("mia,mij,mj->a", by, weight, off))
     away = pose - mean
     away[2] = wrap_angle(away[2])
-    cost = np.minimum(square, gate).sum() + min(away @ prior @ away, gate)
-    sharp = 1.0 / (sigma**2 + 0.5 * np.trace(seen[1], axis1=1, axis2=2))
+    asked = on | _in_view(arm + pose[:2], views)
     information = np.einsum("mia,mij,mjb->ab", by, weight, by)
-    return pose, information, float(cost), float(sharp[on].sum() / sharp.sum())
+    square = np.minimum(square[asked], gate)
+    return pose, information, float(square.sum()), float(len(square)), float(away @ prior @ away)
+
+
+def _in_view(points: Array, views: Array) -> BoolArray:
+    """Return which of the points (m, 2) one of the views (k, 5) has within its range and bearing."""
+    off = points[:, None] - views[:, :2]
+    bearing = np.abs(wrap_angle(np.arctan2(off[:, :, 1], off[:, :, 0]) - views[:, 2]))
+    in_view = (np.hypot(off[:, :, 0], off[:, :, 1]) < views[:, 3]) & (bearing < views[:, 4])
+    return np.asarray(in_view.any(axis=1))
+
+
+def _views(poses: Array, points: Array) -> Array:
+    """Return views (k, 5) from poses (P, 3), `VIEWS` apart, with the limits of the detections (m, 2)."""
+    if len(points) == 0:
+        return np.zeros((0, 5))
+    far, wide = np.quantile(np.abs([np.hypot(*points.T), np.arctan2(*points.T[::-1])]), VIEWED, axis=1)
+    _, first = np.unique(path_lengths(poses) // VIEWS, return_index=True)
+    return np.column_stack([poses[first], np.tile([far, wide], (len(first), 1))])
 
 
 # --- passes of a drive -----------------------------------------------------------------------------------
@@ -252,7 +302,7 @@ class Expected:
     @classmethod
     def after(cls, length: float, covariance: Array, closing: ClosingSettings) -> Self:
         """Expect a pose with a covariance (3, 3) that has drifted for some length (m)."""
-        information = np.asarray(np.linalg.inv(closing.prior_scale**2 * covariance), np.float64)
+        information = np.asarray(np.linalg.inv(covariance), np.float64)
         return cls(closing.radius + closing.drift * length, TURNED, information)
 
 
@@ -307,14 +357,10 @@ def find_return(
 def lay_newest(
     seen_in: SeenIn, poses: Array, place: int, expected: Expected, settings: GrowthSettings
 ) -> Laid | None:
-    """Lay the cones of the newest metres on those about an earlier place, by the poses (P, 3) of all cycles.
-
-    The newest metres are as many as may have been driven again since the first pose, within `NEWEST`.
-    """
+    """Lay the cones of the newest metres on those about an earlier place, by the poses (P, 3) of all."""
     stations = path_lengths(poses)
-    length = float(np.clip(stations[place], *NEWEST))
-    first = int(stations.searchsorted(stations[-1] - length, side="right"))
-    old = np.flatnonzero(np.abs(stations[:first] - stations[place]) < length + BEYOND)
+    first = int(stations.searchsorted(stations[-1] - NEWEST, side="right"))
+    old = np.flatnonzero(np.abs(stations[:first] - stations[place]) < NEWEST + BEYOND)
     known = Constellation.of(seen_in(old), poses, settings)
     seen = Constellation.of(seen_in(np.arange(first, len(poses))), poses, settings).seen_from(poses[-1])
     return lay(seen, known, poses[-1], expected.information, (expected.radius, expected.turn))
