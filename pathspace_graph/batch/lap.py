@@ -82,9 +82,9 @@ class LapMarginal:
     information: Array  # (n, n) its information, the inverse of its covariance
     scatter: dict[int, Array]  # sigma (m,) of each boundary's control points that is its cones' scatter (m)
     cones: dict[int, Array]  # parameters (k,) of each boundary's detected cones on its curve (m)
-    sigma_stations: dict[
-        int, Array
-    ]  # sigma (k,) of those along their curve, given the curve (m); may be empty
+    stations: dict[int, Array]
+    """(2, k) parameters of cones that hold detections along each curve, and the sigmas of these cones along
+    it, given the curve (m); empty without stations."""
     seconds: float  # wall time (s)
     objection: str = ""  # what speaks against the map; empty where nothing does
 
@@ -98,9 +98,9 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
         few, change = simplified(at.state, detections, settings)
         information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
         scatter = scatter_of_cones(few, detections, settings)
-        cones, sigma_stations = scatter.places, dict[int, Array]()
+        stations = dict[int, Array]()
         if system.matches is not None:
-            cones, sigma_stations = stations_on(few, system.matches, at.state, change, dense)
+            stations = stations_on(few, system.matches, at.state, change, dense)
         return LapMarginal(
             convergence=convergence,
             splines=few.splines,
@@ -110,8 +110,8 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             mean=mean,
             information=information,
             scatter={label: scatter.of_control_points(label, b) for label, b in few.boundaries.items()},
-            cones=cones,
-            sigma_stations=sigma_stations,
+            cones=scatter.places,
+            stations=stations,
             seconds=time.perf_counter() - begin,
             objection=disagreement(system, at.state.poses)
             or objection(few.splines, at.state.poses, share_used(at, detections), settings),
@@ -161,13 +161,13 @@ def marginal_of(
 
 def stations_on(
     few: State, matches: StationMatches, dense: State, change: Array, covariance: Array
-) -> tuple[dict[int, Array], dict[int, Array]]:
-    """Return where stations of dense curves are on curves with few knots (k,), and their sigmas along (k,).
+) -> dict[int, Array]:
+    """Return where stations of dense curves are on curves with few knots, and their sigmas along: (2, k).
 
     A cone is `S_dense(u)`. Given the few control points `F c` it moves by `(B_dense(u) - B_few(u') F) dc`,
     with u' its foot point on the few curve, B the basis, and dc of the given covariance.
     """
-    places, sigmas = {}, {}
+    found = {}
     for curve in matches.stations.curves:
         label, u = curve.label, curve.u
         old, new, new_points = dense.boundaries[label], few.boundaries[label], few.control_points(label)
@@ -175,9 +175,9 @@ def stations_on(
         block = map_block(dense, label)
         F = change[map_block(few, label), block]
         along = along_of(old, u, foot.tangent_unit) - along_of(new, foot.u, foot.tangent_unit) @ F
-        places[label] = foot.u
-        sigmas[label] = np.sqrt(np.einsum("kn,kn->k", along @ covariance[block, block], along))
-    return places, sigmas
+        variance = np.einsum("kn,kn->k", along @ covariance[block, block], along)
+        found[label] = np.array([foot.u, np.sqrt(variance)])
+    return found
 
 
 def along_of(boundary: Boundary, u: Array, directions: Array) -> Array:

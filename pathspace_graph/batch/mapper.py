@@ -335,6 +335,7 @@ class BatchMapper:
         self, log: Log, judged: JudgedLog, start: Start, on_round: Callable[[], None] | None, watch: Stopwatch
     ) -> tuple[Optimizer, Found, RunResult | None]:
         """Return the optimum with its optimizer, and the online run that the search began with, if it did."""
+        revisits: Sequence[Revisit] = ()
         if start != "online":
             optimizer = _optimizer(judged, on_round)
             revisits = find_revisits(judged.chain, all_cones(judged), judged.settings)
@@ -350,8 +351,9 @@ class BatchMapper:
         mapper = self.online(replace(self.settings, scale=1.0), self.noise)
         state, online = start_online(log, mapper)
         watch.lap("start")
-        optimizer = _optimizer(judged, on_round)
-        found = find_closed_optimum(optimizer, mapper.closed_by) if start == "auto" else None
+        optimizer, found = _optimizer(judged, on_round), None
+        if start == "auto" and not revisits:
+            found = find_closed_optimum(optimizer, mapper.closed_by)
         if found is None:
             optimizer = _optimizer(judged, on_round)
             optimizer.system.revisits = mapper.revisits

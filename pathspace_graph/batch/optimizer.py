@@ -80,7 +80,8 @@ class Optimizer:
             at, convergence = self.run(state, self.settings.gate, effort.rounds)
             if cone_counts(at.state, detections, settings) == cones:
                 break
-        if settings.stations and all(b.periodic for b in at.state.boundaries.values()):
+        curves = at.state.boundaries.values()
+        if settings.stations and curves and all(boundary.periodic for boundary in curves):
             for _ in range(STATION_PASSES):
                 at, convergence = self.run(at.state, self.settings.gate, effort.rounds, stations=True)
         return at, convergence

@@ -168,7 +168,7 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
     added = np.concatenate([state.keys(label) for label in marginal.splines])
     points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
     smoother.restart(first, removed, added, points)
-    smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.sigma_stations)
+    smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.stations)
     _move_poses(state.poses, marginal.poses[first:])
     state.variables.calibrations[:] = marginal.calibration
     locate_poses(state)

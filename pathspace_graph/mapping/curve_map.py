@@ -116,14 +116,17 @@ class CurveMap:
         self.state.drop_oldest_pose_u()
 
     def replaced_by(
-        self, scatter: dict[int, Array], cones: dict[int, Array], sigma_stations: dict[int, Array]
+        self, scatter: dict[int, Array], cones: dict[int, Array], stations: dict[int, Array]
     ) -> None:
         """Note that curves and prior are a batch's, with the scatter and the places of cones by label.
 
-        Where their standard deviations (k,) along the curves are given (m), they are stations from now on.
+        Stations (2, k) are parameters of cones and their standard deviations along the curves (m), if any.
         """
         self.held_by_prior, self.scatter, self.cones = True, scatter, cones
-        self.stations = Stations.of(self.state, cones, sigma_stations) if sigma_stations else None
+        self.stations = None
+        if stations:
+            u, sigma = ({label: own[k] for label, own in stations.items()} for k in (0, 1))
+            self.stations = Stations.of(self.state, u, sigma)
 
     def match(self, rows: IntArray, directions: Array) -> None:
         """Match detections (m,), newly in use, with the cones of a closed map.
