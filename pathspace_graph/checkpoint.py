@@ -6,6 +6,7 @@ arrays that cannot be written, and GTSAM's factors.
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from types import MethodType
 from typing import Any, Final
 
@@ -14,26 +15,50 @@ import numpy as np
 
 Memo = dict[int, Any]  # copies by the `id` of what they are copies of
 Copier = Callable[[Any, Memo], Any]
+Call = partial[Any]
 
 
 class Recovery:
-    """Return of an estimator to what it was before its newest call, by a copy that each call begins with."""
+    """Return of an estimator to what it was before its newest call, by a copy and the few calls since then.
+
+    A call is repeated to the bit if it has got nothing from outside, such as another process.
+    """
+
+    EVERY: Final = 10  # number of calls from one copy to the next: a copy takes a quarter of a call's time
 
     def __init__(self, failures: int = 0) -> None:
         self.failures = failures
         self._copy: dict[str, Any] | None = None
+        self._calls: list[Call] = []
+        self._outside: object = None
 
-    def before(self, estimator: object, *shared: object) -> None:
-        """Keep a copy of an estimator before a call; it shares itself and some objects."""
-        self._copy = self._held(vars(estimator), estimator, shared)
+    def before(self, estimator: object, *shared: object, outside: object = None) -> None:
+        """Make a copy of an estimator before a call where one is due; it shares itself and some objects.
+
+        One is due as well where `outside` has changed, which says what calls have got from there.
+        """
+        if self._copy is None or len(self._calls) >= self.EVERY or outside != self._outside:
+            self._copy, self._calls = self._held(vars(estimator), estimator, shared), []
+            self._outside = outside
+
+    def called(self, again: Call) -> None:
+        """Note a call that has changed the estimator."""
+        self._calls.append(again)
 
     def take_back(self, estimator: object, *shared: object) -> None:
-        """Take an estimator back to what it was before the call, as often as another attempt fails."""
+        """Take an estimator back to what it was after the last call that was noted."""
         if self._copy is None:
             raise RuntimeError("expected a copy of the estimator, found none")
-        attributes = self._held(self._copy, estimator, shared)
+        attributes = self._held(self._copy, estimator, shared)  # the copy stays, for the next failure
         vars(estimator).clear()
         vars(estimator).update(attributes)
+        for done, again in enumerate(self._calls):
+            try:
+                again()
+            except Exception:  # it did not fail before: something outside has changed
+                self._calls = self._calls[:done]
+                self.take_back(estimator, *shared)
+                return
 
     def _held(self, values: dict[str, Any], estimator: object, shared: tuple[object, ...]) -> dict[str, Any]:
         memo = {id(one): one for one in (self, estimator, *shared)}
@@ -60,7 +85,7 @@ def _copier_of(value: object) -> Copier | None:
     kind = type(value)
     if kind not in _COPIERS:
         copier = _COPIERS[kind] = _copier(kind)
-        if copier is None and hasattr(kind, "__dataclass_params__"):
+        if copier is None and hasattr(kind, "__dataclass_params__") and not getattr(kind, "constant", False):
             held = [own for own in vars(value).values() if type(own) is not np.ndarray]
             _COPIERS[kind] = None if all(map(is_shared, held)) else _object
     return _COPIERS[kind]

@@ -7,7 +7,7 @@ one is clearly better than all others, twice in a row, the window starts anew th
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -60,6 +60,8 @@ class Loop:
     beside: Mapping[int, Array]  # (n,) parameters beside the points of the middle on each boundary (m)
     curves: Mapping[int, KDTree]  # densely sampled points of each boundary
     mapped: Mapping[int, BoolArray]  # whether each of these lies between detected cones (`is_mapped`)
+
+    constant: ClassVar[bool] = True
 
     def at(self, stations: Array) -> Array:
         """Return the points of the middle at stations of any shape, as complex numbers x + i y."""

@@ -105,6 +105,15 @@ class TrackLoop:
             return ends
         return (*ends, batch.last + 1)
 
+    @property
+    def batches(self) -> tuple[int, int]:
+        """Return how many batches have ended, and the newest cycle where one is under way, else -1.
+
+        What has been got from other processes is the same while this is.
+        """
+        under_way = self._lap_batch is not None
+        return len(self._batch_ends), self._smoother.next_cycle if under_way else -1
+
     def may_close(self) -> bool:
         """Return whether it is time to register the newest detections with the beginning of an open loop."""
         if self.closed or self._rests or self._lap_batch is not None or not self._is_near_start():

@@ -12,7 +12,6 @@ from typing import Final, Self
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.residuals import station_rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY
 
@@ -31,20 +30,17 @@ class CurveStations:
     first: int  # number of the first among those of all curves
     u: Array  # parameters (k,) of the cones in m, within one length
     sigma: Array  # standard deviations (k,) of the cones along the curve, given the curve (m)
+    apart: Array  # distances (k,) of each to the nearer one of its neighbours (m)
     length: float  # length of the curve (m)
 
     @classmethod
-    def of(cls, label: int, first: int, tables: SpanPolynomials, u: Array, sigma: Array) -> Self:
-        """Place cones at parameters (k,), at least one, of a closed curve with these tables."""
-        u = tables.low + np.mod(u - tables.low, tables.length)
+    def of(cls, label: int, first: int, u: Array, sigma: Array, ends: tuple[float, float]) -> Self:
+        """Place cones at parameters (k,), at least one, of a closed curve between two ends."""
+        low, length = ends[0], ends[1] - ends[0]
+        u = low + np.mod(u - low, length)
         order = np.argsort(u)
-        return cls(label, first, u[order], sigma[order], tables.length)
-
-    @property
-    def apart(self) -> Array:
-        """Return the distances (k,) of each station to the nearer one of its neighbours (m)."""
-        gaps = np.diff(self.u, append=self.u[0] + self.length)
-        return np.minimum(gaps, np.roll(gaps, 1))
+        gaps = np.diff(u[order], append=u[order[0]] + length)
+        return cls(label, first, u[order], sigma[order], np.minimum(gaps, np.roll(gaps, 1)), length)
 
     def nearest(self, u: Array) -> tuple[IntArray, Array]:
         """Return the nearest station to each parameter, of any shape, and how far beyond it that is (m)."""
@@ -84,7 +80,8 @@ class Stations:
         """Place cones at parameters (k,) of closed curves, at least one on each; by label, as the sigmas."""
         curves, columns, values, before, count = list[CurveStations](), [], [], 0, 0
         for label, boundary in state.boundaries.items():
-            own = CurveStations.of(label, count, boundary.tables, u[label], sigma[label])
+            ends = boundary.tables.low, boundary.tables.high
+            own = CurveStations.of(label, count, u[label], sigma[label], ends)
             value, span = boundary.tables.evaluate(own.u, 1)
             curves.append(own)
             columns.append(before + boundary.columns(span))

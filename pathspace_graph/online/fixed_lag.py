@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final, Self
 
@@ -102,17 +103,19 @@ class FixedLagMapper(MapperEstimate):
         `recovery.failures` counts. If `strict`, it goes back, and what was raised is raised again.
         """
         factors = tuple(factors)
-        self.recovery.before(self, self.front_end.gate)
+        self.recovery.before(self, self.front_end.gate, outside=self.loop.batches)
         cycle, unused = self._admit(odometry, detections, factors), self._unused
         if unused is not None:
             cycle = replace(cycle, odometry=unused.followed_by(cycle.odometry))
+        again = partial(self._process, cycle, factors)
         try:
-            result = self._process(cycle, factors)
+            result = again()
         except Exception as error:  # a vehicle drives on, whatever has failed
             if strict:
                 self.recovery.take_back(self, self.front_end.gate)
                 raise
             return cycle.counted(self._without(cycle, factors, error))
+        self.recovery.called(again)
         self._unused = None
         return cycle.counted(result)
 
@@ -171,10 +174,12 @@ class FixedLagMapper(MapperEstimate):
         attempts = {"the loop is left as it is": cycle, "its detections are not used": blind}
         for consequence, attempt in attempts.items():
             self.recovery.take_back(self, self.front_end.gate)
+            again = partial(self._process, attempt, factors, careful=True)
             try:
-                result = self._process(attempt, factors, careful=True)
+                result = again()
             except Exception:  # the next attempt does less
                 continue
+            self.recovery.called(again)
             self._unused = None
             return replace(result, notice=joined([failed, consequence, result.notice]))
         self.recovery.take_back(self, self.front_end.gate)

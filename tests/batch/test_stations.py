@@ -35,9 +35,8 @@ JITTER = 0.6
 def row(gap: float, jitter: float) -> CurveStations:
     """Return the stations of a closed curve of 120 m, some gap apart."""
     u = np.arange(0.5 * gap, LENGTH, gap)
-    return CurveStations(
-        LEFT, 0, u + jitter * np.random.default_rng(2).normal(size=len(u)), np.full(len(u), 0.02), LENGTH
-    )
+    u = u + jitter * np.random.default_rng(2).normal(size=len(u))
+    return CurveStations.of(LEFT, 0, u, np.full(len(u), 0.02), (0.0, LENGTH))
 
 
 def seen_again(curve: CurveStations, off: float) -> SeenAgain:

@@ -17,7 +17,7 @@ LENGTH = 100.0
 def stations(*u: float, sigma: float = 0.0) -> CurveStations:
     """Return stations of a closed curve of 100 m."""
     places = np.array(u)
-    return CurveStations(LEFT, 10, places, np.full(len(places), sigma), LENGTH)
+    return CurveStations.of(LEFT, 10, places, np.full(len(places), sigma), (0.0, LENGTH))
 
 
 @pytest.mark.parametrize(

@@ -214,6 +214,7 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
         "reach",
         "relinearize",
         "robust",
+        "stations",
     }
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     shipped = project["tool"]["setuptools"]["package-data"]["pathspace_graph.eval"]
