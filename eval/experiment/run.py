@@ -17,7 +17,7 @@ from pathspace_graph.errors import InputError, OutputError, SettingsError
 from pathspace_graph.io.files import check_target, remove_manifest, to_plain, write_json
 from pathspace_graph.io.overrides import flatten
 from pathspace_graph.io.parsing import read_json
-from pathspace_graph.loop.drive_record import end_with
+from pathspace_graph.loop.worker import end_with
 from pathspace_graph.sim.track import Track
 
 from . import cells as store

@@ -1,25 +1,12 @@
-"""The drive as it was measured, its poses along the curves, and its batch when the loop closes."""
+"""The drive as it was measured, and its poses along the curves: what a batch of the lap is made of."""
 
-import os
-import signal
-import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import cache
-from multiprocessing import current_process, resource_tracker
-from threading import Thread
-from typing import Any, Final, cast
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
-from joblib.externals import loky
-from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
-from pathspace_graph.batch.lap import ClosedMap, LapMarginal, OpenLap, solve_lap
+from pathspace_graph.batch.lap import ClosedMap, OpenLap
 from pathspace_graph.batch.start import unwrap
-from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
@@ -57,11 +44,6 @@ def bend(poses: Array, known: Mapping[int, Array]) -> Array:
     return np.asarray(moved[0] + weight * change)
 
 
-WORKER_IDLE: Final = 600  # time with nothing to do after which the process that solves laps ends (s)
-WATCH_SECONDS: Final = 1.0  # at which a worker checks whether the process that started it is still there
-SOLVED: Final = 3.0  # distance from the optimum of a solved batch (joint sigmas): its marginal has the rest
-
-
 class DriveRecord:
     """The odometry, the detections and the poses of every cycle, kept as long as a batch can solve them."""
 
@@ -74,7 +56,6 @@ class DriveRecord:
         self._motions: list[MeasuredMotion] = []  # that lead to each cycle
         self._seen: list[Detections] = []  # of each cycle, as they came
         self._orange: list[Detections] = []  # those of orange cones
-        self._prepared = False
 
     def give_up(self, reason: str) -> None:
         """Drop the measurements; the first reason counts."""
@@ -133,17 +114,6 @@ class DriveRecord:
         """Return the newest pose beside an early one, if the newest cones lie on those of the beginning."""
         return return_to_beginning(self.seen_in(sensor), unwrap(self.poses), covariance, self.settings)
 
-    def prepare(self) -> None:
-        """Start the process that solves laps, once, so that it is ready when the loop closes."""
-        if not self._prepared:
-            self._prepared = True
-            self.resume()
-
-    def resume(self) -> None:
-        """Start the process again where it was ready when a snapshot was taken, without waiting for it."""
-        if self._prepared and self.unsolvable is None:
-            _submit(_nothing)
-
     def lap(self, first_kept: int, start: ClosedMap | Revisit, settings: MapperSettings) -> OpenLap:
         """Return the lap; the priors of its calibrations are those of the settings, which may be wide."""
         chain = chained(self.stamps, self._noise.motions_of_lap(self._motions), settings.odometry)
@@ -151,119 +121,3 @@ class DriveRecord:
         seen = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
         table = replace(table, measured=seen.points_vehicle, covariance=seen.covariances)
         return OpenLap(settings, chain, table, first_kept, start)
-
-
-@dataclass(frozen=True)
-class Unsolved:
-    """Why there is no marginal of a lap."""
-
-    reason: str
-    is_final: bool = True  # whether another attempt, after more of the drive, would fail as well
-
-
-LATE: Final = Unsolved("the batch of the lap was late")
-
-
-class LapBatch:
-    """A lap that is being solved in a process of its own, while the mapper goes on."""
-
-    def __init__(self, lap: OpenLap, t: float, due: int, last: int) -> None:
-        self.t = t  # stamp of the cycle in which the lap was sent (s)
-        self.due, self.last = due, last  # first and last cycle in which the marginal may replace the prior
-        self.first_kept = lap.first_kept  # cycle from which on the window holds the poses until then
-        self._lap = lap
-        self._future: Future[LapMarginal] | None = None
-        self.send()
-
-    def send(self) -> Future[LapMarginal]:
-        """Hand the lap to the process, unless it has it already; a snapshot holds the lap alone."""
-        if self._future is None:
-            self._future = _submit(solve_lap, self._lap)
-        return self._future
-
-    def wait(self) -> None:
-        """Wait for the process, however long it takes."""
-        wait([self.send()])
-
-    def give_up(self) -> None:
-        """Take the lap from the process, which is ended if it is at it; the next lap has a new one then."""
-        future = self.send()
-        if not future.done() and not future.cancel():
-            _end_worker()
-
-    def marginal(self, timeout: float) -> LapMarginal | Unsolved | None:
-        """Return the solution, or why there is none, or None if it is not there after a time (s)."""
-        try:
-            solved = self.send().result(timeout)
-        except TimeoutError:
-            return None
-        except SingularSystemError as error:
-            return Unsolved(str(error), is_final=False)
-        except BrokenProcessPool:
-            return Unsolved("the process of the batch has died")
-        except Exception as error:  # a vehicle drives on, whatever has failed there
-            failed = f"the batch of the lap has failed: {type(error).__name__}: {error}"
-            return Unsolved(" ".join(failed.split()))
-        nearly = solved.convergence.converged or solved.convergence.gradient < SOLVED
-        return solved if nearly else Unsolved("the batch of the lap has not converged", is_final=False)
-
-
-def _submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Hand work to the process that solves laps, a new one if it has died; if none begins, the work fails."""
-    failed = cast("Future[Any]", loky.Future())
-    for _ in range(2):
-        try:
-            with _spared_by_interrupts():
-                return cast("Future[Any]", _worker().submit(work, *arguments))
-        except Exception as error:  # it has died, or cannot be begun
-            _worker.cache_clear()
-            failure = error
-    failed.set_exception(failure)
-    return failed
-
-
-@contextmanager
-def _spared_by_interrupts() -> Iterator[None]:
-    """Let processes begin that Ctrl-C does not reach, lest each prints where it was; it waits meanwhile."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    for tracker in (resource_tracker, loky_tracker):
-        tracker.ensure_running()  # else it would be begun within, and let signals through
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@cache
-def _worker() -> Any:
-    if current_process().daemon:  # it may have no children: a worker of Dask is one
-        return ThreadPoolExecutor(max_workers=1)
-    return loky.ProcessPoolExecutor(
-        max_workers=1, timeout=WORKER_IDLE, initializer=end_with, initargs=(os.getpid(),)
-    )
-
-
-def end_with(parent: int) -> None:
-    """End this process soon after its parent, since a parent that is killed can't end its workers."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(WATCH_SECONDS)
-        os._exit(1)
-
-    if os.getpid() != parent:
-        Thread(target=watch, daemon=True).start()
-
-
-def _end_worker() -> None:
-    worker = _worker()
-    options = {} if isinstance(worker, ThreadPoolExecutor) else {"kill_workers": True}
-    worker.shutdown(wait=False, **options)
-    _worker.cache_clear()
-
-
-def _nothing() -> None:
-    """Do nothing: the process has imported what it needs by then."""

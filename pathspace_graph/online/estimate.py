@@ -256,11 +256,11 @@ class MapperEstimate:
 
         A replay calls this before each update, so that the same log always gives the same map.
         """
-        self.loop.wait()
+        self.loop.solver.wait(self.smoother.next_cycle)
 
     def batches(self) -> LapBatches:
         """Return the cycles in which batches of the lap have ended, and how late they would have been."""
-        return LapBatches(self.loop.batch_ends, self.loop.late_cycles)
+        return LapBatches(self.loop.solver.ends(self.smoother.next_cycle), self.loop.solver.late_cycles)
 
     # --- the estimate ------------------------------------------------------------------------------------
 

@@ -20,11 +20,10 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.lengths import joined
-from pathspace_graph.loop.closing import SIGMA_STEP, apply_correspondences, simplify
+from pathspace_graph.loop.closing import simplify
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.motion import known_noise, predict
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import is_lost, is_within_reach, passes_start, register
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import CycleResult, Stopwatch
@@ -36,8 +35,6 @@ from .estimate import MapperEstimate
 from .growth import Growth
 
 ROAD: Final = 10.0  # length of both boundaries beside a lost vehicle that make a road (m)
-
-PLACED: Final = 20.0  # path for which a vehicle stays so certain that only detections can close the loop (m)
 
 
 @at_scale
@@ -71,7 +68,6 @@ class FixedLagMapper(MapperEstimate):
         self.new_road: FixedLagMapper | None = None  # road beside a lost vehicle, from where the search began
         self._unused: Odometry | None = None  # twists of a cycle that was left out
         self._grown: frozenset[int] = frozenset()
-        self._placed_until = 0.0  # path driven (m) up to which the vehicle is not lost (`is_lost`)
 
     def update(
         self,
@@ -103,7 +99,9 @@ class FixedLagMapper(MapperEstimate):
         `recovery.failures` counts. If `strict`, it goes back, and what was raised is raised again.
         """
         factors = tuple(factors)
-        self.recovery.before(self, self.front_end.gate, outside=self.loop.batches)
+        self.recovery.before(
+            self, self.front_end.gate, outside=self.loop.solver.got(self.smoother.next_cycle)
+        )
         cycle, unused = self._admit(odometry, detections, factors), self._unused
         if unused is not None:
             cycle = replace(cycle, odometry=unused.followed_by(cycle.odometry))
@@ -140,10 +138,10 @@ class FixedLagMapper(MapperEstimate):
         self._update()
         watch.lap("update")
         learned = self.loop.inflate_priors(reading)
-        closes = self._close()
+        closes = self.loop.close()
         watch.lap("close")
         if closes:
-            self._simplify()
+            simplify(self.smoother)
         watch.lap("simplify")
         jump, notice = self.loop.go_on(closes, watch.spent)
         if jump is not None:
@@ -154,7 +152,7 @@ class FixedLagMapper(MapperEstimate):
         watch.lap("find")
         if self.closed:
             self.growth.clear()
-        self.smoother.marginalize(self.loop.first_kept)
+        self.smoother.marginalize(self.loop.solver.first_kept)
         watch.lap("marginalize")
         notice = joined([notice, self.growth.notice, reading.notice, learned])
         return self._result(cycle.detections.t, watch.laps, jump, notice)
@@ -240,30 +238,6 @@ class FixedLagMapper(MapperEstimate):
         """Take the Gauss-Newton steps of a cycle, each relinearized at the current estimate."""
         for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
             self.smoother.step(self.settings.sigma_step)
-
-    def _close(self) -> bool:
-        if not self.boundaries or not self.loop.may_close():
-            return False
-        smoother, settings = self.smoother, self.settings.closing
-        smoother.transform_to_origin()
-        track, times = smoother.map, smoother.times
-        if self.path.length < self._placed_until and not is_within_reach(track, times, settings):
-            return False  # the covariance would be costly
-        covariance = smoother.newest_covariance()
-        if not is_lost(covariance, settings):
-            self._placed_until = self.path.length + PLACED
-        found = register(track, times, covariance, self.path.beginning, settings)
-        if found is None or not passes_start(track.state, self.path, found.motion):
-            return False
-        if self.loop.record.unsolvable is None:
-            self.loop.registered(found)
-            return False  # the map stays open until the batch of the lap agrees
-        apply_correspondences(smoother, found)
-        self.loop.record.bent(smoother.solve_loop(settings.iterations, SIGMA_STEP), smoother)
-        return True
-
-    def _simplify(self) -> None:
-        simplify(self.smoother)
 
     # --- off the closed map ------------------------------------------------------------------------------
 

@@ -26,10 +26,11 @@ from pathspace_graph.factors.se2 import path_lengths, relative, wrap_angle
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT
-from pathspace_graph.loop import drive_record, track_loop
+from pathspace_graph.loop import returns, worker
 from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.lap_solver import LONGEST_WAIT
 from pathspace_graph.loop.map_repair import REPAIRED
-from pathspace_graph.loop.track_loop import LONGEST_WAIT, OWN_PRIOR, STAYS_OPEN, TrackLoop
+from pathspace_graph.loop.track_loop import OWN_PRIOR, STAYS_OPEN, TrackLoop
 from pathspace_graph.mapping.registration import Motion, RefinedMotion
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -74,7 +75,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[Slow]:
         batches.append(Slow(*arguments))
         return batches[-1]
 
-    monkeypatch.setattr(drive_record, "_submit", submit)
+    monkeypatch.setattr(worker, "submit", submit)
     return batches
 
 
@@ -107,7 +108,7 @@ class Stem:
 @pytest.fixture(scope="module")
 def stem(tmp_path_factory: pytest.TempPathFactory) -> Stem:
     mapper, results = map_log(replace(log(), cycles=log().cycles[:130]))
-    assert not results[-1].closed and mapper.loop._lap_batch is None
+    assert not results[-1].closed and mapper.loop.solver._batch is None
     file = tmp_path_factory.mktemp("stem") / "mapper.snap"
     mapper.save(file)
     return Stem(file, results)
@@ -123,7 +124,7 @@ def drive(
     results = [*known]
     with threadpool_limits(limits=1):
         for odometry, detections in islice(split_odometry(log), len(known), None):
-            batch = mapper.loop._lap_batch
+            batch = mapper.loop.solver._batch
             if late >= 0 and batch is not None and mapper.smoother.next_cycle == batch.due + late:
                 sent[-1].end()
             results.append(mapper.update(odometry, detections))
@@ -217,7 +218,7 @@ def test_a_slow_machine_changes_nothing_of_a_replay(monkeypatch: pytest.MonkeyPa
 
     expected, mapper = with_settings(), with_settings()
     known = run_online(log(), expected)
-    monkeypatch.setattr(drive_record, "_submit", submit)
+    monkeypatch.setattr(worker, "submit", submit)
     result = run_online(log(), mapper)
     assert_same(mapper, expected)
     assert result.waited > 0.1
@@ -231,7 +232,7 @@ def test_a_batch_that_never_ends_is_given_up_and_the_window_is_the_lag_again(
     sent: list[Slow], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ended: list[bool] = []
-    monkeypatch.setattr(drive_record, "_end_worker", lambda: ended.append(True))
+    monkeypatch.setattr(worker, "_end_worker", lambda: ended.append(True))
     mapper = with_settings(late=12)
     results = drive(mapper, sent, NEVER, log())
     end = due_cycle(sent[0]) + 13
@@ -248,7 +249,7 @@ def test_a_batch_that_never_ends_is_given_up_and_the_window_is_the_lag_again(
 
 def test_a_late_batch_makes_the_window_no_longer_than_the_longest(sent: list[Slow], stem: Stem) -> None:
     mapper = stem.mapper()
-    mapper.loop.settings = replace(mapper.settings, max_poses=40)
+    mapper.loop.solver._max_poses = 40
     sizes = []
     for cycle in stem.rest(log()):
         mapper.update(*cycle)
@@ -257,21 +258,21 @@ def test_a_late_batch_makes_the_window_no_longer_than_the_longest(sent: list[Slo
 
 
 def test_a_process_that_was_given_up_does_not_block_the_next_batch() -> None:
-    stuck = drive_record._submit(time.sleep, 600.0)
+    stuck = worker.submit(time.sleep, 600.0)
     while not stuck.running():
         time.sleep(0.01)
-    batch = object.__new__(drive_record.LapBatch)
+    batch = object.__new__(worker.LapBatch)
     batch._future = stuck
     batch.give_up()
-    assert drive_record._submit(sum, [1, 2]).result(120.0) == 3
+    assert worker.submit(sum, [1, 2]).result(120.0) == 3
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="Windows")
 def test_an_interrupt_does_not_reach_the_process_of_the_batch_and_reaches_this_one() -> None:
     """Ctrl-C goes to all processes of a terminal; one that is still importing would print where it was."""
-    if drive_record._worker.cache_info().currsize:
-        drive_record._end_worker()
-    blocked = drive_record._submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(120.0)
+    if worker._worker.cache_info().currsize:
+        worker._end_worker()
+    blocked = worker.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(120.0)
     assert signal.SIGINT in blocked
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
@@ -294,7 +295,7 @@ def test_where_no_process_can_be_begun_there_is_a_notice(stem: Stem, monkeypatch
         def submit(self, *_: Any) -> Any:
             raise OSError("out of memory")
 
-    drive_record._worker.cache_clear()
+    worker._worker.cache_clear()
     monkeypatch.setattr(loky, "ProcessPoolExecutor", lambda **_: Executor())
     mapper = stem.mapper()
     results = [replay(mapper, *cycle) for cycle in stem.rest(log())]
@@ -304,9 +305,9 @@ def test_where_no_process_can_be_begun_there_is_a_notice(stem: Stem, monkeypatch
 
 KILLED = """
 import os, signal
-from pathspace_graph.loop import drive_record
+from pathspace_graph.loop import worker
 
-print(drive_record._submit(os.getpid).result(), flush=True)
+print(worker.submit(os.getpid).result(), flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -326,11 +327,11 @@ def test_a_late_batch_is_sent_again_by_a_restored_mapper(
         futures.append((loky.Future(), arguments))
         return futures[-1][0]
 
-    monkeypatch.setattr(drive_record, "_submit", submit)
+    monkeypatch.setattr(worker, "submit", submit)
     mapper, cycles = stem.mapper(), stem.rest(log())
     for cycle in cycles:
         mapper.update(*cycle)
-        batch = mapper.loop._lap_batch
+        batch = mapper.loop.solver._batch
         if batch is not None and mapper.smoother.next_cycle == batch.due + 3:
             break
     mapper.save(tmp_path / "late.snap")
@@ -361,10 +362,10 @@ def test_each_way_to_see_a_return_begins_the_batch_with_a_pose_beside_an_early_o
     way: str, sent: list[Slow], stem: Stem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if way != "curves":
-        monkeypatch.setattr(TrackLoop, "may_close", lambda _: False)
+        monkeypatch.setattr(TrackLoop, "close", lambda _: False)
     if way != "cones":
         monkeypatch.setattr(DriveRecord, "return_to_beginning", lambda *_: None)
-    monkeypatch.setattr(track_loop, "recognize", lies_as_it_is if way == "shape" else lambda _: None)
+    monkeypatch.setattr(returns, "recognize", lies_as_it_is if way == "shape" else lambda _: None)
     mapper, truth = stem.mapper(), true_poses(log())
     for cycle in stem.rest(log()):
         mapper.update(*cycle)

@@ -20,7 +20,7 @@ from pathspace_graph.factors.se2 import relative, wrap_angle
 from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.graph.variables import Layout, Variables, pose_keys
 from pathspace_graph.io.log import Log
-from pathspace_graph.loop import drive_record, track_loop
+from pathspace_graph.loop import track_loop, worker
 from pathspace_graph.loop.closing import _move_poses
 from pathspace_graph.loop.drive_record import DriveRecord
 from pathspace_graph.mapping.smoother import CurveSmoother
@@ -217,8 +217,8 @@ def test_a_lap_with_too_many_cones_keeps_the_prior_and_says_so() -> None:
 
 def test_a_batch_that_does_not_converge_closes_nothing_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its optimum is farther away than nothing at all, so it is never near enough."""
-    monkeypatch.setattr(drive_record, "SOLVED", 0.0)
-    monkeypatch.setattr(drive_record, "_submit", _unconverged)
+    monkeypatch.setattr(worker, "SOLVED", 0.0)
+    monkeypatch.setattr(worker, "submit", _unconverged)
     mapper, results = map_log(log(), *open_lap())
     notices = {result.notice for result in results if result.notice}
     assert notices == {"the loop stays open: the batch of the lap has not converged"}
@@ -228,7 +228,7 @@ def test_a_batch_that_does_not_converge_closes_nothing_and_says_so(monkeypatch: 
 def test_where_the_process_dies_the_loop_closes_by_the_window_s_own_prior(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(drive_record, "solve_lap", _exit)
+    monkeypatch.setattr(worker, "solve_lap", _exit)
     mapper, results = map_log(log(), *open_lap())
     died, own = [result.notice for result in results if result.notice]
     assert died == "the loop stays open: the process of the batch has died"

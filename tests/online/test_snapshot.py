@@ -62,8 +62,8 @@ def laps() -> Drive:
                 mapper.closed and result.jump is None and mapper.smoother.next_cycle % 5 == 0
             ),
             "before the swap": lambda mapper, _: (
-                mapper.loop._lap_batch is not None
-                and mapper.loop._lap_batch.due == mapper.smoother.next_cycle
+                mapper.loop.solver._batch is not None
+                and mapper.loop.solver._batch.due == mapper.smoother.next_cycle
             ),
             "swap": lambda mapper, result: result.jump is not None,
             "after the swap": lambda mapper, result: mapper.loop.lap_seconds > 0.0 and result.jump is None,
@@ -101,7 +101,7 @@ def recurring() -> Drive:
     return Drive(
         simulate(bean_track(), SimulationSettings(laps=3), seed=6),
         {
-            "tried": lambda mapper, _: not mapper.closed and mapper.loop.first_kept is not None,
+            "tried": lambda mapper, _: not mapper.closed and mapper.loop.solver.first_kept is not None,
             "closed": lambda mapper, _: mapper.closed,
         },
         registers=False,
@@ -171,7 +171,7 @@ def test_a_restored_mapper_goes_on_to_the_same_result(
 ) -> None:
     drive = make()
     if not drive.registers:
-        monkeypatch.setattr(TrackLoop, "may_close", lambda _: False)
+        monkeypatch.setattr(TrackLoop, "close", lambda _: False)
     waiting, restored, last = dict(drive.moments), None, 0
     mapper = FixedLagMapper(drive.settings, drive.log.odometry_sigma)
     for number, cycle in enumerate(split_odometry(drive.log)):

@@ -1,0 +1,102 @@
+"""The return to the beginning of a drive, by the newest curves or cones, or by the shape of the road."""
+
+from math import inf
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.mapping.constellation import relative_pose
+from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.registration import (
+    BEGINNING,
+    HEADING,
+    RefinedMotion,
+    is_lost,
+    is_within_reach,
+    near_start,
+    passes_start,
+    register,
+)
+from pathspace_graph.mapping.smoother import CurveSmoother
+
+from .drive_record import DriveRecord
+from .revisit import recognize
+
+PLACED: Final = 20.0  # path for which a vehicle stays so certain that only detections can close the loop (m)
+RECOGNITION_INTERVAL: Final = 10.0  # least distance of two attempts to recognize the place (m along the path)
+RETURN_CYCLES: Final = 10  # least number of cycles of two attempts to find the beginning again by its cones
+LONG_PATH: Final = 1000.0
+"""Path from which on the distance of attempts grows with it (m), as the cost of an attempt does."""
+
+
+class ReturnFinder:
+    """The search for a return of an open road, in three ways, each some metres after its last attempt."""
+
+    def __init__(self, smoother: CurveSmoother, path: DrivenPath, record: DriveRecord) -> None:
+        self._smoother, self._path, self._record = smoother, path, record
+        self._settings = smoother.map.settings.closing
+        self._tried: dict[str, tuple[float, int]] = {}  # path (m) and cycle of the last attempt in each way
+        self._rests_until = 0.0  # path (m)
+        self._placed_until = 0.0  # path (m) up to which the vehicle is not lost (`is_lost`)
+
+    def rest(self, length: float) -> None:
+        """Look for no return for a length (m) from here on; zero ends a rest."""
+        self._rests_until = self._path.length + length if length else 0.0
+
+    def by_curves(self) -> RefinedMotion | None:
+        """Return the motion that lays the newest detections on the beginning of the curves."""
+        if not self._is_near_start() or not self._is_due("curves", self._settings.check_interval):
+            return None
+        smoother, settings = self._smoother, self._settings
+        smoother.transform_to_origin()
+        track, times = smoother.map, smoother.times
+        if self._path.length < self._placed_until and not is_within_reach(track, times, settings):
+            return None  # the covariance would be costly
+        covariance = smoother.newest_covariance()
+        if not is_lost(covariance, settings):
+            self._placed_until = self._path.length + PLACED
+        found = register(track, times, covariance, self._path.beginning, settings)
+        return found if found is not None and passes_start(track.state, self._path, found.motion) else None
+
+    def by_cones(self) -> Revisit | None:
+        """Return the newest pose beside an early one, if the newest cones lie on those of the beginning."""
+        if (
+            not self._is_due("cones", self._settings.check_interval, RETURN_CYCLES)
+            or not self._is_near_start()
+        ):
+            return None
+        covariance = self._smoother.newest_covariance()
+        return self._record.return_to_beginning(covariance, self._smoother.variables.sensor)
+
+    def by_shape(self) -> Revisit | None:
+        """Return the newest pose beside an earlier one, if the newest curves match one earlier stretch."""
+        length = self._path.length
+        if not self._is_due("shape", RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)):
+            return None
+        found = recognize(self._smoother)
+        return None if found is None else self.revisit_of(found, length - self._settings.min_path)
+
+    def revisit_of(self, found: RefinedMotion, within: float = BEGINNING) -> Revisit:
+        """Return the newest pose, once moved, beside the nearest one `within` the first metres."""
+        poses = self._record.with_window(self._smoother)
+        newest = poses[-1:].copy()
+        found.motion.move(newest)
+        beside = (path_lengths(poses) < within) & (np.cos(poses[:, 2] - newest[0, 2]) > np.cos(HEADING))
+        away = np.where(beside, np.hypot(*(poses[:, :2] - newest[0, :2]).T), inf)
+        earlier, information = int(away.argmin()), np.asarray(np.linalg.inv(found.covariance), np.float64)
+        ends = (earlier, poses[earlier]), (len(poses) - 1, newest[0])
+        return relative_pose(*ends, newest[0], information)
+
+    def _is_near_start(self) -> bool:
+        return near_start(self._path, self._smoother.variables.poses[-1], self._settings)
+
+    def _is_due(self, way: str, interval: float, cycles: float = inf) -> bool:
+        """Return whether to look for a return in a way again, some metres or cycles after the last time."""
+        length, cycle = self._path.length, self._smoother.next_cycle
+        tried, tried_cycle = self._tried.get(way, (-inf, 0))
+        if length < self._rests_until or (length < tried + interval and cycle < tried_cycle + cycles):
+            return False
+        self._tried[way] = length, cycle
+        return True
