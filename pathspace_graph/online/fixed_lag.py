@@ -133,9 +133,9 @@ class FixedLagMapper(MapperEstimate):
         watch.lap("predict")
         self._classify(reading)  # detections that no curve explains may expand one
         watch.lap("classify")
-        self._expand()
+        grown = self._expand()
         watch.lap("expand")
-        self._update()
+        self._update(grown)
         watch.lap("update")
         learned = self.loop.inflate_priors(reading)
         closes = self.loop.close()
@@ -227,16 +227,18 @@ class FixedLagMapper(MapperEstimate):
         if not self.closed:
             self.growth.observe(new, detections.t)
 
-    def _expand(self) -> None:
+    def _expand(self) -> frozenset[int]:
+        """Let open curves grow, and return the labels of those that did; their detections are tested next."""
         self._grown = frozenset()
         if not self.closed:
             path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
             self._grown = self.growth.expand(path_ahead)
         self.smoother.deactivate_distant()
+        return self._grown
 
-    def _update(self) -> None:
+    def _update(self, grown: frozenset[int]) -> None:
         """Take the Gauss-Newton steps of a cycle, each relinearized at the current estimate."""
-        for _ in range(self.settings.steps_grown if self._grown else self.settings.steps):
+        for _ in range(self.settings.steps_grown if grown else self.settings.steps):
             self.smoother.step(self.settings.sigma_step)
 
     # --- off the closed map ------------------------------------------------------------------------------
@@ -257,8 +259,7 @@ class FixedLagMapper(MapperEstimate):
         road = self.new_road
         road._predict(reading)
         road._classify(reading)
-        road._expand()
-        road._update()
+        road._update(road._expand())
         road.smoother.marginalize()
         ends = [boundary.confirmed_end for boundary in road.boundaries.values()]
         sees_road = len(ends) == len(BOUNDARIES) and min(ends) > ROAD and road.loop.health.condition == GOOD

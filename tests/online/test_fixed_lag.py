@@ -512,8 +512,8 @@ def test_a_strict_update_raises_what_has_failed_and_changes_nothing(monkeypatch:
 
     works = FixedLagMapper._update
 
-    def fails(self: FixedLagMapper) -> None:
-        works(self)
+    def fails(self: FixedLagMapper, grown: frozenset[int]) -> None:
+        works(self, grown)
         if self.smoother.times[-1] == seen.t:
             raise np.linalg.LinAlgError("no convergence")
 
