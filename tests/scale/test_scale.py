@@ -22,13 +22,14 @@ from hypothesis import strategies as st
 from pathspace_graph.baselines.filters import CkfMapper
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.errors import ReadingError, SettingsError
+from pathspace_graph.errors import InputError, ReadingError, SettingsError
 from pathspace_graph.estimators import ONLINE, make_batch, make_online
 from pathspace_graph.eval.metrics.measures import measure
 from pathspace_graph.eval.metrics.summary import laps_of, summarize
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
+from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.health import Health
-from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
@@ -38,8 +39,8 @@ from pathspace_graph.plausibility.diagnosis import diagnose, measured_line
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.scale import ENOUGH, PATIENCE, SCALES, SceneScale, scale_of, width_and_gap
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import BatchSettings, MapperSettings
+from pathspace_graph.settings.online import GrowthSettings, LimitSettings
 from pathspace_graph.sim.mistakes import in_frame
 from pathspace_graph.spline.bspline import BSpline
 
@@ -286,6 +287,19 @@ def test_a_batch_of_a_log_s_times_as_large_is_s_times_as_large() -> None:
     )
 
 
+@pytest.mark.parametrize("name", ["spline", "landmark-batch"])
+def test_a_batch_with_a_given_scale_begins_with_an_online_run_at_scale_one(name: str) -> None:
+    log = replace(short_drive(), cycles=short_drive().cycles[:60])
+    own = BatchSettings(start="online")
+    one, ten = (
+        make_batch(name, MapperSettings(scale=s, batch=own), scaled(log, s)).solve(scaled(log, s))
+        for s in (1.0, 10.0)
+    )
+    weights = np.array([10.0, 10.0, 1.0])
+    np.testing.assert_allclose(ten.trajectory, one.trajectory * weights, rtol=0.0, atol=1e-5)
+    assert ten.map.size == one.map.size > 0
+
+
 @pytest.mark.parametrize("name", ONLINE)
 def test_an_estimator_for_a_log_is_made_for_its_scale(name: str) -> None:
     """From the first pose on, and whatever it is asked for, it is the one of scale 1 times the scale."""
@@ -376,6 +390,15 @@ def test_no_detections_break_the_search_for_a_scale(seed: int, strange: float) -
     mapper = FixedLagMapper(MapperSettings(scale=scene.value), ODOMETRY_SIGMA)
     for one in cycles:
         assert np.isfinite(mapper.update(*one).pose).all()
+
+
+def test_a_log_is_read_by_the_limits_of_its_scene(tmp_path: Path) -> None:
+    log = scaled(short_drive(), 0.1)
+    log.odometry.twist[7, 0] = 12.0
+    write_log(log, tmp_path / "log")
+    with pytest.raises(InputError, match=r"vx from -10 to 10 m/s, found 12$") as error:
+        read_usable_log(tmp_path / "log", LimitSettings())
+    assert error.value.row == 7 + 2
 
 
 def test_a_refusal_has_the_lengths_of_the_scene() -> None:
