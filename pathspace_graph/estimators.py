@@ -5,6 +5,7 @@ A package adds one by an entry point of its name, in the group `pathspace_graph.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -14,7 +15,8 @@ from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Log
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.scale import chosen_scale
+from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 from .errors import check_name, check_type
 from .run import BatchEstimator, OnlineEstimator
@@ -72,9 +74,10 @@ def check_batch(name: str) -> None:
 
 
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
+    """Return an online estimator for a log, which tells the scale where the settings leave it open."""
     check_online(name)
-    check_type("log", log, Log)
-    return ONLINE[name](settings, log.noise)
+    settings = known_settings(settings)
+    return ONLINE[name](replace(settings, scale=chosen_scale(settings, log)), log.noise)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:

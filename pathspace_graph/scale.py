@@ -1,31 +1,27 @@
 """Scenes of any size: inside of an estimator, every scene has the size of a Formula Student track.
 
-The scale of a scene is found from the width of its road and the gaps of its rows where the drive begins.
-Lengths are divided by it on the way in, and multiplied by it on the way out.
+An estimator is made for one scale. Lengths are divided by it on the way in (`front_end.gate`, `solved`) and
+those of results multiplied by it on the way out. Where the settings leave it open, it is found beforehand,
+from the width of the road and the gaps of its rows in the first metres of the log.
 """
 
 from collections.abc import Callable
-from copy import deepcopy
-from dataclasses import replace
-from functools import partial, wraps
-from numbers import Real
-from typing import Any, ClassVar, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .errors import ReadingError, SettingsError, check_type, solving
+from .errors import check_type, solving
 from .labels import LEFT, RIGHT, UNKNOWN
-from .lengths import POSE, Text, scaled, times
-from .run import settings_dict, split_odometry
+from .lengths import scaled
+from .run import split_odometry
 
-C = TypeVar("C", bound=type[Any])
+R = TypeVar("R")
 
 WIDTH: Final = 3.5  # m from a cone to the nearest one of the other side in Formula Student, median
 GAP: Final = 3.2  # distance of a cone from the nearest one of its row there, m, median
@@ -35,24 +31,22 @@ FEWEST: Final = 3  # number of cones of each side that a cycle needs
 SAME: Final = 3.0  # largest distance (sigmas) of two detections of one cone
 FARTHEST: Final = 1e4  # largest distance of a cone (m), in a scene of any scale
 MOVED: Final = 0.1  # share of a gap by which the vehicle moves until the next cycle counts
-JUDGED: Final = (1, 5, 20)  # cycles that count after which the scale is judged, the last time finally
+ENOUGH: Final = 20  # number of cycles that count after which the scale is final
 PATIENCE: Final = 200  # number of cycles after which it is final in any case
 
 
 class SceneScale:
-    """Finder of a scene's scale, cycle by cycle, as soon as both sides of the road and a row are seen.
+    """Finder of a scene's scale, cycle by cycle, where both sides of the road and a row are seen.
 
     It is the less extreme one of what width and gaps say, and 1 where they disagree, since a wide road isn't
     a large scene, or where they are out of the range of `SCALES`.
     """
 
-    def __init__(self, scale: float | None = None) -> None:
-        self.value = 1.0 if scale is None else scale  # scale as far as it is known
-        self.is_final = scale is not None  # whether the value changes no more
+    def __init__(self) -> None:
         self._widths: list[float] = []
         self._gaps: list[float] = []
         self._driven = np.inf  # since the last cycle that counted
-        self._cycles = self._counted = 0
+        self._cycles = 0
 
     def see(self, odometry: Odometry, detections: Detections) -> None:
         if self.is_final:
@@ -63,12 +57,18 @@ class SceneScale:
         width, gap = width_and_gap(detections)
         if not np.isnan(gap) and self._driven >= MOVED * gap:
             self._driven = 0.0
-            self._counted += 1
             self._gaps.append(gap)
             self._widths.append(width)
-            if self._counted in JUDGED:
-                self.value = _nearest(self._widths, self._gaps)
-        self.is_final = self._counted >= JUDGED[-1] or self._cycles >= PATIENCE
+
+    @property
+    def value(self) -> float:
+        """Return the scale as far as it is known."""
+        return _nearest(self._widths, self._gaps) if self._gaps else 1.0
+
+    @property
+    def is_final(self) -> bool:
+        """Return whether the value changes no more."""
+        return len(self._gaps) >= ENOUGH or self._cycles >= PATIENCE
 
 
 def scale_of(log: Log) -> float:
@@ -79,6 +79,22 @@ def scale_of(log: Log) -> float:
         if scene.is_final:
             break
     return scene.value
+
+
+def chosen_scale(settings: MapperSettings, log: Log) -> float:
+    """Return the scale of the settings, or that of a log's scene where they leave it open."""
+    check_type("log", log, Log)
+    return scale_of(log) if settings.scale is None else settings.scale
+
+
+def solved(solve: Callable[[Log, float], R], log: Log, settings: MapperSettings) -> R:
+    """Return the result of a batch in metres of the log; `solve` takes the log at scale 1, and its scale.
+
+    BLAS has one thread, and whatever numerics raise is a SolveError.
+    """
+    scale = chosen_scale(settings, log)
+    with threadpool_limits(limits=1), solving("the batch"):
+        return scaled(solve(scaled(log, 1.0 / scale), scale), scale)
 
 
 def width_and_gap(detections: Detections) -> tuple[float, float]:
@@ -115,169 +131,3 @@ def _nearest(widths: list[float], gaps: list[float]) -> float:
     away = 2.0 * ratios[np.abs(ratios).argmin()]
     place = round(float(away)) + SCALES.index(1.0)
     return SCALES[place] if 0 <= place < len(SCALES) else 1.0
-
-
-# --- the front door of estimators ------------------------------------------------------------------------
-
-ANSWERS: Final = (  # methods of an online estimator that return what has lengths
-    *("map", "outline", "ahead", "readings", "vehicle_state", "noise_used"),
-    *("window_poses", "smoothed"),
-)
-
-
-class FrontDoor:
-    """The scale of an estimator and, until that is final, what it takes to begin anew."""
-
-    constant: ClassVar = True  # an estimator that goes back to what it was before an update keeps it
-
-    def __init__(
-        self, settings: MapperSettings | None = None, odometry_sigma: Any = None, *others: Any, **named: Any
-    ) -> None:
-        """Keep what an estimator is made from, whose settings may give the scale."""
-        settings = MapperSettings() if settings is None else settings
-        check_type("settings", settings, MapperSettings)
-        self.scene = SceneScale(settings.scale)
-        self.made_from = (settings, odometry_sigma, *deepcopy((others, named)))
-        self.cycles: list[tuple[Odometry, Detections]] = []
-
-    def make(self, begin: Callable[..., None], estimator: Any) -> None:
-        """Let an estimator begin, or begin anew, at the present scale."""
-        settings, noise, others, named = self.made_from
-        begin(estimator, settings, noise_at(noise, self.scene.value), *deepcopy(others), **deepcopy(named))
-
-    def see(self, odometry: Odometry, detections: Detections) -> bool:
-        """Take a cycle into account, and return whether the scale is another one now."""
-        if self.scene.is_final:
-            return False
-        before = self.scene.value
-        self.cycles.append((odometry, detections))
-        self.scene.see(odometry, detections)
-        return self.scene.value != before
-
-    def inwards(self, odometry: Odometry, detections: Detections) -> tuple[Odometry, Detections]:
-        """Return a cycle as it is at scale 1; one of wrong types or shapes is left to the gate as it is."""
-        factor = 1.0 / self.scene.value
-        try:
-            with np.errstate(over="ignore"):  # what overflows is impossible, and dropped
-                return scaled(odometry, factor), scaled(detections, factor)
-        except (TypeError, ValueError):
-            return odometry, detections
-
-
-def noise_at(noise: Array | KnownNoise | None, scale: float) -> Array | KnownNoise | None:
-    if noise is None:
-        return None
-    if isinstance(noise, KnownNoise):
-        positive_sigmas(noise.odometry)
-        return scaled(noise, 1.0 / scale)
-    return np.asarray(times(positive_sigmas(noise), POSE, 1.0 / scale))
-
-
-def positive_sigmas(values: Any) -> Array:
-    """Return the standard deviations (3,) of a twist; SettingsError for anything but positive numbers."""
-    try:
-        sigmas = np.array(values, float)
-    except (TypeError, ValueError):
-        sigmas = np.zeros(0)
-    if sigmas.shape != (3,) or not ((sigmas > 0.0) & (sigmas < np.inf)).all():
-        found = values.tolist() if isinstance(values, np.ndarray) else values
-        raise SettingsError(f"odometry_sigma: expected 3 positive numbers, found {found!r:.80}")
-    return sigmas
-
-
-def in_scene(error: ReadingError, scale: float) -> ReadingError:
-    if not isinstance(error.expected, Text):
-        return error
-    found = error.found * scale if isinstance(error.found, float) else error.found
-    return type(error)(error.field, error.expected.scaled(scale), found, error.row, error.t)
-
-
-def at_scale(estimator: C) -> C:
-    """Let an online estimator map scenes of any size.
-
-    Lengths of odometry and detections are divided by `settings.scale`, those of results multiplied by it.
-    Where it is None, the first cycles tell the scale. With each new one, the estimator begins anew and takes
-    the cycles so far again.
-    """
-    begin, step = estimator.__init__, estimator.update
-
-    @wraps(begin)
-    def begin_at_scale(self: Any, *arguments: Any, **named: Any) -> None:
-        self._door = FrontDoor(*arguments, **named)
-        self._door.make(begin, self)
-
-    @wraps(step)
-    def update(self: Any, odometry: Odometry, detections: Detections, *factors: Any, **named: Any) -> Any:
-        door: FrontDoor = self._door
-        try:
-            result = step(self, *door.inwards(odometry, detections), *factors, **named)
-        except ReadingError as error:
-            raise in_scene(error, door.scene.value) from None
-        if any(factors) or any(named.values()):
-            door.scene.is_final = True  # the user's factors have lengths of this scale
-        if door.see(odometry, detections):
-            door.make(begin, self)
-            for cycle in door.cycles:
-                try:
-                    again = step(self, *door.inwards(*cycle))
-                except ReadingError:  # a cycle that is possible at one scale may not be so at another
-                    continue
-                result = replace(again, refused=result.refused)
-        if door.scene.is_final:
-            door.cycles = []
-        return scaled(result, door.scene.value)
-
-    estimator.__init__, estimator.update = begin_at_scale, update
-    for name in filter(partial(hasattr, estimator), ANSWERS):
-        setattr(estimator, name, _outwards(getattr(estimator, name)))
-    estimator.scale = property(lambda self: self._door.scene.value, doc="Return the scale of the scene.")
-    return estimator
-
-
-def _outwards(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a method whose answer has its lengths multiplied by the scale; what `ahead` takes is divided."""
-
-    @wraps(method)
-    def answer(self: Any, *arguments: Any) -> Any:
-        found, scale = method(self, *arguments), self._door.scene.value
-        return times(found, POSE, scale) if isinstance(found, np.ndarray) else scaled(found, scale)
-
-    @wraps(method)
-    def ahead(self: Any, distance: float, step: float = 1.0) -> Any:
-        for name, length in (("distance", distance), ("step", step)):
-            if not isinstance(length, Real):
-                raise SettingsError(f"{name}: expected a number (m), found {length!r}")
-        scale = self._door.scene.value
-        try:
-            return scaled(method(self, distance / scale, step / scale), scale)
-        except SettingsError as error:
-            raise SettingsError(times(error.args[0], 0, scale)) from None
-
-    return ahead if method.__name__ == "ahead" else answer
-
-
-def log_at_scale(estimator: C) -> C:
-    """Let a batch estimator map logs of any size, by the scale of the settings or as the log tells it.
-
-    BLAS has one thread, and whatever numerics raise is a SolveError.
-    """
-    begin, solve = estimator.__init__, estimator.solve
-
-    @wraps(begin)
-    def begin_and_keep(self: Any, *arguments: Any, **named: Any) -> None:
-        self._door = FrontDoor(*arguments, **named)
-        begin(self, *arguments, **named)
-
-    @wraps(solve)
-    def solve_at_scale(self: Any, log: Log, *options: Any, **named: Any) -> Any:
-        check_type("log", log, Log)
-        settings, noise, others, by_name = self._door.made_from
-        scale = settings.scale or scale_of(log)
-        inner = object.__new__(type(self))
-        begin(inner, replace(settings, scale=1.0), noise_at(noise, scale), *others, **by_name)
-        with threadpool_limits(limits=1), solving("the batch"):
-            result = solve(inner, scaled(log, 1.0 / scale), *options, **named)
-        return replace(scaled(result, scale), settings=settings_dict(settings))
-
-    estimator.__init__, estimator.solve = begin_and_keep, solve_at_scale
-    return estimator

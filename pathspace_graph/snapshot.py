@@ -56,7 +56,7 @@ FORMAT: Final = "pathspace-snapshot/2"
 PACKAGE: Final = "pathspace_graph."
 ROOMS: Final = (  # rooms and modules whose classes estimators are made of
     *("baselines", "batch", "factors", "front_end", "graph", "health", "io.log", "loop", "mapping"),
-    *("online", "scale", "settings", "spline"),
+    *("online", "settings", "spline"),
 )
 FORMAT_ERRORS: Final = (  # of a file that does not fit together; they include Recursion- and UnicodeError
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, MemoryError),

@@ -189,8 +189,6 @@ ASSIGNED = {
     "online.fixed_lag": {"self.recovery.failures"},
     "online.outlook": {"row.ended"},
     "commands.options": {"entry.metadata"},  # of dataclasses
-    "scale": {"door.scene.is_final", "door.cycles"}
-    | {f"estimator.{name}" for name in ("__init__", "update", "solve", "scale")},  # a decorator
     "snapshot": {"array.flags.writeable", "zipped.comment"},  # of numpy and zipfile
 }
 """Attributes that a module assigns to objects of others: no module may have another one."""

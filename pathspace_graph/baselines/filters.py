@@ -16,6 +16,7 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.lengths import scaled
 from pathspace_graph.loop.closing import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping import registration
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
@@ -25,8 +26,7 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import Motion, near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.scale import at_scale
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, known_settings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 
@@ -52,8 +52,9 @@ class _Filter:
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
-        self.settings = settings or MapperSettings()
-        self.front_end = FrontEnd(self.settings, known_noise(odometry_sigma))
+        self.settings = known_settings(settings)
+        self.scale = self.settings.scale or 1.0
+        self.front_end = FrontEnd(self.settings, known_noise(odometry_sigma, self.scale), self.scale)
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
         self._begin()
 
@@ -76,13 +77,12 @@ class _Filter:
         """Map a cycle."""
 
     def noise_used(self) -> RunNoise:
-        return self.front_end.noise_used
+        return scaled(self.front_end.noise_used, self.scale)
 
     def vehicle_state(self) -> VehicleState:
-        return self.belief.vehicle_state()
+        return scaled(self.belief.vehicle_state(), self.scale)
 
 
-@at_scale
 class CkfMapper(_Filter):
     """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points."""
 
@@ -141,11 +141,11 @@ class CkfMapper(_Filter):
     def map(self) -> Map:
         state = self.state
         curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
-        return Map(self.closed, curves, state.belief.covariance[HEAD:, HEAD:].copy())
+        return scaled(Map(self.closed, curves, state.belief.covariance[HEAD:, HEAD:].copy()), self.scale)
 
     def outline(self) -> Map:
         curves = {b: SplineBoundary(self.state.spline(b), NO_COVARIANCE) for b in self.state.curves}
-        return Map(self.closed, curves)
+        return scaled(Map(self.closed, curves), self.scale)
 
 
 def associate_early_segment(
@@ -225,7 +225,6 @@ def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
         state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 
-@at_scale
 class LandmarkCkf(_Filter):
     """Maps cones as points: predict, associate, update, create.
 
@@ -293,7 +292,8 @@ class LandmarkCkf(_Filter):
             self.labels = np.concatenate([self.labels, detections.labels[rows]])
 
     def map(self) -> Map:
-        return point_map(self.belief.points, self.labels, self.belief.covariance[HEAD:, HEAD:], False)
+        covariance = self.belief.covariance[HEAD:, HEAD:]
+        return scaled(point_map(self.belief.points, self.labels, covariance, False), self.scale)
 
     def outline(self) -> Map:
-        return point_map(self.belief.points, self.labels, None, False)
+        return scaled(point_map(self.belief.points, self.labels, None, False), self.scale)

@@ -28,8 +28,8 @@ from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.run import settings_dict, split_odometry
-from pathspace_graph.scale import log_at_scale
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.scale import solved
+from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 from . import landmark_association as association
 from .landmark_association import GATES, find_duplicates
@@ -43,26 +43,29 @@ MAX_STEPS: Final = 80  # most steps of a round's optimization
 TOLERANCE: Final = 1e-6  # largest relative gain of the last step
 
 
-@log_at_scale
 class LandmarkBatch:
     """Maps cones as points with all poses of a log; the start is the online run of `LandmarkFixedLag`."""
 
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
-        self.settings = settings or MapperSettings()
-        self.noise = known_noise(odometry_sigma)
+        self.settings = known_settings(settings)
+        self.odometry_sigma = odometry_sigma
+        known_noise(odometry_sigma)  # a wrong one is refused here
 
     def solve(self, log: Log) -> BatchRun:
-        system = LandmarkSystem.of_log(log, self.settings, self.noise)
-        system, state = start_online(log, system, self.noise)
+        return solved(self._solve, log, self.settings)
+
+    def _solve(self, log: Log, scale: float) -> BatchRun:
+        noise = known_noise(self.odometry_sigma, scale)
+        system, state = start_online(log, LandmarkSystem.of_log(log, self.settings, noise), noise)
         system.optimize(state)
         for _ in range(MAX_ROUNDS):
             converged = self._refresh(system, state) <= SETTLED * len(system.detections)
             system.optimize(state)
             if converged:
                 break
-        return self._result(system, state, converged)
+        return self._result(system, state, scale, converged)
 
     def _refresh(self, system: "LandmarkSystem", state: LandmarkState) -> int:
         detections, before, known = system.detections, system.detections.landmark.copy(), len(state)
@@ -73,13 +76,15 @@ class LandmarkBatch:
         remove_rare(state, detections, self.settings.growth.sightings)
         return int((before != detections.landmark).sum())
 
-    def _result(self, system: "LandmarkSystem", state: LandmarkState, converged: bool) -> BatchRun:
+    def _result(
+        self, system: "LandmarkSystem", state: LandmarkState, scale: float, converged: bool
+    ) -> BatchRun:
         laps, problem, poses = LapCounter(), system.eliminated(state), state.variables.poses.copy()
         for pose in poses:
             laps.update(pose)
         return BatchRun(
             estimator=NAME,
-            settings=settings_dict(self.settings),
+            settings=settings_dict(replace(self.settings, scale=scale)),
             map=point_map(state.landmarks, state.labels, problem.joint(state.keys), laps.completed > 0),
             trajectory_t=system.chain.stamps,
             trajectory=poses,
@@ -142,8 +147,8 @@ class LandmarkSystem:
 
 def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[LandmarkSystem, LandmarkState]:
     """Return the last map of the online run, with each pose and association as it left the window."""
-    online, detections = LandmarkFixedLag(system.settings, noise), system.detections
-    smoother, track = online.smoother, online.smoother.map
+    online = LandmarkFixedLag(replace(system.settings, scale=1.0), noise)
+    detections, smoother, track = system.detections, online.smoother, online.smoother.map
     poses = np.zeros((len(log.cycles), POSE))
     landmark = np.full(len(detections), UNASSOCIATED, np.intp)
     begins = np.searchsorted(detections.cycle, np.arange(len(log.cycles)))

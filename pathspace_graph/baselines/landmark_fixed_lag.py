@@ -18,14 +18,14 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.lengths import POSE, scaled, times
 from pathspace_graph.mapping import motion as motions
 from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
-from pathspace_graph.scale import at_scale
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 from . import landmark_association as association
 from .landmark_association import CREATE, GATES, difference_covariances, find_duplicates, squared_mahalanobis
@@ -36,7 +36,6 @@ MIN_PAIRS: Final = 4  # recognized landmarks that close the loop, a third of the
 MIN_LEAD: Final = 2.0  # over any other set of pairs, where each landmark counts as one gate
 
 
-@at_scale
 class LandmarkFixedLag:
     """Maps cones as points: predict, associate, create, update, close, marginalize.
 
@@ -47,8 +46,10 @@ class LandmarkFixedLag:
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
-        self.settings = settings or MapperSettings()
-        self.front_end = FrontEnd(self.settings, motions.known_noise(odometry_sigma))
+        self.settings = known_settings(settings)
+        self.scale = self.settings.scale or 1.0
+        noise = motions.known_noise(odometry_sigma, self.scale)
+        self.front_end = FrontEnd(self.settings, noise, self.scale)
         self.smoother = FixedLagSmoother(motions.smoother_settings(self.settings), LandmarkMap(self.settings))
         self.smoother.window.exact = True
         self.path = DrivenPath()
@@ -159,14 +160,15 @@ class LandmarkFixedLag:
         if len(state) == 0:
             return Map(self.closed, {})
         joint = self.smoother.last_covariance(state.keys)
-        return point_map(state.landmarks, state.labels, joint, self.closed)
+        return scaled(point_map(state.landmarks, state.labels, joint, self.closed), self.scale)
 
     def outline(self) -> Map:
         state = self.smoother.map.state
-        return point_map(state.landmarks, state.labels, None, self.closed)
+        return scaled(point_map(state.landmarks, state.labels, None, self.closed), self.scale)
 
     def window_poses(self) -> Array:
-        return self.smoother.variables.poses.copy()
+        poses: Array = times(self.smoother.variables.poses.copy(), POSE, self.scale)
+        return poses
 
     def readings(self) -> Readings:
         table, state = self.smoother.map.detections, self.smoother.map.state
@@ -175,13 +177,13 @@ class LandmarkFixedLag:
         points = table.points_map(rows, self.smoother.variables)
         feet = np.full(points.shape, np.nan)
         feet[used] = state.landmarks[state.positions(table.landmark[rows[used]])]
-        return Readings(points, table.label[rows], used, feet)
+        return scaled(Readings(points, table.label[rows], used, feet), self.scale)
 
     def noise_used(self) -> RunNoise:
-        return self.front_end.noise_used
+        return scaled(self.front_end.noise_used, self.scale)
 
     def vehicle_state(self) -> VehicleState:
-        return vehicle_state(self.smoother)
+        return scaled(vehicle_state(self.smoother), self.scale)
 
 
 class JointCompatibility:

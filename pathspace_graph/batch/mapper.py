@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, MutableSequence, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import ClassVar, Final
 
 import gtsam
@@ -43,8 +43,8 @@ from pathspace_graph.mapping.motion import known_noise, size_of_vehicle, with_in
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict
-from pathspace_graph.scale import log_at_scale
-from pathspace_graph.settings.mapper import MapperSettings, Start
+from pathspace_graph.scale import solved
+from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 from pathspace_graph.spline.boundary import Boundary
 
 from .lap import disagreement, objection, share_used
@@ -262,7 +262,6 @@ class BatchResult(BatchRun):
         return variables.gtsam_values(variables.keys)
 
 
-@log_at_scale
 class BatchMapper:
     """Mapper of a whole log at once."""
 
@@ -276,9 +275,10 @@ class BatchMapper:
 
         `online` makes the online mapper whose map the optimization begins with, if not at odometry.
         """
-        self.settings = settings or MapperSettings()
+        self.settings = known_settings(settings)
         self.online = online
-        self.noise = known_noise(odometry_sigma)
+        self.odometry_sigma = odometry_sigma
+        known_noise(odometry_sigma)  # a wrong one is refused here
 
     def solve(
         self, log: Log, start: Start | None = None, on_round: Callable[[], None] | None = None
@@ -289,12 +289,17 @@ class BatchMapper:
         SettingsError if there is no online mapper to begin with, and SolveError where the log leaves no way
         to an optimum.
         """
-        watch = Stopwatch()
-        judged = judge_log(log, self.noise, own_settings(self.settings))
+        return solved(partial(self._solve, start, on_round), log, self.settings)
+
+    def _solve(
+        self, start: Start | None, on_round: Callable[[], None] | None, log: Log, scale: float
+    ) -> BatchResult:
+        watch, noise = Stopwatch(), known_noise(self.odometry_sigma, scale)
+        judged = judge_log(log, noise, own_settings(self.settings))
         settings, chain = judged.settings, judged.chain
         watch.lap("integrate")
         start = start or self.settings.batch.start
-        optimizer, found, online = self._search(log, judged, start, on_round, watch)
+        optimizer, found, online = self._search(log, judged, noise, start, on_round, watch)
         system = optimizer.system
         at, convergence, known = _with_wider_priors(optimizer, *found)
         watch.lap("optimum")
@@ -310,7 +315,7 @@ class BatchMapper:
         records, laps = _records(state, detections, chain, sum(watch.laps.values()))
         return BatchResult(
             estimator=NAME,
-            settings=settings_dict(self.settings),
+            settings=settings_dict(replace(self.settings, scale=scale)),
             map=replace(_map(state, joint, scatter), points=_orange(judged, at.state, settings)),
             scatter=scatter,
             trajectory_t=chain.stamps,
@@ -332,7 +337,13 @@ class BatchMapper:
         )
 
     def _search(
-        self, log: Log, judged: JudgedLog, start: Start, on_round: Callable[[], None] | None, watch: Stopwatch
+        self,
+        log: Log,
+        judged: JudgedLog,
+        noise: KnownNoise,
+        start: Start,
+        on_round: Callable[[], None] | None,
+        watch: Stopwatch,
     ) -> tuple[Optimizer, Found, RunResult | None]:
         """Return the optimum with its optimizer, and the online run that the search began with, if it did."""
         revisits: Sequence[Revisit] = ()
@@ -348,7 +359,7 @@ class BatchMapper:
         if self.online is None:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
         watch.lap("optimum")
-        mapper = self.online(replace(self.settings, scale=1.0), self.noise)
+        mapper = self.online(replace(self.settings, scale=1.0), noise)
         state, online = start_online(log, mapper)
         watch.lap("start")
         optimizer, found = _optimizer(judged, on_round), None

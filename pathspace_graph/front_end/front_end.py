@@ -53,9 +53,10 @@ class Reading:
 class FrontEnd:
     """Judge of each cycle's readings by those of the cycles before, without any map."""
 
-    def __init__(self, settings: MapperSettings, noise: KnownNoise) -> None:
+    def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
+        """Begin with the noise known at scale 1; cycles come in metres of a scene of the scale."""
         self.noise = NoiseLearner(noise, settings.noise)
-        self.gate = Gate(settings.limits)
+        self.gate = Gate(settings.limits, scale)
         self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
         self._settings = settings
         self._begun = self._sensor_doubted = False
@@ -117,7 +118,7 @@ class JudgedLog:
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
-    """Return a log as the front end gives it to a batch; unknown noise is measured on all of it first."""
+    """Return a log of scale 1 as the front end gives it to a batch; unknown noise is measured on it first."""
     front_end = FrontEnd(settings, noise)
     if front_end.noise.is_learning:
         front_end = FrontEnd(settings, replace(noise, measured=measure_log(log)))

@@ -2,6 +2,7 @@
 
 A wrong stamp, shape, label or twist makes the whole cycle useless, which is a ReadingError and changes
 nothing. A single detection that is impossible is dropped: a detector may fail for one cone.
+A cycle comes in metres of its scene and leaves the gate at scale 1; its result goes back by the scale.
 """
 
 from dataclasses import dataclass, replace
@@ -26,9 +27,9 @@ from pathspace_graph.io.log import (
     read_log,
 )
 from pathspace_graph.labels import LEFT, NAMES
-from pathspace_graph.lengths import Length, Text, joined, scaled
+from pathspace_graph.lengths import joined, scaled
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.scale import in_scene, scale_of
+from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
 
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
@@ -55,16 +56,18 @@ class Newest:
 
 @dataclass(frozen=True, eq=False)
 class Admitted:
-    """A perception cycle that may be used, in arrays of its own."""
+    """A perception cycle that may be used, at scale 1 and in arrays of its own."""
 
     odometry: Odometry  # twists in force from the newest cycle to this one
     detections: Detections
     dropped: int = 0
     refused: int = 0  # number of cycles that were refused since the last one that was used
     notice: str = ""  # what was dropped, in the first of the cycles in which that happens
+    scale: float = 1.0  # size of the scene, in whose metres the cycle came
 
     def counted(self, result: CycleResult) -> CycleResult:
-        """Return the result of the cycle with what was counted at the gate."""
+        """Return the result of the cycle in metres of its scene, with what was counted at the gate."""
+        result = scaled(result, self.scale)
         if not (self.dropped or self.refused):
             return result
         notice = joined([self.notice, result.notice])
@@ -74,8 +77,9 @@ class Admitted:
 class Gate:
     """Check of each cycle, which counts refused cycles."""
 
-    def __init__(self, limits: LimitSettings) -> None:
-        self.limits = limits
+    def __init__(self, limits: LimitSettings, scale: float = 1.0) -> None:
+        self.scale = scale
+        self.limits = scaled(limits, scale)  # in metres of the scene
         self.refused = 0  # number of cycles that were refused since the last one that was used
         self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
         self._dropping = False
@@ -93,15 +97,16 @@ class Gate:
             silence = inf  # a cycle that goes on from the one just refused: two that agree end a silence
         t = _stamp(_of_type(Detections, detections, "detections").t)
         try:
-            possible, notice = possible_detections(detections, t, self.limits)
+            possible, notice = possible_detections(detections, t, self.limits, self.scale)
             stamps, twists = _checked_twists(_of_type(Odometry, odometry, "odometry"), self.limits)
             _check_order(stamps, t, newest.t, silence)
-            stamps, twists = _since(stamps, twists, newest)
         except ReadingError as error:
             raise error.at(t) from None
         dropped, notice = len(detections.labels) - len(possible.labels), "" if self._dropping else notice
         self.refused, self._refused_at, self._dropping = 0, None, dropped > 0
-        return Admitted(Odometry(stamps, twists), possible, dropped, refused, notice)
+        to_one = 1.0 / self.scale
+        since = _since(scaled(Odometry(stamps, twists), to_one), newest)
+        return Admitted(since, scaled(possible, to_one), dropped, refused, notice, self.scale)
 
     def refuse(self) -> None:
         self.refused += 1
@@ -109,13 +114,13 @@ class Gate:
 
 def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
     """Read a log whose cycles may all be used; otherwise raise an InputError with file, row and stamp."""
-    log, newest, gate = read_log(folder), Newest(), Gate(limits)
-    scale = scale_of(log)
-    for odometry, detections in split_odometry(scaled(log, 1.0 / scale)):
+    log, newest = read_log(folder), Newest()
+    gate = Gate(limits, scale_of(log))
+    for odometry, detections in split_odometry(log):
         try:
             admitted = gate.admit(odometry, detections, newest)
         except ReadingError as error:
-            raise _of_file(in_scene(error, scale), folder, log, odometry) from error
+            raise _of_file(error, folder, log, odometry) from error
         newest = Newest(detections.t, admitted.odometry.twist[-1] if len(admitted.odometry.t) else None)
     return log
 
@@ -176,9 +181,6 @@ def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, A
         row, column = divmod(int(good.argmin()), len(TWIST))
         name, unit = list(TWIST.items())[column]
         expected = f"{name} from -{most[column]:g} to {most[column]:g} {unit}"
-        if unit == "m/s":
-            limit = Length(most[column])
-            expected = Text("{name} from -{limit:g} to {limit:g} m/s", name=name, limit=limit)
         raise ReadingError("odometry.twist", expected, float(twists[row, column]), row)
     return stamps, twists
 
@@ -189,57 +191,49 @@ def _require(good: BoolArray, field: str, expected: str, values: NDArray[Any]) -
         raise ReadingError(field, expected, values[row].item(), row)
 
 
-def _since(stamps: Array, twists: Array, newest: Newest) -> tuple[Array, Array]:
-    """Return the stamps (k,) and twists (k, 3) in force since the newest cycle, the first from there on."""
+def _since(odometry: Odometry, newest: Newest) -> Odometry:
+    """Return the twists in force since the newest cycle, the first from there on."""
     if newest.t is None:
-        return stamps, twists
+        return odometry
+    stamps, twists = odometry.t, odometry.twist
     first = int(stamps.searchsorted(newest.t, side="right")) - 1
     if first >= 0:
         stamps, twists = stamps[first:], twists[first:]
         stamps[0] = newest.t
     elif newest.twist is not None:
         stamps, twists = np.append(newest.t, stamps), np.concatenate([newest.twist[None], twists])
-    return stamps, twists
+    return Odometry(stamps, twists)
 
 
-def possible_detections(detections: Detections, t: float, limits: LimitSettings) -> tuple[Detections, str]:
-    """Return the possible detections of a cycle at t (s), and a notice about the others."""
+def possible_detections(
+    detections: Detections, t: float, limits: LimitSettings, scale: float
+) -> tuple[Detections, str]:
+    """Return the possible detections of a cycle at t (s), and a notice about the others.
+
+    They are in metres of a scene of the scale, and so are the limits.
+    """
     points = _numbers(detections.points_vehicle, "detections.points_vehicle", (-1, 2))
     count = len(points)
     covariances = _numbers(detections.covariances, "detections.covariances", (count, 2, 2))
     labels = _labels(detections.labels, count)
     if count > MAX_DETECTIONS:
         raise ReadingError("detections.points_vehicle", f"at most {MAX_DETECTIONS} rows", count)
-    possible = MIN_RANGE, limits.range_max, MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA, MAX_SIGMA
-    near, definite = _usable(points, covariances, possible)
+    ranges, sigmas = (MIN_RANGE * scale, limits.range_max), (MIN_SIGMA * scale, MAX_SIGMA * scale)
+    near, definite = _usable(points, covariances, (*ranges, MAX_ASYMMETRY, MIN_DETERMINANT, *sigmas))
     good = near & definite
     if good.all():
         return Detections(t, points, covariances, labels), ""
     row = int(good.argmin())
-    expected, found = _impossible(points[row], covariances[row], near[row], limits)
-    notice = Text(
-        "{dropped} of {count} detections dropped: expected {expected}, found {found} in row {row}",
-        dropped=count - int(good.sum()),
-        count=count,
-        expected=expected,
-        found=found,
-        row=row,
-    )
+    if near[row]:
+        (xx, xy), (yx, yy) = covariances[row].tolist()
+        expected = f"a covariance with sigmas from {sigmas[0]:g} to {sigmas[1]:g} m"
+        found = f"[[{xx:g}, {xy:g}], [{yx:g}, {yy:g}]]"
+    else:
+        expected = f"a distance from {ranges[0]:g} to {ranges[1]:g} m"
+        found = f"[{points[row, 0]:g}, {points[row, 1]:g}]"
+    dropped = f"{count - int(good.sum())} of {count} detections dropped"
+    notice = f"{dropped}: expected {expected}, found {found} in row {row}"
     return Detections(t, points[good], covariances[good], labels[good]), notice
-
-
-def _impossible(point: Array, covariance: Array, is_near: bool, limits: LimitSettings) -> tuple[Text, Text]:
-    """Return what was expected of a detection, and what was found: its position (2,) or covariance (2, 2)."""
-    if not is_near:
-        low, high = Length(MIN_RANGE), Length(limits.range_max)
-        x, y = map(Length, point.tolist())
-        expected = Text("a distance from {low:g} to {high:g} m", low=low, high=high)
-        return expected, Text("[{x:g}, {y:g}]", x=x, y=y)
-    low, high = Length(MIN_SIGMA), Length(MAX_SIGMA)
-    entries = dict(zip(("xx", "xy", "yx", "yy"), covariance.ravel().tolist(), strict=True))
-    squares = {name: Length(entry, power=2) for name, entry in entries.items()}
-    expected = Text("a covariance with sigmas from {low:g} to {high:g} m", low=low, high=high)
-    return expected, Text("[[{xx:g}, {xy:g}], [{yx:g}, {yy:g}]]", **squares)
 
 
 @compiled

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass, field, replace
 from math import inf
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
@@ -14,7 +15,7 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, pose_ke
 from pathspace_graph.graph.window import MapRows, SmootherSettings
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.scale import positive_sigmas
+from pathspace_graph.lengths import scaled
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.settings.online import OdometrySettings
 
@@ -66,16 +67,29 @@ class MeasuredMotion:
         return "the detections contradict the odometry" if self.doubted else ""
 
 
-def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
-    """Return what is known of the noise before a drive, by default that of the simulator, not stated.
+def known_noise(sigma: Array | KnownNoise | None, scale: float = 1.0) -> KnownNoise:
+    """Return what is known of the noise before a drive, at scale 1; by default the simulator's, not stated.
 
-    An array (3,) states the standard deviations of a twist (m/s, m/s, rad/s). SettingsError is raised for
-    anything but three positive numbers.
+    What is given is in metres of a scene of the scale. An array (3,) states the standard deviations of a
+    twist (m/s, m/s, rad/s). SettingsError is raised for anything but three positive numbers.
     """
+    if sigma is None:
+        return KnownNoise(np.array(ODOMETRY_SIGMA), odometry_stated=False)
     if not isinstance(sigma, KnownNoise):
-        stated = sigma is not None
-        sigma = KnownNoise(np.array(sigma if stated else ODOMETRY_SIGMA), odometry_stated=stated)
-    return replace(sigma, odometry=positive_sigmas(sigma.odometry))
+        sigma = KnownNoise(sigma)
+    return scaled(replace(sigma, odometry=_positive_sigmas(sigma.odometry)), 1.0 / scale)
+
+
+def _positive_sigmas(values: Any) -> Array:
+    """Return the standard deviations (3,) of a twist; SettingsError for anything but positive numbers."""
+    try:
+        sigmas = np.array(values, float)
+    except (TypeError, ValueError):
+        sigmas = np.zeros(0)
+    if sigmas.shape != (3,) or not ((sigmas > 0.0) & (sigmas < np.inf)).all():
+        found = values.tolist() if isinstance(values, np.ndarray) else values
+        raise SettingsError(f"odometry_sigma: expected 3 positive numbers, found {found!r:.80}")
+    return sigmas
 
 
 def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:

@@ -19,6 +19,8 @@ from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.graph.window import as_nonlinear
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import LapBatches, VehicleState
+from pathspace_graph.lengths import POSE as POSE_LENGTHS
+from pathspace_graph.lengths import scaled, times
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.detections import NO_STATION
@@ -28,7 +30,7 @@ from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones
 from pathspace_graph.run import Readings
 from pathspace_graph.settings.mapper import GaugeSettings, MapperSettings
-from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, track_ahead
+from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, check_line, track_ahead
 from pathspace_graph.spline.boundary import Boundary
 
 from .growth import Growth
@@ -39,6 +41,7 @@ class MapperEstimate:
     """What a fixed-lag mapper can be asked; to ask changes nothing of the estimate."""
 
     settings: MapperSettings
+    scale: float
     smoother: CurveSmoother
     path: DrivenPath
     growth: Growth
@@ -59,7 +62,7 @@ class MapperEstimate:
         An open curve goes on beyond its confirmed end, as `outline` says.
         """
         with self.looked_at():
-            return replace(self._map(), points=self.orange.points())
+            return scaled(replace(self._map(), points=self.orange.points()), self.scale)
 
     def _map(self) -> Map:
         """Return the map without points; a closed curve with few control points has its scatter added."""
@@ -94,7 +97,7 @@ class MapperEstimate:
                 label: SplineBoundary(outlook.spline, NO_COVARIANCE, outlook.confirmed_until)
                 for label, outlook in self._outlooks().items()
             }
-        return Map(self.closed, boundaries, points=self.orange.points())
+        return scaled(Map(self.closed, boundaries, points=self.orange.points()), self.scale)
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
         """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
@@ -103,10 +106,14 @@ class MapperEstimate:
         ends through the cones of `outline`, and says where. While the vehicle is lost on a closed map, it is
         the road as mapped since then. SettingsError is raised where a length is out of its range.
         """
+        check_line(distance, step, self.scale)
+        return scaled(self._ahead(distance / self.scale, step / self.scale), self.scale)
+
+    def _ahead(self, distance: float, step: float) -> TrackAhead:
         if not self.smoother.times:
             return track_ahead({}, np.zeros(POSE), distance, step)
         if self.new_road is not None:
-            return self.new_road.ahead(distance, step)
+            return self.new_road._ahead(distance, step)
         pose, state = self.poses[-1], self.smoother.map.state
         if not self.closed:
             t = self.smoother.times[-1]
@@ -140,12 +147,12 @@ class MapperEstimate:
             on = np.flatnonzero(used & (boundary == label))
             if len(on):
                 feet[on] = curve.evaluate(track.state.control_points(label), table.u[newest][on])
-        return Readings(points, boundary, used, feet)
+        return scaled(Readings(points, boundary, used, feet), self.scale)
 
     def vehicle_state(self) -> VehicleState:
         """Return the newest pose and the calibration, with their joint covariance."""
         with self.looked_at():
-            return vehicle_state(self.smoother, self.loop.sigma_size)
+            return scaled(vehicle_state(self.smoother, self.loop.sigma_size), self.scale)
 
     def _outlooks(self) -> dict[int, Outlook]:
         self.smoother.refresh()
@@ -230,7 +237,7 @@ class MapperEstimate:
 
     def smoothed(self, t: Array) -> Array:
         """Return the corrected poses (n, 3) of the cycles at stamps (n,); NaN after the last of them."""
-        poses = self.corrected_poses
+        poses: Array = times(self.corrected_poses, POSE_LENGTHS, self.scale)
         stamps = np.array(self.loop.record.stamps[: len(poses)])
         found, known = np.full((len(t), 3), np.nan), t <= stamps.max(initial=-np.inf)
         found[known] = poses[np.maximum(stamps.searchsorted(t[known], side="right") - 1, 0)]
@@ -281,7 +288,8 @@ class MapperEstimate:
 
     def window_poses(self) -> Array:
         """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
-        return self.poses.copy()
+        poses: Array = times(self.poses.copy(), POSE_LENGTHS, self.scale)
+        return poses
 
     @property
     def calibration(self) -> Array:

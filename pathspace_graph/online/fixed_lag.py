@@ -19,7 +19,7 @@ from pathspace_graph.health import GOOD
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.lengths import joined
+from pathspace_graph.lengths import joined, scaled
 from pathspace_graph.loop.closing import simplify
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.motion import known_noise, predict
@@ -27,8 +27,7 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.scale import at_scale
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, known_settings
 from pathspace_graph.snapshot import restore, save
 
 from .estimate import MapperEstimate
@@ -37,7 +36,6 @@ from .growth import Growth
 ROAD: Final = 10.0  # length of both boundaries beside a lost vehicle that make a road (m)
 
 
-@at_scale
 class FixedLagMapper(MapperEstimate):
     """Both boundaries of a track, mapped cycle by cycle as splines in one factor graph with the poses.
 
@@ -49,10 +47,12 @@ class FixedLagMapper(MapperEstimate):
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
-        self.settings = settings or MapperSettings()
-        noise = known_noise(odometry_sigma)
+        self.settings = known_settings(settings)
+        self.scale = self.settings.scale or 1.0
+        """Size of the scene: a cycle comes in its metres, and so does what is asked for."""
+        noise = known_noise(odometry_sigma, self.scale)
         self.odometry_sigma = noise.odometry
-        self.front_end = FrontEnd(self.settings, noise)
+        self.front_end = FrontEnd(self.settings, noise, self.scale)
         self.smoother = CurveSmoother(self.settings)
         """Variables, factors of the window, and the prior."""
         self.path = DrivenPath()
@@ -279,7 +279,7 @@ class FixedLagMapper(MapperEstimate):
 
     def noise_used(self) -> RunNoise:
         """Return the noise that is used now, and what was measured so far."""
-        return self.front_end.noise_used
+        return scaled(self.front_end.noise_used, self.scale)
 
     def save(self, path: Path | str) -> None:
         """Write the whole mapper to one file, from which `restore` makes one that goes on to the same map.

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, check_type
 
 from .checked import Positive
 from .online import (
@@ -230,7 +230,8 @@ class MapperSettings(Positive):
     of the sensor are measured unless this is `stated`."""
     scale: float | None = None
     """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road. All
-    lengths of the settings are those at scale 1. By default the first metres of the drive tell it."""
+    lengths of the settings are those at scale 1. By default the first metres of the log tell it; an online
+    estimator that is made without one takes it as 1."""
     limits: LimitSettings = field(default_factory=LimitSettings)
     spline: SplineSettings = field(default_factory=SplineSettings)
     gauge: GaugeSettings = field(default_factory=GaugeSettings)
@@ -262,3 +263,10 @@ class MapperSettings(Positive):
 
 ODOMETRY_SIGMA = (0.25, 0.12, 0.035)
 """Standard deviations of a twist (m/s, m/s, rad/s) where none are given; they are the simulator's."""
+
+
+def known_settings(settings: MapperSettings | None) -> MapperSettings:
+    """Return the settings of an estimator, by default the defaults; SettingsError for anything else."""
+    settings = MapperSettings() if settings is None else settings
+    check_type("settings", settings, MapperSettings)
+    return settings

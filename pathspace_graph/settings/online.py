@@ -81,6 +81,7 @@ class LimitSettings(Positive, group="limits"):
     A cycle beyond that is refused; a single detection beyond the range is dropped instead.
     """
 
+    LENGTHS: ClassVar = {"speed": 1, "range_max": 1}
     UNLIMITED = ("silence",)
 
     speed: float = 100.0

@@ -16,7 +16,6 @@ from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.lengths import Length, Text
 
 from .bspline import dot
 from .centre_line import points_across
@@ -92,28 +91,32 @@ class TrackAhead:
 
 def too_short(name: str, least: float, found: object) -> SettingsError:
     """Return the error of a length that is less than `least` (m), or no number."""
-    number = Length(float(found)) if isinstance(found, Real) else repr(found)
-    expected = "{name}: expected a number of at least {least:g} m, found {found}"
-    return SettingsError(Text(expected, name=name, least=Length(least), found=number))
+    number = f"{float(found):g}" if isinstance(found, Real) else repr(found)
+    return SettingsError(f"{name}: expected a number of at least {least:g} m, found {number}")
 
 
-def check_length(name: str, length: float) -> None:
+def check_length(name: str, length: float, least: float = LEAST_STEP) -> None:
     """Raise a SettingsError unless a length (m) is a number of at least the shortest step."""
-    if not isinstance(length, Real) or not LEAST_STEP <= length < np.inf:
-        raise too_short(name, LEAST_STEP, length)
+    if not isinstance(length, Real) or not least <= length < np.inf:
+        raise too_short(name, least, length)
+
+
+def check_line(distance: float, step: float, scale: float) -> None:
+    """Raise a SettingsError unless a scene of this scale can have such a line ahead, in its metres."""
+    check_length("step", step, LEAST_STEP * scale)
+    if not isinstance(distance, Real):
+        raise SettingsError(f"distance: expected a number (m), found {distance!r}")
+    if not 0.0 < distance < np.inf:
+        raise SettingsError(f"distance: expected a positive number (m), found {distance:g}")
+    if distance > MOST_POINTS * step:
+        raise too_short("step", distance / MOST_POINTS, step)
 
 
 def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:
     """Return the next `distance` metres from a pose (x, y, theta), at points `step` (m) apart.
 
-    `curves` are the known boundaries by label. SettingsError where a length is out of its range.
+    `curves` are the known boundaries by label. The lengths have passed `check_line`.
     """
-    check_length("step", step)
-    if not 0.0 < distance < np.inf:
-        found = Length(distance)
-        raise SettingsError(Text("distance: expected a positive number (m), found {found:g}", found=found))
-    if distance > MOST_POINTS * step:
-        raise too_short("step", distance / MOST_POINTS, step)
     samples = {label: _sampled(curve, distance) for label, curve in curves.items()}
     sides = [np.zeros((0, 2)) for _ in BOUNDARIES]
     for label, one in samples.items():

@@ -22,25 +22,27 @@ from hypothesis import strategies as st
 from pathspace_graph.baselines.filters import CkfMapper
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.errors import ReadingError, SettingsError
+from pathspace_graph.errors import InputError, ReadingError, SettingsError
 from pathspace_graph.estimators import ONLINE, make_batch, make_online
 from pathspace_graph.eval.metrics.measures import measure
 from pathspace_graph.eval.metrics.summary import laps_of, summarize
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
+from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.health import Health
-from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.lengths import Length, Text, joined, scaled
+from pathspace_graph.lengths import POSE, Length, Text, joined, scaled, times
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.diagnosis import diagnose, measured_line
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.run import CycleResult, run_online, split_odometry
-from pathspace_graph.scale import JUDGED, SceneScale, scale_of, width_and_gap
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.scale import ENOUGH, PATIENCE, SCALES, SceneScale, scale_of, width_and_gap
+from pathspace_graph.settings.mapper import BatchSettings, MapperSettings
+from pathspace_graph.settings.online import GrowthSettings, LimitSettings
 from pathspace_graph.sim.mistakes import in_frame
+from pathspace_graph.spline.bspline import BSpline
 
 from ..scenes.drives import ODOMETRY_SIGMA, short_drive
 from ..scenes.paths import modules
@@ -99,7 +101,7 @@ def test_a_cone_that_is_detected_twice_is_one() -> None:
     ],
 )
 def test_the_scale_is_what_width_and_gap_agree_on(width: float, gap: float, scale: float) -> None:
-    scene = driven(road(width, gap), speed=2.0 * gap, count=JUDGED[-1] + 1)
+    scene = driven(road(width, gap), speed=2.0 * gap, count=ENOUGH + 1)
     assert scene.value == scale
     assert scene.is_final
 
@@ -110,10 +112,20 @@ def test_a_vehicle_at_rest_learns_nothing_more() -> None:
     assert not scene.is_final
 
 
-def test_a_given_scale_is_final() -> None:
-    scene = SceneScale(2.5)
-    scene.see(STANDING, road(0.35, 0.32))
-    assert (scene.value, scene.is_final) == (2.5, True)
+def test_a_scale_that_is_final_does_not_change() -> None:
+    scene = driven(road(0.35, 0.32), speed=2.0, count=ENOUGH)
+    for k in range(2 * ENOUGH):
+        odometry = Odometry(np.array([3.0 + k]), np.array([[10.0, 0.0, 0.0]]))
+        scene.see(odometry, replace(road(3.5, 3.2), t=4.0 + k))
+    assert (scene.value, scene.is_final) == (0.1, True)
+
+
+def test_a_scene_without_a_road_is_taken_as_one_of_scale_one_in_the_end() -> None:
+    one_side = road(0.35, 0.32).where(np.arange(10) < 5)
+    scene = driven(one_side, speed=2.0, count=PATIENCE - 1)
+    assert not scene.is_final
+    scene.see(STANDING, one_side)
+    assert (scene.value, scene.is_final) == (1.0, True)
 
 
 # --- records ---------------------------------------------------------------------------------------------
@@ -227,6 +239,27 @@ def assert_alike(found: RunResult, known: RunResult, scale: float) -> None:
         )
 
 
+ANSWERS = ("map", "outline", "readings", "vehicle_state", "noise_used", "window_poses")
+"""Methods of an estimator that return what has lengths."""
+
+
+def assert_same(found: Any, known: Any) -> None:
+    """Two records agree in all of their numbers, to rounding; what holds no numbers isn't compared."""
+    assert type(found) is type(known)
+    if is_dataclass(known):
+        for field in fields(known):
+            assert_same(getattr(found, field.name), getattr(known, field.name))
+    elif isinstance(known, dict) and known:
+        assert found.keys() == known.keys()
+        for key in known:
+            assert_same(found[key], known[key])
+    elif isinstance(known, BSpline):
+        assert_same(found.control_points, known.control_points)
+    elif isinstance(known, float | np.ndarray) and np.size(known):
+        largest = np.nanmax(np.abs(known), initial=0.0)
+        np.testing.assert_allclose(found, known, rtol=0.0, atol=1e-6 * largest)
+
+
 def online(log: Log, scale: float | None) -> RunResult:
     return run_online(log, FixedLagMapper(MapperSettings(scale=scale), log.odometry_sigma))
 
@@ -247,71 +280,86 @@ def test_a_batch_of_a_log_s_times_as_large_is_s_times_as_large() -> None:
     larger = scaled(log, 3.0)
     found = make_batch("spline", MapperSettings(), larger).solve(larger)
     assert_alike(found, known, 3.0)
+    assert found.settings["scale"] == 3.0
     np.testing.assert_allclose(found.vehicle.pose, known.vehicle.pose * [3.0, 3.0, 1.0], rtol=1e-6)
     np.testing.assert_allclose(
         found.pose_covariances[-1], known.pose_covariances[-1] * np.outer([3, 3, 1], [3, 3, 1]), rtol=1e-3
     )
 
 
+@pytest.mark.parametrize("name", ["spline", "landmark-batch"])
+def test_a_batch_with_a_given_scale_begins_with_an_online_run_at_scale_one(name: str) -> None:
+    log = replace(short_drive(), cycles=short_drive().cycles[:60])
+    own = BatchSettings(start="online")
+    one, ten = (
+        make_batch(name, MapperSettings(scale=s, batch=own), scaled(log, s)).solve(scaled(log, s))
+        for s in (1.0, 10.0)
+    )
+    weights = np.array([10.0, 10.0, 1.0])
+    np.testing.assert_allclose(ten.trajectory, one.trajectory * weights, rtol=0.0, atol=1e-5)
+    assert ten.map.size == one.map.size > 0
+
+
 @pytest.mark.parametrize("name", ONLINE)
-def test_an_estimator_finds_the_scale_without_reading_ahead(name: str) -> None:
-    """It begins anew with the scale that the first cycle tells; only what was said before differs."""
+def test_an_estimator_for_a_log_is_made_for_its_scale(name: str) -> None:
+    """From the first pose on, and whatever it is asked for, it is the one of scale 1 times the scale."""
     log = short_drive()
     log = replace(log, cycles=log.cycles[:60])
     small = scaled(log, 0.1)
     known = run_online(log, make_online(name, MapperSettings(scale=1.0), log))
     found = run_online(small, make_online(name, MapperSettings(), small))
-    assert found.scale == 0.1
-    np.testing.assert_allclose(
-        found.trajectory[1:], known.trajectory[1:] * [0.1, 0.1, 1.0], rtol=0.0, atol=1e-8
-    )
+    assert found.scale == found.settings["scale"] == 0.1
+    np.testing.assert_allclose(found.trajectory, known.trajectory * [0.1, 0.1, 1.0], rtol=0.0, atol=1e-8)
     assert found.map.size == known.map.size
 
 
-def test_an_estimator_begins_anew_where_more_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first cycles show a false scale; what was mapped with it is mapped again."""
-    log = short_drive()
-    log = replace(log, cycles=log.cycles[:40])
-    values = iter([0.1] * 4 + [1.0] * 100)
-
-    def see(scene: SceneScale, odometry: Odometry, detections: Detections) -> None:
-        scene.value = next(values)
-        scene.is_final = scene.value == 1.0
-
-    monkeypatch.setattr(SceneScale, "see", see)
-    found = run_online(log, FixedLagMapper(None, log.odometry_sigma))
-    monkeypatch.undo()
-    known = online(log, 1.0)
-    np.testing.assert_array_equal(found.trajectory[4:], known.trajectory[4:])
-    assert not np.array_equal(found.trajectory[:4], known.trajectory[:4])
-
-
-def test_what_a_mapper_is_asked_for_has_the_size_of_the_scene() -> None:
+@pytest.mark.parametrize("name", ["fixed-lag", "landmark-fixed-lag", "ckf", "landmark-ckf"])
+def test_what_an_estimator_is_asked_for_has_the_size_of_the_scene(name: str) -> None:
+    """Lengths of all that a method returns are ten times those at scale 1, or a tenth of them."""
     log = short_drive()
     log = replace(log, cycles=log.cycles[:60])
-    one, ten = (
-        FixedLagMapper(MapperSettings(scale=s), log.odometry_sigma * [s, s, 1.0]) for s in (1.0, 10.0)
-    )
-    for odometry, detections in split_odometry(log):
-        one.update(odometry, detections)
-        ten.update(scaled(odometry, 10.0), scaled(detections, 10.0))
-    np.testing.assert_allclose(ten.ahead(50.0, 10.0).points, 10.0 * one.ahead(5.0).points, atol=1e-6)
-    np.testing.assert_allclose(ten.ahead(50.0, 10.0).curvature, 0.1 * one.ahead(5.0).curvature, atol=1e-6)
-    np.testing.assert_allclose(ten.window_poses(), one.window_poses() * [10.0, 10.0, 1.0], atol=1e-6)
-    np.testing.assert_allclose(ten.readings().points, 10.0 * one.readings().points, atol=1e-6)
-    np.testing.assert_allclose(ten.vehicle_state().pose, one.vehicle_state().pose * [10, 10, 1], atol=1e-6)
-    assert ten.outline().size == one.outline().size
+    one, ten = (make_online(name, MapperSettings(scale=s), scaled(log, s)) for s in (1.0, 10.0))
+    for cycle, larger in zip(split_odometry(log), split_odometry(scaled(log, 10.0)), strict=True):
+        known, found = one.update(*cycle), ten.update(*larger)
+        assert_same(replace(found, stages={}), scaled(replace(known, stages={}), 10.0))
+    asked = {name for name in ANSWERS if hasattr(one, name)}
+    assert asked >= {"map", "outline", "vehicle_state", "noise_used"}
+    for method in asked:
+        known, found = getattr(one, method)(), getattr(ten, method)()
+        assert_same(found, times(known, POSE, 10.0))
+    if isinstance(one, FixedLagMapper):
+        assert_same(ten.ahead(50.0, 10.0), scaled(one.ahead(5.0), 10.0))
 
 
-def test_a_mapper_is_saved_while_it_still_learns_the_scale(tmp_path: Path) -> None:
+def test_the_smoothed_drive_has_the_size_of_the_scene() -> None:
+    log = short_drive()
+    one, ten = (FixedLagMapper(MapperSettings(scale=s)) for s in (1.0, 10.0))
+    t = np.array([log.cycles[0].t])
+    for mapper in (one, ten):
+        mapper.loop.record.stamps[:] = t.tolist()
+        mapper.loop.corrected_poses = np.array([[2.0, 3.0, 0.5]])
+    np.testing.assert_allclose(one.smoothed(t), [[2.0, 3.0, 0.5]])
+    np.testing.assert_allclose(ten.smoothed(t), [[20.0, 30.0, 0.5]])
+
+
+def test_a_mapper_that_is_given_no_scale_takes_scenes_as_they_are() -> None:
+    log = short_drive()
+    known = online(replace(log, cycles=log.cycles[:40]), 1.0)
+    found = online(replace(log, cycles=log.cycles[:40]), None)
+    np.testing.assert_array_equal(found.trajectory, known.trajectory)
+    assert found.scale == 1.0
+
+
+def test_a_saved_mapper_keeps_its_scale(tmp_path: Path) -> None:
     log = scaled(short_drive(), 0.1)
     log = replace(log, cycles=log.cycles[:30])
-    mapper = FixedLagMapper(None, log.odometry_sigma)
+    mapper = FixedLagMapper(MapperSettings(scale=0.1), log.odometry_sigma)
     cycles = [*split_odometry(log)]
     for cycle in cycles[:5]:
         mapper.update(*cycle)
     mapper.save(tmp_path / "early.snap")
     again = FixedLagMapper.restore(tmp_path / "early.snap")
+    assert again.scale == 0.1
     for cycle in cycles[5:]:
         np.testing.assert_array_equal(again.update(*cycle).pose, mapper.update(*cycle).pose)
     assert again.outline().size == mapper.outline().size > 0
@@ -328,15 +376,29 @@ def test_a_wrong_shape_is_refused_at_any_scale(kind: Any) -> None:
 @given(seed=st.integers(0, 10**6), strange=st.sampled_from([0.0, np.nan, np.inf, 1e308, 1e-308, -1e5]))
 @settings(max_examples=20, deadline=None)
 def test_no_detections_break_the_search_for_a_scale(seed: int, strange: float) -> None:
-    """Cones anywhere tell all kinds of scales, and the mapper begins anew with each of them."""
-    rng, mapper = np.random.default_rng(seed), FixedLagMapper(None, ODOMETRY_SIGMA)
+    """Cones anywhere tell one of the scales, at which a mapper can be made."""
+    rng, scene = np.random.default_rng(seed), SceneScale()
+    cycles = []
     for k in range(8):
         points = rng.normal(0.0, 10.0 ** rng.uniform(-1.0, 1.5), (12, 2))
         points[rng.integers(12), rng.integers(2)] = strange
         covariances = np.tile(1e-4 * np.eye(2), (12, 1, 1))
         cycle = Detections(0.1 * (k + 1), points, covariances, rng.integers(0, 3, 12))
-        result = mapper.update(Odometry(np.array([0.1 * k]), np.array([[5.0, 0.0, 0.1]])), cycle)
-        assert np.isfinite(result.pose).all()
+        cycles.append((Odometry(np.array([0.1 * k]), np.array([[5.0, 0.0, 0.1]])), cycle))
+        scene.see(*cycles[-1])
+    assert scene.value in SCALES
+    mapper = FixedLagMapper(MapperSettings(scale=scene.value), ODOMETRY_SIGMA)
+    for one in cycles:
+        assert np.isfinite(mapper.update(*one).pose).all()
+
+
+def test_a_log_is_read_by_the_limits_of_its_scene(tmp_path: Path) -> None:
+    log = scaled(short_drive(), 0.1)
+    log.odometry.twist[7, 0] = 12.0
+    write_log(log, tmp_path / "log")
+    with pytest.raises(InputError, match=r"vx from -10 to 10 m/s, found 12$") as error:
+        read_usable_log(tmp_path / "log", LimitSettings())
+    assert error.value.row == 7 + 2
 
 
 def test_a_refusal_has_the_lengths_of_the_scene() -> None:
@@ -354,7 +416,8 @@ def test_a_refusal_has_the_lengths_of_the_scene() -> None:
 
 def test_metrics_are_those_of_scale_one_times_the_scale() -> None:
     log = short_drive()
-    known, found = of_scale_one(), online(scaled(log, 10.0), None)
+    known, larger = of_scale_one(), scaled(log, 10.0)
+    found = run_online(larger, make_online("fixed-lag", MapperSettings(), larger))
     first, second = summarize(known, log), summarize(found, scaled(log, 10.0))
     assert second["scale"] == scale_of(scaled(log, 10.0)) == 10.0
     assert second["ate"] == pytest.approx(10.0 * first["ate"], rel=1e-6)

@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.front_end.gate import Gate
 
-NOT_ESTIMATED = ("lap_seconds", "late_cycles", "recovery", "_unused", "_first_pose", "_door")
-"""These attributes are times of the machine, what is kept for a failure or to begin anew, and caches."""
+NOT_ESTIMATED = ("lap_seconds", "late_cycles", "recovery", "_unused", "_first_pose")
+"""These attributes are times of the machine, what is kept for a failure, and caches."""
 
 
 def digest(estimator: object) -> str:

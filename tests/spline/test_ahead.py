@@ -12,7 +12,7 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry
-from pathspace_graph.spline.ahead import CurveAhead, track_ahead
+from pathspace_graph.spline.ahead import CurveAhead, check_line, track_ahead
 from pathspace_graph.spline.bspline import BSpline
 
 from ..scenes.drives import bean_track, lap_log, noisy
@@ -145,7 +145,7 @@ def test_nothing_is_known_before_the_first_cycle() -> None:
 )
 def test_lengths_out_of_range_are_refused(distance: float, step: float, message: str) -> None:
     with pytest.raises(SettingsError, match=message):
-        track_ahead(straights(), np.zeros(3), distance, step)
+        check_line(distance, step, 1.0)
 
 
 def test_a_drive_sees_its_centre_line_and_is_not_changed_by_looking() -> None:
