@@ -28,6 +28,7 @@ MIN_SHARE_BESIDE: Final = 0.3  # `MIN_SHARE` of a cluster beside a curve, whose 
 MIN_CONES: Final = 4  # least number of cones of a curve, below which none is removed
 STEP: Final = 1.0  # at which the curve's point nearest to a pose is searched for, m along the curve
 DIRECTION_PENALTY: Final = 100.0  # distance added in quadrature where the curve runs against a heading, m
+STRETCH: Final = 5.0  # most distance along the curve from a cone to the poses that pass it, m
 ROOM: Final = 2.0  # by which two poses may be farther apart along an open curve than was driven, m
 FOLD_COSINE: Final = 0.5  # a row of cones folds back where the cosine of its turn is less than minus this
 FOLD_DISTANCE: Final = 1.5  # from its nearer neighbour (m), below which a cone at such a turn is a duplicate
@@ -214,7 +215,10 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     cones = cones.merged(off_curve.where(off_curve.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
         pose_u = state.pose_u[label]
-        cones = along_drive(cones, state.poses[pose_u > pose_u[-1] - boundary.length], label)  # the last lap
+        lap = pose_u > pose_u[-1] - boundary.length  # the last one
+        apart = np.mod(cones.u[:, None] + begin - pose_u[lap], boundary.length)
+        own = np.minimum(apart, boundary.length - apart) < STRETCH
+        cones = along_drive(cones, state.poses[lap], own, label)
     return without_folds(cones, boundary.periodic)
 
 
@@ -228,13 +232,15 @@ def first_parameter(state: State, label: int) -> float:
     return float(state.pose_u[label][0]) if boundary.periodic else boundary.tables.low
 
 
-def along_drive(cones: Cones, lap: Array, label: int) -> Cones:
+def along_drive(cones: Cones, lap: Array, own: BoolArray, label: int) -> Cones:
     """Return the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
 
-    What stands behind the row belongs to another stretch, or is smeared between two rows by far detections.
+    `own` (k, l) are the poses beside each cone's own stretch of the curve: where one row bounds two lanes,
+    those of the other lane may be nearer. What stands behind the row belongs to another stretch, or is
+    smeared between two rows by far detections.
     """
-    offset = cones.points[:, None] - lap[:, :2]
-    nearest = (offset**2).sum(axis=2).argmin(axis=1)
+    square = ((cones.points[:, None] - lap[:, :2]) ** 2).sum(axis=2)
+    nearest = np.add(square, DIRECTION_PENALTY**2, out=square, where=~own).argmin(axis=1)
     ahead, left = to_vehicle(cones.points, lap[nearest]).T
     station, side = path_lengths(lap)[nearest] + ahead, SIDES[label] * left
     front = in_front_row(station, side, BESIDE, LATERAL_GAP)

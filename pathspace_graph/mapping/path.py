@@ -188,19 +188,19 @@ class End:
 def chain(candidates: Candidates, end: End | None) -> IntArray:
     """Return the indices of the candidates, sorted by station, that may follow one another.
 
-    A candidate i may follow the end of the curve if `side_i <= side_end + LATERAL_CHANGE + LATERAL_RATE
-    (s_i - s_end)`; without a curve the first candidate takes the place of the end. All are held against the
-    end, or a row would drift to the next lane's, step by step. Of candidates at about the same station only
-    those nearest to the path remain: a second row is of another stretch of the track.
+    A candidate i may follow a cone j of the row if `side_i <= side_j + LATERAL_CHANGE + LATERAL_RATE (s_i -
+    s_j)`. It is held against the end of the curve and all candidates before it: against its neighbour alone a
+    row would drift to the next lane's, step by step, and against the end alone jump there. Without a curve
+    the first candidate takes the place of the end. Of candidates at about the same station only those nearest
+    to the path remain: a second row is of another stretch of the track.
     """
     stations, sides = candidates.stations, candidates.sides
     in_front = np.flatnonzero(in_front_row(stations, sides, BESIDE, LATERAL_GAP))
     if len(in_front) == 0:
         return in_front
-    first = in_front[0]
-    station, side = (stations[first], sides[first]) if end is None else (end.station, end.side)
-    room = LATERAL_CHANGE + LATERAL_RATE * (stations[in_front] - station)
-    return np.asarray(in_front[sides[in_front] <= side + room])
+    out = sides[in_front] - LATERAL_RATE * stations[in_front]
+    known = np.append(out[0] if end is None else end.side - LATERAL_RATE * end.station, out[:-1])
+    return np.asarray(in_front[out <= np.minimum.accumulate(known) + LATERAL_CHANGE])
 
 
 def in_front_row(stations: Array, sides: Array, beside: float, gap: float) -> BoolArray:

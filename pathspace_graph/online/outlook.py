@@ -248,14 +248,16 @@ def extended_rows(
 def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> IntArray:
     """Return the indices of the tracks near the vehicle that are confirmed or were seen just now.
 
-    Tracks at cones of the curve are left out: across an infield the sensor sees an earlier stretch again.
+    Tracks at the curve are left out: across an infield the sensor sees an earlier stretch again.
     """
     settings, state = track.settings.growth, track.state
     near = np.hypot(*(tracks.points - state.poses[-1, :2]).T) < REACH
     believed = (tracks.counts >= settings.sightings) | (tracks.last_t > t - MEMORY)
     indices = np.flatnonzero(near & believed)
     if label in state.boundaries:
-        mapped = state.boundaries[label].observed
+        boundary, radius = state.boundaries[label], settings.merge_radius
+        u = np.arange(0.0, boundary.confirmed_end - radius, settings.threshold)
+        mapped = np.concatenate([boundary.observed, boundary.evaluate(state.control_points(label), u)])
         _, is_mapped = nearest_within(tracks.points[indices], mapped, settings.threshold)
         indices = indices[~is_mapped]
     return indices[undisputed(track, label, tracks.points[indices], settings.merge_radius)]

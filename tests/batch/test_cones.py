@@ -8,14 +8,18 @@ from numpy.typing import ArrayLike, NDArray
 from pathspace_graph.batch.association import (
     Cones,
     along_drive,
+    associate,
     cluster,
     cones_of_curve,
     without_folds,
 )
+from pathspace_graph.factors.se2 import to_vehicle
+from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.batch import straight
+from ..scenes.batch import state_of, straight
 
 Array = NDArray[np.float64]
 
@@ -101,7 +105,7 @@ def test_cones_are_passed_in_the_order_of_the_drive() -> None:
     )
     wrong = np.array([0, 1, 4, 3, 2, 5, 6])
     cones = Cones(true[wrong], np.arange(7.0), wrong)
-    passed = along_drive(cones, lap, LEFT)
+    passed = along_drive(cones, lap, np.ones((7, len(lap)), bool), LEFT)
     np.testing.assert_array_equal(passed.points, true)
     np.testing.assert_array_equal(passed.count, np.arange(7))
 
@@ -112,4 +116,30 @@ def test_a_cone_behind_the_row_is_none_of_it() -> None:
     lap = np.column_stack([x, np.zeros(20), np.zeros(20)])
     row = np.column_stack([np.arange(1.0, 18.0, 4.0), [-2.0, -2.6, -3.2, -2.6, -2.0]])
     cones = Cones(np.concatenate([row, [[10.0, -4.4]]]), np.arange(6.0), np.full(6, 9))
-    np.testing.assert_array_equal(along_drive(cones, lap, RIGHT).points, row)
+    own = np.ones((6, len(lap)), bool)
+    np.testing.assert_array_equal(along_drive(cones, lap, own, RIGHT).points, row)
+
+
+def test_a_row_between_two_lanes_is_the_cones_of_both() -> None:
+    """The left row runs out along y = 0 and back along it, and the way back is nearer to its cones.
+
+    Each of the six cones between the lanes is on the curve twice, and the drive passes them in order.
+    """
+    x, there = np.arange(4.0, 25.0, 4.0), np.column_stack([np.arange(29.0), np.zeros(29)])
+    row = np.column_stack([x, np.zeros(6)])
+    phi = np.linspace(0.0, 2.0 * np.pi, 38)[1:-1]
+    turn = np.column_stack([28.0 + 12.0 * np.sin(0.5 * phi), 6.0 * np.sin(phi)])
+    curve = np.concatenate([there, turn, there[::-1], np.array([28.0, 0.0]) - turn])
+    along = np.arange(0.0, 29.0, 1.0)
+    out = np.column_stack([along, np.full(29, -2.4), np.zeros(29)])
+    back = np.column_stack([along[::-1], np.full(29, 1.6), np.full(29, np.pi)])
+    state = state_of({LEFT: curve}, np.concatenate([out, back]), periodic=True)
+    table = DetectionTable()
+    for cycle, pose in enumerate(state.poses):
+        local = to_vehicle(row, np.tile(pose, (len(row), 1)))
+        local = local[(local[:, 0] > -3.0) & (local[:, 0] < 14.0)]
+        covariances = np.tile(0.01 * np.eye(2), (len(local), 1, 1))
+        table.append(Detections(float(cycle), local, covariances, np.full(len(local), LEFT)), cycle)
+    associate(state, table, SETTINGS, 4.0, strict=True)
+    cones = cones_of_curve(state, table, LEFT, SETTINGS)
+    np.testing.assert_allclose(cones.points[:, 0], [*x, *x[::-1]], atol=1e-6)

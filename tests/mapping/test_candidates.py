@@ -24,6 +24,13 @@ def test_a_row_at_one_distance_is_a_chain() -> None:
     assert chain(candidates((0.0, 2.0), (4.0, 2.0), (8.0, 2.0)), None).tolist() == [0, 1, 2]
 
 
+def test_a_row_does_not_jump_to_the_next_lane_between_two_cones() -> None:
+    """The cone of the next lane's row is 2.6 m farther from the path than that 2.2 m before it."""
+    row = candidates((4.0, 1.3), (6.2, 3.9), (8.5, 1.3))
+    assert chain(row, end(0.0, 1.3)).tolist() == [0, 2]
+    assert chain(row, None).tolist() == [0, 2]
+
+
 @pytest.mark.parametrize(("side", "follows"), [(1.0, True), (4.29, True), (4.31, False)])
 def test_the_next_may_be_farther_from_the_path_by_a_step_and_a_rate(side: float, follows: bool) -> None:
     """4 m on: 2 + 1.5 + 0.2 * 4 = 4.3 m; to the other side it may come as near as it likes."""
@@ -40,7 +47,7 @@ def test_one_that_is_left_out_does_not_lead_on_to_the_next() -> None:
     assert chain(found, None).tolist() == [0, 3]
 
 
-@pytest.mark.parametrize(("begin", "count"), [(None, 4), (end(-4.0, 2.0), 6)], ids=["no curve", "a curve"])
+@pytest.mark.parametrize(("begin", "count"), [(None, 4), (end(-4.0, 2.0), 4)], ids=["no curve", "a curve"])
 def test_no_candidate_allows_the_next_one_more(begin: End | None, count: int) -> None:
     """A row leads away by 1.2 m from cone to cone, and only 0.8 m of them are the rate."""
     found = candidates(*((4.0 * k, 2.0 + 1.2 * k) for k in range(8)))
@@ -48,8 +55,8 @@ def test_no_candidate_allows_the_next_one_more(begin: End | None, count: int) ->
 
 
 def test_a_candidate_farther_out_does_not_end_the_chain() -> None:
-    """One that may not follow is left out, and the next one near the path is measured from the same end."""
-    found = candidates((4.0, 2.0), (8.0, 6.0), (12.0, 2.0), (16.0, 5.5))
+    """One that may not follow is left out, and the next one is measured from the one before it."""
+    found = candidates((4.0, 2.0), (8.0, 6.0), (12.0, 2.0), (16.0, 4.2))
     assert chain(found, end(0.0, 2.0)).tolist() == [0, 2, 3]
 
 
