@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import current_process, resource_tracker
+from multiprocessing.util import Finalize
 from threading import Thread
 from typing import Any, Final, cast
 
@@ -112,9 +113,13 @@ def _spared_by_interrupts() -> Iterator[None]:
 def _worker() -> Any:
     if current_process().daemon:  # it may have no children: a worker of Dask is one
         return ThreadPoolExecutor(max_workers=1)
-    return loky.ProcessPoolExecutor(
+    executor = loky.ProcessPoolExecutor(
         max_workers=1, timeout=WORKER_IDLE, initializer=end_with, initargs=(os.getpid(),)
     )
+    # a process that ends waits for its children first, and this one would be idle for minutes
+    ended = {"wait": False, "kill_workers": True}
+    Finalize(None, executor.shutdown, kwargs=ended, exitpriority=1)
+    return executor
 
 
 def end_with(parent: int) -> None:

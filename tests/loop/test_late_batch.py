@@ -267,6 +267,28 @@ def test_a_process_that_was_given_up_does_not_block_the_next_batch() -> None:
     assert worker.submit(sum, [1, 2]).result(120.0) == 3
 
 
+USES_A_WORKER = """
+from multiprocessing import get_context
+from pathspace_graph.loop import worker
+
+def use():
+    assert worker.submit(sum, [1, 2]).result(120.0) == 3
+
+if __name__ == "__main__":
+    process = get_context("spawn").Process(target=use)
+    process.start()
+    process.join()
+    raise SystemExit(process.exitcode)
+"""
+
+
+def test_a_process_ends_though_its_own_one_for_laps_is_idle(tmp_path: Path) -> None:
+    """A worker of a study that is replaced would wait for it, and the study with it."""
+    script = tmp_path / "uses_a_worker.py"
+    script.write_text(USES_A_WORKER)
+    assert subprocess.run([sys.executable, str(script)], timeout=120.0, check=False).returncode == 0
+
+
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="Windows")
 def test_an_interrupt_does_not_reach_the_process_of_the_batch_and_reaches_this_one() -> None:
     """Ctrl-C goes to all processes of a terminal; one that is still importing would print where it was."""
