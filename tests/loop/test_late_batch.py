@@ -317,6 +317,8 @@ def test_where_no_process_can_be_begun_there_is_a_notice(stem: Stem, monkeypatch
         def submit(self, *_: Any) -> Any:
             raise OSError("out of memory")
 
+        def shutdown(self, **_: Any) -> None: ...
+
     worker._worker.cache_clear()
     monkeypatch.setattr(loky, "ProcessPoolExecutor", lambda **_: Executor())
     mapper = stem.mapper()
