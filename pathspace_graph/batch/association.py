@@ -7,6 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import project
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.graph.variables import Variables, pose_keys
@@ -28,6 +29,7 @@ MIN_SHARE_BESIDE: Final = 0.3  # `MIN_SHARE` of a cluster beside a curve, whose 
 MIN_CONES: Final = 4  # least number of cones of a curve, below which none is removed
 STEP: Final = 1.0  # at which the curve's point nearest to a pose is searched for, m along the curve
 DIRECTION_PENALTY: Final = 100.0  # distance added in quadrature where the curve runs against a heading, m
+FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched, m along the curve
 STRETCH: Final = 5.0  # most distance along the curve from a cone to the poses that pass it, m
 ROOM: Final = 2.0  # by which two poses may be farther apart along an open curve than was driven, m
 FOLD_COSINE: Final = 0.5  # a row of cones folds back where the cosine of its turn is less than minus this
@@ -230,6 +232,12 @@ def first_parameter(state: State, label: int) -> float:
     """Return the parameter of a curve from which those of its cones are counted."""
     boundary = state.boundaries[label]
     return float(state.pose_u[label][0]) if boundary.periodic else boundary.tables.low
+
+
+def feet_of_cones(state: State, cones: Cones, label: int) -> FootPoints:
+    """Return the foot points of a boundary's cones on its curve, near their places along it."""
+    boundary, u = state.boundaries[label], first_parameter(state, label) + cones.u
+    return boundary.find(state.control_points(label), cones.points, u - FOOT_ROOM, u + FOOT_ROOM)
 
 
 def along_drive(cones: Cones, lap: Array, own: BoolArray, label: int) -> Cones:

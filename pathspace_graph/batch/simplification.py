@@ -18,12 +18,11 @@ from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 
-from .association import MIN_CONES, associate, cones_of_curve, first_parameter, locate_poses
+from .association import MIN_CONES, associate, cones_of_curve, feet_of_cones, locate_poses
 
 MIN_SIZE_SHARE: Final = 0.6  # least share of the largest number of control points that is tried
 ALIKE: Final = (3.0, 0.01)  # parameters on curves of length L through the same cones differ by < a + b L (m)
 FOLDS: Final = 4  # groups of the cross-validation, dealt in turn, so that the neighbours of a cone are there
-FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched (m along the curve)
 
 
 def reknot(state: State, detections: DetectionTable, settings: MapperSettings, dense: bool = False) -> State:
@@ -38,8 +37,7 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
         if len(points) < MIN_CONES:
             continue
         if not dense:  # the optimum's curve beside the cones, since some of them are strays
-            u = first_parameter(state, label) + cones.u
-            points = boundary.find(state.control_points(label), points, u - FOOT_ROOM, u + FOOT_ROOM).position
+            points = feet_of_cones(state, cones, label).position
         share, least_share = settings.batch.size_share, MIN_SIZE_SHARE
         if dense:
             share, least_share = settings.batch.dense_share, 1.0
@@ -197,8 +195,7 @@ def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperS
     seen, unseen, places, lengths = [], [], {}, {}
     for label, boundary in state.boundaries.items():
         cones = cones_of_curve(state, detections, label, settings)
-        u, share = first_parameter(state, label) + cones.u, boundary.size / max(len(cones.u), 1)
-        foot = boundary.find(state.control_points(label), cones.points, u - FOOT_ROOM, u + FOOT_ROOM)
+        foot, share = feet_of_cones(state, cones, label), boundary.size / max(len(cones.u), 1)
         seen.append(foot.distance)
         unseen.append(cross_validated(cones.points, boundary.periodic, settings, share))
         places[label] = foot.u

@@ -14,9 +14,8 @@ from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.stations import SIGMA_POSE, CurveStations, Stations
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .association import MIN_CONES, cones_of_curve, first_parameter
+from .association import MIN_CONES, cones_of_curve, feet_of_cones
 
-FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched (m along the curve)
 SIGMA_STATION: Final = 0.02  # of a cone along a curve that has a control point for each and follows it (m)
 BLOCK: Final = 20.0  # length of the stretches of a later lap that are shifted along the curves together (m)
 REACH: Final = 4.0  # most of a shift (m)
@@ -54,14 +53,12 @@ def match_stations(
     are about as likely, its detections are of no cone.
     """
     places = {}
-    for label, boundary in state.boundaries.items():
+    for label in state.boundaries:
         first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0))
         cones = cones_of_curve(state, first, label, settings)
         if len(cones.u) < MIN_CONES:
             return None
-        u = first_parameter(state, label) + cones.u
-        points = state.control_points(label)
-        places[label] = boundary.find(points, cones.points, u - FOOT_ROOM, u + FOOT_ROOM).u
+        places[label] = feet_of_cones(state, cones, label).u
     sigmas = {label: np.full(len(u), SIGMA_STATION) for label, u in places.items()}
     stations = Stations.of(state, places, sigmas)
     seen = [SeenAgain.of(state, detections, curve) for curve in stations.curves]
