@@ -149,9 +149,7 @@ def test_a_killed_study_goes_on_where_it_was_with_the_same_results(
         assert first[name] == second[name]
 
 
-def test_a_damaged_cell_is_made_again(
-    study: Study, ran: tuple[Path, pd.DataFrame], finished: Path
-) -> None:
+def test_a_damaged_cell_is_made_again(study: Study, ran: tuple[Path, pd.DataFrame], finished: Path) -> None:
     cells = sorted((finished / "cells").iterdir())
     cells[0].write_text("{")
     again = run_study(study, finished)
