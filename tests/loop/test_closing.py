@@ -28,9 +28,10 @@ from ..scenes.drives import (
     ahead,
     bean_track,
     corridor,
+    exact_lap,
     exact_log,
-    lap_log,
     map_log,
+    mapped,
     replay,
     true_poses,
 )
@@ -40,13 +41,13 @@ Array = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def log() -> Log:
-    return lap_log(bean_track(), overrun=45.0)
+    return exact_lap()
 
 
 @pytest.fixture(scope="module")
 def run(log: Log) -> tuple[FixedLagMapper, list[CycleResult]]:
     """The whole drive."""
-    return map_log(log)
+    return mapped(log)
 
 
 @pytest.fixture(scope="module")

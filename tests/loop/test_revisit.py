@@ -16,7 +16,8 @@ from pathspace_graph.run import CycleResult
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
 
-from ..scenes.drives import bean_track, beginning, lap_log, map_log, path_of, true_poses
+from ..scenes import drives
+from ..scenes.drives import beginning, map_log, path_of, true_poses
 
 STEP = 1.0
 SECONDS, PERIOD = 24.0, 0.1
@@ -117,5 +118,5 @@ def test_a_window_that_holds_the_whole_drive_has_none_and_fails_in_no_cycle() ->
 
 
 def test_a_lap_that_closes_has_none() -> None:
-    mapper, _ = map_log(lap_log(bean_track(), 30.0))
+    mapper, _ = drives.mapped(drives.exact_lap())
     assert mapper.closed and not mapper.revisits

@@ -17,7 +17,15 @@ from pathspace_graph.online.outlook import SIGMA_BEND, Outlook, joint_covariance
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.drives import ahead, bean_track, corridor, detections, exact_log, lap_log, map_log
+from ..scenes.drives import (
+    ahead,
+    corridor,
+    detections,
+    exact_lap,
+    exact_log,
+    map_log,
+    mapped,
+)
 
 Array = NDArray[np.float64]
 
@@ -119,7 +127,7 @@ def test_a_mapper_that_has_seen_nothing_has_no_outline() -> None:
 
 
 def test_a_closed_map_is_confirmed_as_a_whole() -> None:
-    mapper, _ = map_log(lap_log(bean_track(), overrun=45.0))
+    mapper, _ = mapped(exact_lap())
     assert mapper.closed
     track = mapper.map()
     for label, outline in mapper.outline().boundaries.items():

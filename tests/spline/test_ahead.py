@@ -15,7 +15,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.spline.ahead import CurveAhead, check_line, track_ahead
 from pathspace_graph.spline.bspline import BSpline
 
-from ..scenes.drives import bean_track, lap_log, noisy
+from ..scenes.drives import noisy_lap
 
 Array = NDArray[np.float64]
 
@@ -150,7 +150,7 @@ def test_lengths_out_of_range_are_refused(distance: float, step: float, message:
 
 def test_a_drive_sees_its_centre_line_and_is_not_changed_by_looking() -> None:
     """In each tenth cycle the line is that of the whole outline, on the open map and on the closed one."""
-    log = noisy(lap_log(bean_track(), overrun=60.0), 0)
+    log = noisy_lap()
     looked = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     compared = {False: 0, True: 0}
     for cycle, (odometry, detections) in enumerate(split_odometry(log)):
