@@ -45,6 +45,7 @@ class Reading:
     seen_again: BoolArray  # (m,) whether each of them lies where the cycles just before had one
     orange: Detections  # detections of orange cones, which bound no road
     stated: tuple[Detections, Detections]  # those of both kinds as they came, before any noise was measured
+    noise: NoiseLearner  # noise as it is known now
     sensor_doubted: bool = False  # whether readings contradict the prior of the sensor's yaw or latency
     measured: MapperSettings | None = None  # with priors of calibrations that were measured in this cycle
     notice: str = ""  # what the labels mean from now on, where that has changed
@@ -94,7 +95,7 @@ class FrontEnd:
             settings, self._begun = noise.calibrated(self._settings), True
         measured = None if settings is self._settings else settings
         seen, notice = check.seen_again, "; ".join(notices)
-        return Reading(motion, judged, seen, orange, stated, self._sensor_doubted, measured, notice)
+        return Reading(motion, judged, seen, orange, stated, noise, self._sensor_doubted, measured, notice)
 
     @property
     def noise_used(self) -> RunNoise:
