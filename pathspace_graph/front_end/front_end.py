@@ -1,9 +1,10 @@
 """The front end of all estimators: what they are given of each cycle."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
@@ -62,6 +63,13 @@ class FrontEnd:
         self._settings = settings
         self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently, and shares what nothing changes."""
+        other = copy(self)
+        other.noise, other.gate = self.noise.copy(), self.gate.copy()
+        other._motion, other._sides = self._motion.copy(), self._sides.copy()
+        return other
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
         """Return a usable cycle, or raise a ReadingError."""
