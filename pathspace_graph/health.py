@@ -2,11 +2,12 @@
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from itertools import groupby
 from math import nan
 from typing import ClassVar, Final, Self
+
+from pathspace_graph.copies import shallow
 
 from .labels import BOUNDARIES, NAMES
 from .lengths import Length, Text
@@ -68,7 +69,7 @@ class HealthMonitor:
 
     def copy(self) -> Self:
         """Return a monitor that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other._recent = self._recent.copy()
         return other
 

@@ -1,13 +1,13 @@
 """The front end of all estimators: what they are given of each cycle."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
@@ -66,7 +66,7 @@ class FrontEnd:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently, and shares what nothing changes."""
-        other = copy(self)
+        other = shallow(self)
         other.noise, other.gate = self.noise.copy(), self.gate.copy()
         other._motion, other._sides = self._motion.copy(), self._sides.copy()
         return other

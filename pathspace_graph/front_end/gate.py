@@ -5,7 +5,6 @@ nothing. A single detection that is impossible is dropped: a detector may fail f
 A cycle comes in metres of its scene and leaves the gate at scale 1; its result goes back by the scale.
 """
 
-from copy import copy
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.errors import InputError, ReadingError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
@@ -87,7 +87,7 @@ class Gate:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def admit(self, odometry: Odometry, detections: Detections, newest: Newest) -> Admitted:
         """Return a cycle as an estimator may use it; otherwise raise a ReadingError and count it as refused.

@@ -6,12 +6,12 @@ derivatives, noise scatters them, and errors that stay with a cone scatter its s
 """
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, ray_axes
@@ -312,7 +312,7 @@ class Measurement:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently."""
-        other = copy(self)
+        other = shallow(self)
         other._tracker = self._tracker.copy()
         return other
 

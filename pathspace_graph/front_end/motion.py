@@ -1,12 +1,12 @@
 """The motion between two cycles: odometry, checked against what the detections say of it."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import replace
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
@@ -70,7 +70,7 @@ class MotionCheck:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently."""
-        other = copy(self)
+        other = shallow(self)
         other.errors, other._recent = self.errors.copy(), self._recent.copy()
         other._rest, other._standstill = self._rest.copy(), self._standstill.copy()
         return other
@@ -267,7 +267,7 @@ class Rest:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def end(self) -> None:
         self._since: float | None = None

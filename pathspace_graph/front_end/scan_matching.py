@@ -8,12 +8,12 @@ by -psi. Detections that are late by tau lie too far ahead by `tau v`, which cha
 """
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import huber_weights
@@ -54,7 +54,7 @@ class RecentDetections:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
         """Add detections (m, 2) at t (s) from a pose (3,), and their derivatives (m, 2, e) by errors."""
@@ -209,7 +209,7 @@ class SensorErrors:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def contradict(self, settings: CalibrationSettings) -> bool:
         """Return whether the errors contradict the sensor's prior, by `settings.doubt` sigmas."""

@@ -1,13 +1,13 @@
 """Sightings of cones, followed by dead reckoning, and the twists of a drive: what noise is measured from."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, fields
 from math import comb
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import MeasuredNoise
@@ -75,7 +75,7 @@ class ConeTracker:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def follow(self, cycles: Sequence[SeenCycle]) -> Sightings:
         """Return the sightings of the next cycles as measured, in order of time, the nearest first."""
@@ -219,7 +219,7 @@ class TwistRecord:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def add(self, odometry: Odometry) -> None:
         self._parts = (*self._parts, odometry)

@@ -17,13 +17,13 @@ oldest link holds the origin of the map frame. To bring it back to (0, 0, 0), th
 """
 
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import Final, Protocol, Self
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.linear import keys_of_factor
@@ -56,7 +56,7 @@ class InactiveMap:
 
     def copy(self) -> Self:
         """Return a map to which conditionals can be added independently."""
-        other = copy(self)
+        other = shallow(self)
         other.net = gtsam.GaussianBayesNet()
         other.net.push_back(self.net)
         return other

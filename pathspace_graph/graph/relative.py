@@ -9,7 +9,6 @@ is linear in map coordinates does neither: it is linearized at the heading that 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass
 from itertools import islice
 from typing import Self
@@ -17,6 +16,7 @@ from typing import Self
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, relative, wrap_angle
@@ -164,7 +164,7 @@ class Submaps:
 
     def copy(self) -> Self:
         """Return submaps that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other.finished = self.finished.copy()
         other.keyframes = self.keyframes.copy()
         other._attached = self._attached.copy()

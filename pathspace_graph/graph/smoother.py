@@ -7,12 +7,12 @@ variable that a marginal touches, which here is the whole map.
 """
 
 from collections.abc import Sequence
-from copy import copy
 from typing import Final, Generic, Self
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
@@ -66,13 +66,13 @@ class FixedLagSmoother(Generic[M_co]):
 
     def copy(self) -> Self:
         """Return a smoother that can go on independently; `attached` is left to its owner."""
-        other = copy(self)
+        other = shallow(self)
         other.map = self.map.copy()
         other.variables = other.map.variables
         other.times = self.times.copy()
         other.window = self.window.copy()
         other.window.map, other.window.variables = other.map, other.variables
-        other.user_factors = copy(self.user_factors)
+        other.user_factors = shallow(self.user_factors)
         other.inactive = self.inactive.copy()
         other.submaps = self.submaps and self.submaps.copy()
         return other

@@ -5,13 +5,13 @@ frozen.
 """
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import Final, Generic, Protocol, Self, TypeVar
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.linear import keys_of_factor
@@ -116,9 +116,9 @@ class WindowFactors(Generic[M_co]):
 
     def copy(self) -> Self:
         """Return factors that can be linearized independently; the map is left to the owner of both."""
-        other = copy(self)
-        other.odometry, other.measured = copy(self.odometry), copy(self.measured)
-        other.gauge, other.linear_gauge = copy(self.gauge), copy(self.linear_gauge)
+        other = shallow(self)
+        other.odometry, other.measured = shallow(self.odometry), shallow(self.measured)
+        other.gauge, other.linear_gauge = shallow(self.gauge), shallow(self.linear_gauge)
         return other
 
     @property

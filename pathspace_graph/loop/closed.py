@@ -1,9 +1,9 @@
 """The closed map: it is localized on, refined, and repaired where cones contradict it."""
 
 from collections.abc import Mapping
-from copy import copy
 from typing import Self
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Health
 from pathspace_graph.labels import BOUNDARIES
@@ -36,9 +36,9 @@ class Closed:
 
     def copy(self) -> Self:
         """Return a phase that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other.map_repair = self.map_repair.copy()
-        other.known_loop = copy(self.known_loop)
+        other.known_loop = shallow(self.known_loop)
         return other
 
     def judge(

@@ -1,6 +1,5 @@
 """The drive: what its phases have in common, and what a phase makes of a cycle."""
 
-from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from math import nan
@@ -9,6 +8,7 @@ from typing import Final, Protocol, Self
 import numpy as np
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.relative import Revisit
@@ -46,7 +46,7 @@ class Drive:
 
     def copy(self) -> Self:
         """Return a drive that can go on independently; a batch that is under way is of both."""
-        other = copy(self)
+        other = shallow(self)
         other.record = self.record.copy()
         other.solver = self.solver.copy()
         other.monitor = self.monitor.copy()

@@ -1,7 +1,6 @@
 """The drive as it was measured, and its poses along the curves: what a batch of the lap is made of."""
 
 from collections.abc import Iterator, Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from itertools import chain as chain_of
 from typing import Final, Generic, Self, TypeVar
@@ -10,6 +9,7 @@ import numpy as np
 
 from pathspace_graph.batch.lap import ClosedMap, OpenLap
 from pathspace_graph.batch.start import unwrap
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
@@ -58,7 +58,7 @@ class CycleList(Generic[T]):
         self._newest: list[T] = []
 
     def copy(self) -> Self:
-        other = copy(self)
+        other = shallow(self)
         other._newest = self._newest.copy()
         return other
 
@@ -100,7 +100,7 @@ class DriveRecord:
 
     def copy(self) -> Self:
         """Return a record that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other.stamps = self.stamps.copy()
         other._measured = self._measured.copy()
         return other

@@ -148,7 +148,11 @@ def evidence_of(
     if known is not None and used.sum() < SHARE_DEGRADED * judged.sum():
         others = np.flatnonzero(judged & ~used)
         rows = tested.rows[others]
-        points, label, loop = detections.points_map(rows, smoother.variables), labels[others], known.of(smoother)
+        points, label, loop = (
+            detections.points_map(rows, smoother.variables),
+            labels[others],
+            known.of(smoother),
+        )
         explained[others] = loop.distances(label, points, BESIDE_CURVE) < BESIDE_CURVE
         unmapped[others] = ~explained[others] & loop.beside_gaps(label, points)
         wrong = loop.distances(LEFT + RIGHT - label, points, BESIDE_CURVE) < BESIDE_CURVE

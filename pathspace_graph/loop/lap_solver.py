@@ -1,13 +1,13 @@
 """The batches of a drive: one lap at a time is solved in another process, and taken when it is due."""
 
 from collections.abc import Callable, Sequence
-from copy import copy
 from math import ceil
 from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.batch.lap import LapMarginal, OpenLap
+from pathspace_graph.copies import shallow
 from pathspace_graph.settings.mapper import MapperSettings
 
 from . import worker
@@ -31,7 +31,7 @@ class LapSolver:
 
     def copy(self) -> Self:
         """Return a solver that can go on independently; a batch that is under way is of both."""
-        return copy(self)
+        return shallow(self)
 
     @property
     def is_busy(self) -> bool:

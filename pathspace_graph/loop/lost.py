@@ -1,9 +1,9 @@
 """The lost vehicle: its place on the closed map is searched, and the road beside it is mapped anew."""
 
-from copy import copy
 from dataclasses import replace
 from typing import Final, Self
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, Health, HealthMonitor
 from pathspace_graph.labels import BOUNDARIES
@@ -35,7 +35,7 @@ class Lost:
 
     def copy(self) -> Self:
         """Return a phase that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other.closed = self.closed.copy()
         other.search = self.search.copy()
         other.new_road = self.new_road and self.new_road.copy()
@@ -89,7 +89,11 @@ class Lost:
 
     def _on_new_road(self, health: Health) -> Step:
         """Return whether the vehicle has left the map: no place of it agrees, but there is a good road."""
-        ends = [boundary.confirmed_end for boundary in self.new_road.boundaries.values()] if self.new_road else []
+        ends = (
+            [boundary.confirmed_end for boundary in self.new_road.boundaries.values()]
+            if self.new_road
+            else []
+        )
         sees_road = len(ends) == len(BOUNDARIES) and min(ends) > ROAD and health.condition == GOOD
         before, is_new = self._health, self.search.is_off_map and sees_road
         self._health = Health(DEGRADED, NEW_ROAD) if is_new else self._lost

@@ -5,7 +5,6 @@ are right, held by the other boundary and by the stretches before and after. So 
 begins at these poses, with curves through the cones that were seen.
 """
 
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
@@ -15,6 +14,7 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.simplification import fit_through
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT
@@ -61,7 +61,7 @@ class Contradictions:
 
     def copy(self) -> Self:
         """Return tracks that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other._tracks = {label: tracks.copy() for label, tracks in self._tracks.items()}
         return other
 
@@ -137,7 +137,7 @@ class MapRepair:
 
     def copy(self) -> Self:
         """Return a repair that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other.contradictions = self.contradictions.copy()
         return other
 

@@ -1,11 +1,8 @@
 """The open road: its map grows, until a return to its beginning starts the batch that closes the loop."""
 
-from copy import copy
 from typing import Final, Self
 
-import numpy as np
-
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.health import Health
@@ -42,9 +39,9 @@ class Open:
 
     def copy(self) -> Self:
         """Return a phase that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other.returns = self.returns.copy()
-        other.revisits = copy(self.revisits)
+        other.revisits = shallow(self.revisits)
         return other
 
     def judge(

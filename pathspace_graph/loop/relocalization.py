@@ -5,13 +5,13 @@ which is laid rigidly beside each place of the loop, and the best places are ref
 one is clearly better than all others, twice in a row, the window starts anew there.
 """
 
-from copy import copy
 from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.batch.association import locate_poses
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, wrap_angle
 from pathspace_graph.io.log import Detections
@@ -70,7 +70,7 @@ class Search:
 
     def copy(self) -> Self:
         """Return a search that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other._poses = self._poses.copy()
         other._seen = self._seen.copy()
         return other

@@ -1,12 +1,12 @@
 """The return to the beginning of a drive, by the newest curves or cones, or by the shape of the road."""
 
-from copy import copy
 from math import inf
 from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.batch.start import unwrap
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.relative import Revisit
@@ -45,7 +45,7 @@ class ReturnFinder:
 
     def copy(self) -> Self:
         """Return a search that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other._tried = self._tried.copy()
         return other
 
@@ -83,7 +83,9 @@ class ReturnFinder:
         if not self._is_due(road, "shape", RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)):
             return None
         found = recognize(road.smoother)
-        return None if found is None else self.revisit_of(road, record, found, length - self._settings.min_path)
+        return (
+            None if found is None else self.revisit_of(road, record, found, length - self._settings.min_path)
+        )
 
     def revisit_of(
         self, road: Road, record: DriveRecord, found: RefinedMotion, within: float = BEGINNING

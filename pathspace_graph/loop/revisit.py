@@ -84,9 +84,7 @@ class Revisits:
             self._next = length + INTERVAL
         return revisit
 
-    def _measured(
-        self, smoother: CurveSmoother, seen_in: SeenIn, poses: Array, place: int
-    ) -> Revisit | None:
+    def _measured(self, smoother: CurveSmoother, seen_in: SeenIn, poses: Array, place: int) -> Revisit | None:
         """Return the oldest pose of the window, as seen from the keyframe next to an earlier place."""
         laid = lay_newest(seen_in, poses, place, NEARBY, self.settings.growth)
         if laid is None or not laid.is_sure:

@@ -1,10 +1,10 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
-from copy import copy
 from typing import Any, Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import Spans
 from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, TOLERANCES, refine_joint_foot_points
@@ -41,7 +41,7 @@ class CurveMap:
 
     def copy(self) -> Self:
         """Return a map that can change independently."""
-        other = copy(self)
+        other = shallow(self)
         other.state = self.state.copy()
         other.variables = other.state.variables
         other.detections = self.detections.copy()

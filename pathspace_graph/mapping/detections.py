@@ -1,13 +1,13 @@
 """Tables of detections: one row for each detected cone, with what an estimator has decided about it."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import rotated, to_map
@@ -172,7 +172,7 @@ class DetectionTable(DetectionColumns):
 
     def copy(self) -> Self:
         """Return a table whose associations can change independently; other columns are only replaced."""
-        other = copy(self)
+        other = shallow(self)
         for column in ("boundary", "u", "used", "station", "changed"):
             vars(other)[column] = vars(self)[column].copy()
         return other

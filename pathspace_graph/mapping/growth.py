@@ -1,11 +1,11 @@
 """Growth of the open curves through confirmed tentative tracks ahead of their ends (paper: Expansion)."""
 
-from copy import copy
 from statistics import median
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
@@ -37,7 +37,7 @@ class Growth:
 
     def copy(self) -> Self:
         """Return tracks that can go on independently."""
-        other = copy(self)
+        other = shallow(self)
         other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
         other._beside = self._beside.copy()
         return other

@@ -1,11 +1,11 @@
 """The driven path and the path ahead, along which curves grow, and the cones that come next beside it."""
 
-from copy import copy
 from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import move_points
@@ -58,7 +58,7 @@ class DrivenPath:
 
     def copy(self) -> Self:
         """Return a path that can grow independently; its arrays are only replaced."""
-        return copy(self)
+        return shallow(self)
 
     def update(self, pose: Array) -> None:
         """Extend the path to `pose` (3,), map frame."""

@@ -4,13 +4,12 @@ The order of a cycle is that of the paper: predict, classify, expand, update, an
 """
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import Self
 
 import gtsam
-import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.mapper import MapperSettings
@@ -18,9 +17,9 @@ from pathspace_graph.spline.boundary import Boundary
 
 from .growth import Growth
 from .motion import MeasuredMotion, predict
-from .tentative import OrangeCones, Sighting
 from .path import DrivenPath
 from .smoother import CurveSmoother, Gating
+from .tentative import OrangeCones, Sighting
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +51,7 @@ class Road:
 
     def copy(self) -> Self:
         """Return a road that can go on independently; what is only ever replaced is shared."""
-        other = copy(self)
+        other = shallow(self)
         other.smoother = self.smoother.copy()
         other.path = self.path.copy()
         other.growth = self.growth.copy()

@@ -1,7 +1,6 @@
 """The state of the spline estimators: curves, and the variables of their control points and poses."""
 
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import is_
@@ -9,6 +8,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials, Spans, lay_out
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points
@@ -107,9 +107,9 @@ class State:
 
     def copy(self) -> Self:
         """Return a state whose boundaries, values and pose parameters can change independently."""
-        other = copy(self)
+        other = shallow(self)
         other.variables = self.variables.copy()
-        other.boundaries = {label: copy(boundary) for label, boundary in self.boundaries.items()}
+        other.boundaries = {label: shallow(boundary) for label, boundary in self.boundaries.items()}
         other.pose_u = self.pose_u.copy()
         other.active_stretch = self.active_stretch.copy()
         other._curves = self._curves and self._curves.on(other.boundaries)

@@ -1,7 +1,6 @@
 """Cones that no curve explains: tentative tracks, which one may explain later, and orange cones."""
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from math import inf
@@ -10,6 +9,7 @@ from typing import Final, Self
 import numpy as np
 from scipy.linalg import block_diag
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, move_points, rotated, to_map
@@ -36,7 +36,7 @@ class TentativeTracks:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def add(self, points: Array, covariances: Array, t: float) -> None:
         """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
@@ -223,7 +223,7 @@ class OrangeCones:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def add(self, sighting: Sighting, sensor: Array) -> None:
         """Add the detections of a cycle; `sensor` is the calibration (5,) of the sensor, or (0,)."""

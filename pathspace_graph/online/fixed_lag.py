@@ -42,8 +42,8 @@ class _Before:
 
     @classmethod
     def of(cls, mapper: "FixedLagMapper") -> Self:
-        parts = mapper.front_end, mapper.road, mapper.drive, mapper.phase
-        return cls(*(part.copy() for part in parts), mapper.health)
+        front_end, road = mapper.front_end.copy(), mapper.road.copy()
+        return cls(front_end, road, mapper.drive.copy(), mapper.phase.copy(), mapper.health)
 
     def give_back(self, mapper: "FixedLagMapper") -> None:
         """Set a mapper back; what was before stays, for another failure."""
