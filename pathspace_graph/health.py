@@ -2,10 +2,11 @@
 
 from collections import Counter, deque
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from itertools import groupby
 from math import nan
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Self
 
 from .labels import BOUNDARIES, NAMES
 from .lengths import Length, Text
@@ -64,6 +65,12 @@ class HealthMonitor:
         self._offered = 0  # by all the recent cycles together
         self._last_offered: float | None = None
         self._wrong: int | None = None  # this boundary is wrong, as long as it explains too little
+
+    def copy(self) -> Self:
+        """Return a monitor that can go on independently."""
+        other = copy(self)
+        other._recent = self._recent.copy()
+        return other
 
     def restart(self) -> None:
         self._recent.clear()

@@ -179,7 +179,6 @@ ASSIGNED = {
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "eval.view.animation": {"writer.fig"},  # of matplotlib
     "front_end.motion": {"self._rest.sigma"},
-    "front_end.sides": {"near.judged"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
     "baselines.landmark_association": {"detections.landmark"},
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},

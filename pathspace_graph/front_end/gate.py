@@ -5,10 +5,11 @@ nothing. A single detection that is impossible is dropped: a detector may fail f
 A cycle comes in metres of its scene and leaves the gate at scale 1; its result goes back by the scale.
 """
 
+from copy import copy
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +84,10 @@ class Gate:
         self.refused = 0  # number of cycles that were refused since the last one that was used
         self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
         self._dropping = False
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return copy(self)
 
     def admit(self, odometry: Odometry, detections: Detections, newest: Newest) -> Admitted:
         """Return a cycle as an estimator may use it; otherwise raise a ReadingError and count it as refused.

@@ -6,6 +6,7 @@ derivatives, noise scatters them, and errors that stay with a cone scatter its s
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
@@ -250,9 +251,15 @@ class Measurement:
         found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
         return cls(cycles, replace(found, odometry=sigma, interval=interval))
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = copy(self)
+        other._tracker = self._tracker.copy()
+        return other
+
     def _begin(self, found: MeasuredNoise) -> None:
         self._found, self._tracker, self._followed = found, ConeTracker(found), 0
-        self._sightings: list[Sightings] = []
+        self._sightings: tuple[Sightings, ...] = ()
         self._cones: _Cones | None = None
 
     def advance(self) -> MeasuredNoise | None:
@@ -260,11 +267,11 @@ class Measurement:
         if self._cones is not None:
             return self._round(self._cones)
         cycles = self._cycles[self._followed : self._followed + FOLLOWED]
-        self._sightings.append(self._tracker.follow(cycles))
+        self._sightings = (*self._sightings, self._tracker.follow(cycles))
         self._followed += FOLLOWED
         if self._followed < len(self._cycles):
             return None
-        self._sightings = [Sightings.stacked(self._sightings)]
+        self._sightings = (Sightings.stacked(self._sightings),)
         self._cones = _cones(self._sightings[0])
         if self._cones is None:
             return self._passed(self._found)

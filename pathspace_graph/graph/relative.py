@@ -9,8 +9,10 @@ is linear in map coordinates does neither: it is linearized at the heading that 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from itertools import islice
+from typing import Self
 
 import gtsam
 import numpy as np
@@ -144,6 +146,14 @@ class Submaps:
         self._graph: gtsam.GaussianFactorGraph | None = None
         self._keyframe = 0
         self._driven = 0.0
+
+    def copy(self) -> Self:
+        """Return submaps that can go on independently."""
+        other = copy(self)
+        other.finished = self.finished.copy()
+        other.keyframes = self.keyframes.copy()
+        other._attached = self._attached.copy()
+        return other
 
     def add_pose(self, pose: int, factors: gtsam.GaussianFactorGraph, variables: Variables) -> None:
         """Add the window's oldest pose, by its key, and its factors, without the prior, to the submap.

@@ -1,6 +1,7 @@
 """Tables of detections: one row for each detected cone, with what an estimator has decided about it."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Final, Self
@@ -168,6 +169,13 @@ class DetectionTable(DetectionColumns):
     def refine(self, rows: IntArray, u: Array) -> None:
         """Store the refreshed foot points' parameters (m,); the associations do not change."""
         self.u[rows] = u
+
+    def copy(self) -> Self:
+        """Return a table whose associations can change independently; other columns are only replaced."""
+        other = copy(self)
+        for column in ("boundary", "u", "used", "station", "changed"):
+            vars(other)[column] = vars(self)[column].copy()
+        return other
 
     @property
     def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array]:

@@ -1,5 +1,6 @@
 """The driven path and the path ahead, along which curves grow, and the cones that come next beside it."""
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -54,6 +55,10 @@ class DrivenPath:
         self.length = 0.0  # length of the driven path: the station of the vehicle (m)
         self.curvature = 0.0  # smoothed curvature of the present turn (1/m), left positive
         self._last: Array = np.zeros(2)
+
+    def copy(self) -> Self:
+        """Return a path that can grow independently; its arrays are only replaced."""
+        return copy(self)
 
     def update(self, pose: Array) -> None:
         """Extend the path to `pose` (3,), map frame."""

@@ -1,10 +1,11 @@
 """Cones that no curve explains: tentative tracks, which one may explain later, and orange cones."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, combinations
+from copy import copy
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 from math import inf
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -32,6 +33,10 @@ class TentativeTracks:
         self.information: Array = np.zeros((0, 2, 2))  # (n, 2, 2) sum of its inverse covariances (1/m^2)
         self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
         self.last_t: Array = np.zeros(0)  # (n,) stamp of the newest detection (s)
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return copy(self)
 
     def add(self, points: Array, covariances: Array, t: float) -> None:
         """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
@@ -148,6 +153,11 @@ class Sighting:
     twist: Array  # (3,) twist of the vehicle (m/s, m/s, rad/s)
     detections: Detections  # detections of orange cones only
 
+    def placed_by(self, known: Sequence[tuple[int, Array]]) -> Self:
+        """Return the sighting with its pose among poses (P, 3), each from a first cycle on; the last wins."""
+        poses = [poses[self.cycle - first] for first, poses in known if 0 <= self.cycle - first < len(poses)]
+        return replace(self, pose=poses[-1].copy()) if poses else self
+
 
 class OrangeCones:
     """Orange cones as points of the map; they bound no road, and do not hold the vehicle.
@@ -161,29 +171,31 @@ class OrangeCones:
     def __init__(self, settings: GrowthSettings, sigma: float) -> None:
         """Keep how detections are merged, and a standard deviation (m) that none of them averages out."""
         self._settings, self._sigma = settings, sigma
-        self._sightings: list[Sighting] = []
-        self._passes: dict[int, list[_Pass]] = {}  # by label, in order
+        self._sightings: tuple[Sighting, ...] = ()
+        self._passes: dict[int, tuple[_Pass, ...]] = {}  # by label, in order
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return copy(self)
 
     def add(self, sighting: Sighting, sensor: Array) -> None:
         """Add the detections of a cycle; `sensor` is the calibration (5,) of the sensor, or (0,)."""
         if len(sighting.detections.labels):
-            self._sightings = [*self._sightings[1 - self.MOST :], sighting]
+            self._sightings = (*self._sightings[1 - self.MOST :], sighting)
             self._place(sighting, sensor)
 
     def place_again(self, sensor: Array, *known: tuple[int, Array]) -> None:
         """Place all detections anew by poses (P, 3), each from a first cycle on; later arguments win."""
         self._passes = {}
-        for k, one in enumerate(self._sightings):
-            for first, poses in known:
-                if first <= one.cycle < first + len(poses):
-                    self._sightings[k] = replace(one, pose=poses[one.cycle - first].copy())
-            self._place(self._sightings[k], sensor)
+        self._sightings = tuple(one.placed_by(known) for one in self._sightings)
+        for one in self._sightings:
+            self._place(one, sensor)
 
     def move(self, motion: Array) -> None:
         """Move all cones by a rigid motion (3,) of the map frame."""
-        self._sightings = [replace(one, pose=compose(motion, one.pose)) for one in self._sightings]
-        for one in chain.from_iterable(self._passes.values()):
-            one.tracks.move(motion)
+        self._sightings = tuple(replace(one, pose=compose(motion, one.pose)) for one in self._sightings)
+        moved = {label: tuple(one.moved(motion) for one in passes) for label, passes in self._passes.items()}
+        self._passes = moved
 
     def points(self) -> dict[int, PointBoundary]:
         """Return the cones that were detected often enough, by label."""
@@ -202,29 +214,38 @@ class OrangeCones:
         places = to_map(points, pose[None])
         for label in np.unique(seen.labels).tolist():
             own = seen.labels == label
-            self._pass(label, seen.t).add(places[own], covariances[own], seen.t)
+            *earlier, present = self._passes_at(label, seen.t)
+            present = present.with_detections(places[own], covariances[own], seen.t)
+            self._passes = {**self._passes, label: (*earlier, present)}
 
-    def _pass(self, label: int, t: float) -> "_Pass":
-        """Return the present pass, which begins where no cone was seen for a while."""
-        passes, settings = self._passes.setdefault(label, []), self._settings
-        if not passes or t - passes[-1].tracks.last_t.max() > settings.forget_after:
-            radius = PASS_RADIUS * settings.merge_radius
-            passes.append(_Pass(TentativeTracks(replace(settings, forget_after=inf, merge_radius=radius))))
-        return passes[-1]
+    def _passes_at(self, label: int, t: float) -> tuple["_Pass", ...]:
+        """Return the passes with the present one, which begins where no cone was seen for a while."""
+        passes, settings = self._passes.get(label, ()), self._settings
+        if passes and t - passes[-1].tracks.last_t.max() <= settings.forget_after:
+            return passes
+        radius = PASS_RADIUS * settings.merge_radius
+        return (*passes, _Pass(TentativeTracks(replace(settings, forget_after=inf, merge_radius=radius))))
 
 
+@dataclass(frozen=True, eq=False)
 class _Pass:
-    """Tracks of one label in one pass, and in how many cycles each two of them were detected together."""
+    """Tracks of one label in one pass, which stay as they are."""
 
-    def __init__(self, tracks: TentativeTracks) -> None:
-        self.tracks = tracks
-        self.together: IntArray = np.zeros((0, 0), np.intp)
+    tracks: TentativeTracks
+    together: IntArray = field(default_factory=lambda: np.zeros((0, 0), np.intp))
+    """(n, n) Number of cycles in which each two of them were detected together."""
 
-    def add(self, points: Array, covariances: Array, t: float) -> None:
-        self.tracks.add(points, covariances, t)
-        new = len(self.tracks.last_t) - len(self.together)
-        seen = self.tracks.last_t == t
-        self.together = np.pad(self.together, ((0, new), (0, new))) + np.outer(seen, seen)
+    def with_detections(self, points: Array, covariances: Array, t: float) -> "_Pass":
+        """Return the pass with detections (m, 2), seen at t (s), and their covariances (m, 2, 2)."""
+        tracks = self.tracks.copy()
+        tracks.add(points, covariances, t)
+        new, seen = len(tracks.last_t) - len(self.together), tracks.last_t == t
+        return _Pass(tracks, np.pad(self.together, ((0, new), (0, new))) + np.outer(seen, seen))
+
+    def moved(self, motion: Array) -> "_Pass":
+        tracks = self.tracks.copy()
+        tracks.move(motion)
+        return replace(self, tracks=tracks)
 
     def cones(self) -> list["_Cone"]:
         """Return the confirmed tracks, merged while two of them may be one cone."""
