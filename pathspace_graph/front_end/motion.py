@@ -7,6 +7,7 @@ from typing import Final, Self
 import numpy as np
 
 from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
@@ -224,7 +225,7 @@ class MotionCheck:
         """Return how far the detections are from the predicted pose (3,), in the vehicle's frame."""
         known = matched.pose, matched.information, self._excess, predicted, odometry.covariance
         way = rotation(predicted[2]).T @ (predicted[:2] - self._recent.seen_from)
-        return Difference(*scans.off_prediction(*known), self.errors.shifts(way, odometry.twist))
+        return Difference(*kernels.off_prediction(*known), self.errors.shifts(way, odometry.twist))
 
     @property
     def _excess(self) -> float:
