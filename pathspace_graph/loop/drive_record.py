@@ -95,8 +95,8 @@ class DriveRecord:
         self.unsolvable: str | None = None  # why the drive cannot be solved as a batch; None if it can be
         self.poses: Array = np.zeros((0, 3))  # of each cycle, map frame, as of then or the newest batch
         self.corrected: Array = self.poses  # (k, 3) of the first k cycles, as they were replaced last
-        self.stamps = CycleList[float]()  # stamp of each cycle (s)
-        self._measured = CycleList[MeasuredCycle]()
+        self.stamps: CycleList[float] = CycleList()  # stamp of each cycle (s)
+        self._measured: CycleList[MeasuredCycle] = CycleList()
 
     def copy(self) -> Self:
         """Return a record that can go on independently."""
