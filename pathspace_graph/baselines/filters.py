@@ -1,8 +1,7 @@
 """The paper's filters: that of splines, which closes its loop, and its landmark baseline (paper: Results)."""
 
 from abc import abstractmethod
-from dataclasses import replace
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -27,6 +26,7 @@ from pathspace_graph.mapping.registration import Motion, near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
+from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 
@@ -36,9 +36,6 @@ from .landmark_association import ROUGH, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 
 REACH: Final = 9.0  # a curve is extended up to this far ahead of the vehicle (m along the predicted path)
-SIGMA_MATCH: Final = 0.6  # of a detection in the registration (m), which is worse than online
-PATIENCE: Final = 30.0  # length of the beginning (m) driven again that closes the loop, however uncertain:
-SIGMA_PATIENCE: Final = 1000.0  # replaces `closing.sigma_max` (m) then
 SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the loop closes (m)
 TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
@@ -148,13 +145,19 @@ class CkfMapper(_Filter):
         return scaled(Map(self.closed, curves), self.scale)
 
 
+class EarlySegmentSettings(ClosingSettings, group="closing"):
+    """The registration of a filter, which is less certain than online, and closes the loop in the end."""
+
+    sigma_reading: ClassVar[float] = 0.6
+    patience: ClassVar[float] = 30.0
+    sigma_patience: ClassVar[float] = 1000.0
+
+
 def associate_early_segment(
     state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
 ) -> Motion | None:
     """Return the motion that moves the newest detections onto the beginning of the curves, or None."""
-    closing = replace(
-        state.settings.closing, sigma_reading=SIGMA_MATCH, patience=PATIENCE, sigma_patience=SIGMA_PATIENCE
-    )
+    closing = EarlySegmentSettings(**vars(state.settings.closing))
     track = CurveMap(state.settings)
     for label in state.curves:
         track.state.add_boundary(label, state.boundary(label), state.control_points(label))
