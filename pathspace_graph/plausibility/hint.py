@@ -1,62 +1,33 @@
 """A hint: what is odd about a log, where it is, its likely cause, and what to do; and the table of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE
+from pathspace_graph.lengths import Text
 
 
 @dataclass(frozen=True)
 class Hint:
-    """A likely mistake in a log, by its row of `TABLE` and the numbers that show it; words are made last."""
+    """A likely mistake in a log, in words whose lengths change with the scale of the scene."""
 
-    LENGTHS: ClassVar = {"figures": 0}
+    LENGTHS: ClassVar = dict.fromkeys(("cause", "file", "columns", "found", "likely", "advice"), 0)
 
-    mistake: str
-    """Key of its row."""
-    figures: Mapping[str, Any]
-    """Numbers and words of the row's texts by their names there; each in m or m/s is a `Length`."""
-
-    @property
-    def cause(self) -> str:
-        """Return the kind of the mistake."""
-        return self._text(0)
-
-    @property
-    def file(self) -> str:
-        return self._text(1)
-
-    @property
-    def columns(self) -> str:
-        """Return the columns of the file, in words."""
-        return self._text(2)
-
-    @property
-    def found(self) -> str:
-        """Return what was found, with its figure."""
-        return str(self.figures.get("found") or self._text(3))
-
-    @property
-    def likely(self) -> str:
-        return self._text(4)
-
-    @property
-    def advice(self) -> str:
-        return self._text(5)
-
-    @property
-    def texts(self) -> dict[str, str]:
-        """Return the texts by name, as in `summary.json`."""
-        names = ("cause", "file", "columns", "found", "likely", "advice")
-        return {name: getattr(self, name) for name in names}
+    cause: str
+    """Kind of the mistake."""
+    file: str
+    columns: str
+    """Columns of the file, in words."""
+    found: str
+    """What was found, with its figure."""
+    likely: str
+    """Likely cause."""
+    advice: str
 
     @property
     def line(self) -> str:
         return f"{self.file}, {self.columns}: {self.found}; likely cause: {self.likely}; {self.advice}"
-
-    def _text(self, column: int) -> str:
-        return TABLE[self.mistake][column].format(**self.figures)
 
 
 def because(hints: Sequence[Hint]) -> str:
@@ -162,4 +133,5 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
 
 
 def told(mistake: str, **figures: Any) -> Hint:
-    return Hint(mistake, figures)
+    """Return the hint of a row of `TABLE`, filled in; a figure in m or m/s is a `Length`."""
+    return Hint(*(Text(text, **figures) for text in TABLE[mistake]))

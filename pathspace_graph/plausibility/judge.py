@@ -280,9 +280,10 @@ def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
     if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURNED or sigma > TURNED_SIGMA):
         return found
     side = ", with y to the right" if frame.mirrored else ""
-    figure = next((one.found for one in found if one.cause == "sensor frame"), "")
+    turned = told("turned", angle=_angle(frame.turn + yaw, 1), side=side)
+    figures = [one.found for one in found if one.cause == "sensor frame"]
     others = [one for one in found if one.cause not in ("sensor frame", "y to the right")]
-    return [*others, told("turned", angle=_angle(frame.turn + yaw, 1), side=side, found=figure)]
+    return [*others, replace(turned, found=figures[0]) if figures else turned]
 
 
 def _placed(mounting: Mounting) -> list[Hint]:
