@@ -30,6 +30,9 @@ class Cause(NamedTuple):
     unit: float  # size of a calibration of 1
     signs: tuple[str, str]  # words for a positive and for a negative calibration
 
+    def told(self, value: float) -> str:
+        return self.text.format(self.unit * abs(value), self.signs[0 if value > 0.0 else 1])
+
 
 CAUSES: Final = {  # by the name of the calibration
     "scale": Cause("speeds are {:.1f} % too {}", 100.0, ("high", "low")),
@@ -58,8 +61,7 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.
     lines = []
     for name, ratio in by_prior(state, settings, scale).items():
         if abs(ratio) > LIMIT:
-            cause, size = CAUSES[name], abs(state.by_name[name][0])
-            text = cause.text.format(cause.unit * size, cause.signs[0 if ratio > 0.0 else 1])
+            text = CAUSES[name].told(float(state.by_name[name][0]))
             lines.append(f"{text} ({abs(ratio):.1f} sigmas of its prior)")
     return lines
 
@@ -75,11 +77,6 @@ CLEAR: Final = 4.0  # standard deviations beyond which a measured error of the s
 # size beyond which it is told (rad, m, s, -, m, at scale 1)
 WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
 LENGTHS: Final = ("lateral", "range_bias")  # errors of the sensor in m
-TOLD: Final = {
-    "latency": ("stamps {:.0f} ms {}", ("late", "early")),
-    "yaw": ("turned {:.1f} degrees to the {}", ("left", "right")),
-    "lateral": ("{:.2f} m too far to the {}", ("left", "right")),
-}
 STAYING: Final = 0.1  # share of the variance from which errors that stay with a cone are told
 
 
@@ -117,18 +114,11 @@ def measured_line(measured: MeasuredNoise, scale: float = 1.0) -> str:
 def _errors(measured: MeasuredNoise, scale: float) -> list[str]:
     worth = {name: scale * least if name in LENGTHS else least for name, least in WORTH.items()}
     errors = zip(SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True)
-    clear = {name: value for name, value, sigma in errors if abs(value) > max(CLEAR * sigma, worth[name])}
-    texts = [
-        text.format(CAUSES[name].unit * abs(clear[name]), words[clear[name] < 0.0])
-        for name, (text, words) in TOLD.items()
-        if name in clear
+    return [
+        CAUSES[name].told(value)
+        for name, value, sigma in errors
+        if abs(value) > max(CLEAR * sigma, worth[name])
     ]
-    ranges = []
-    if "range_scale" in clear:
-        ranges.append(f"{clear['range_scale']:+.1%}".replace("%", " %"))
-    if "range_bias" in clear:
-        ranges.append(f"{'-' if clear['range_bias'] < 0.0 else '+'} {abs(clear['range_bias']):.2f} m")
-    return [*texts, f"ranges {' '.join(ranges)}"] if ranges else texts
 
 
 NOISE_FACTOR: Final = 1.5  # of measured and stated noise of the odometry, from which it is wrong

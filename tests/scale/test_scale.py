@@ -467,5 +467,5 @@ def test_a_diagnosis_of_a_small_scene_is_by_the_prior_at_scale_one() -> None:
         sensor_sigma=np.full(5, 1e-3),
     )
     assert measured_line(noise, 0.1).endswith(
-        "detections 0.02 m along and 0.02 m across the ray at 1 m; 0.02 m too far to the left"
+        "detections 0.02 m along and 0.02 m across the ray at 1 m; the sensor sits 0.02 m too far to the left"
     )
