@@ -28,11 +28,11 @@ from pathspace_graph.spline.knots import refit
 
 from .ckf_curves import CurveState, Expansion, in_map
 from .ckf_update import OnCurve, classify, update
-from .landmark_association import ROUGH, associate, compatible, pair_costs
+from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 from .online import OnlineBaseline
 
-REACH: Final = 9.0  # a curve is extended up to this far ahead of the vehicle (m along the predicted path)
+FILTER_REACH: Final = 9.0  # how far ahead of the vehicle a curve is extended (m along the predicted path)
 SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the loop closes (m)
 TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
@@ -86,7 +86,7 @@ class CkfMapper(_Filter):
         free = np.ones(len(detections.labels), bool)
         for on in found.values():
             free[on.rows] = False
-        path_ahead = self.path.ahead(self.state.pose, REACH)
+        path_ahead = self.path.ahead(self.state.pose, FILTER_REACH)
         extended = self.expansion.expand(self.state, detections, path_ahead, free)
         return classify(self.state, detections) if extended else found
 
@@ -229,7 +229,7 @@ class LandmarkCkf(_Filter):
 
     def _associate(self, detections: Detections) -> tuple[IntArray, BoolArray]:
         points = to_map(detections.points_vehicle, self.belief.pose[None])
-        nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH)[1])
+        nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH_GATE)[1])
         predicted, covariances = np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
         if (k := len(nearby)) > 0:
             seen = self.belief.predict_detections(nearby)

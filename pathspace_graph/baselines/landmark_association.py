@@ -17,7 +17,7 @@ from pathspace_graph.settings.online import GrowthSettings
 
 from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother, LandmarkState, two_rows
 
-ROUGH: Final = 5.0  # a landmark farther from every detection of a cycle than this (m) is not tested at all
+ROUGH_GATE: Final = 5.0  # a landmark farther from all detections of a cycle (m) is not tested
 HELD_MARGIN: Final = 1e-9  # of a held pair below the match gate, where round-off would decide
 
 
@@ -29,11 +29,11 @@ class Gates(NamedTuple):
 
 
 MATCH: Final = 0.95  # probability of the gate inside which a detection may be of a landmark
-CREATE: Final = 0.99  # probability of the gates of all landmarks outside of which a detection may be new
-GATES: Final = Gates(chi2_quantile(MATCH, POINT), chi2_quantile(CREATE, POINT))
+CREATE: Final = 0.99  # of the gates of all landmarks outside of which a detection may be new
+LANDMARK_GATES: Final = Gates(chi2_quantile(MATCH, POINT), chi2_quantile(CREATE, POINT))
 
 
-def associate(cost: Array, gates: Gates = GATES) -> tuple[IntArray, BoolArray]:
+def associate(cost: Array, gates: Gates = LANDMARK_GATES) -> tuple[IntArray, BoolArray]:
     """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
     cost (m, n) are squared Mahalanobis distances of detections to landmarks, infinite for other labels.
@@ -62,7 +62,7 @@ def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_co
     return squared_mahalanobis(innovations, predicted_covariances[None] + covariances[:, None])
 
 
-def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates = GATES) -> Array:
+def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates = LANDMARK_GATES) -> Array:
     """Return the costs, where `held` pairs stay in the match gate up to the create gate, lest they flip."""
     inside = (1.0 - HELD_MARGIN) * gates.match
     return np.where(held & (cost < gates.create), np.minimum(cost, inside), cost)
@@ -82,7 +82,7 @@ def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray
     detections, state = smoother.map.detections, smoother.map.state
     rows = np.arange(new.start, new.stop)
     points = detections.points_map(rows, smoother.variables)
-    near = nearest_within(state.landmarks, points, ROUGH)[1]
+    near = nearest_within(state.landmarks, points, ROUGH_GATE)[1]
     landmarks = np.flatnonzero(near & eligible)
     numbers = state.numbers[landmarks]
     predicted = predict(smoother, landmarks)
@@ -91,7 +91,7 @@ def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray
     landmark, is_new = associate(np.where(same_label, any_label, np.inf))
     matched = landmark != UNASSOCIATED
     detections.take(rows[matched], numbers[landmark[matched]])
-    explained = (any_label < GATES.match).any(axis=1)
+    explained = (any_label < LANDMARK_GATES.match).any(axis=1)
     detections.landmark[rows[~matched & (~is_new | explained)]] = AMBIGUOUS
     if explained.any():
         state.vote(detections.label[rows[explained]], numbers[any_label[explained].argmin(axis=1)])
@@ -167,7 +167,7 @@ def compatible_pairs(newer: IntArray, older: IntArray, offset: Array, covariance
     distance = squared_mahalanobis(offset, covariances)
     taken: set[int] = set()
     chosen = []
-    for row in np.argsort(distance)[: int((distance < GATES.match).sum())].tolist():
+    for row in np.argsort(distance)[: int((distance < LANDMARK_GATES.match).sum())].tolist():
         pair = {int(newer[row]), int(older[row])}
         if taken.isdisjoint(pair):
             taken |= pair

@@ -25,11 +25,11 @@ from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
 
 from . import landmark_association as association
-from .landmark_association import CREATE, GATES, difference_covariances, find_duplicates, squared_mahalanobis
+from .landmark_association import CREATE, LANDMARK_GATES, difference_covariances
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 from .online import OnlineBaseline
 
-UNSEEN: Final = 40.0  # path (m) without a detection after which a landmark is not associated near the start
+UNSEEN_PATH: Final = 40.0  # path (m) without a detection: a landmark is not associated near the start
 MIN_PAIRS: Final = 4  # recognized landmarks that close the loop, a third of them of each colour
 MIN_LEAD: Final = 2.0  # over any other set of pairs, where each landmark counts as one gate
 
@@ -110,7 +110,7 @@ class LandmarkFixedLag(OnlineBaseline):
 
     def _old(self) -> BoolArray:
         last_detected = self._last_detected[self.smoother.map.state.numbers]
-        return np.asarray(last_detected < self.path.length - UNSEEN)
+        return np.asarray(last_detected < self.path.length - UNSEEN_PATH)
 
     def _close(self) -> None:
         """Close the loop or, once it has closed, merge duplicates; this is tried every few metres."""
@@ -123,7 +123,9 @@ class LandmarkFixedLag(OnlineBaseline):
             return
         self._last_check = length
         if self.closed:
-            self._merge(*find_duplicates(state, len(state), self.smoother.last_covariance, self.settings))
+            self._merge(
+                *association.find_duplicates(state, len(state), self.smoother.last_covariance, self.settings)
+            )
         elif self._near_start():
             reach = self.settings.closing.radius_after(length)
             recent, old = state.positions(detected), np.flatnonzero(self._old())
@@ -183,7 +185,8 @@ class JointCompatibility:
         """Return the squared Mahalanobis distances (k, n) of all pairs; other labels give infinity."""
         k = len(self.recent)
         spread = difference_covariances(covariance, np.arange(k)[:, None], np.arange(k, len(mean)))
-        return np.where(self.same_label, squared_mahalanobis(mean[:k, None] - mean[None, k:], spread), np.inf)
+        squared = association.squared_mahalanobis(mean[:k, None] - mean[None, k:], spread)
+        return np.where(self.same_label, squared, np.inf)
 
     def conditioned(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
         """Return the Gaussian given that recent landmark i is old landmark j: one Kalman update."""
@@ -222,7 +225,7 @@ def detect_loop(
     old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
         return None
-    gate = GATES.match
+    gate = LANDMARK_GATES.match
     test = JointCompatibility(smoother, recent, old, settings.closing.prior_scale)
     seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
     if len(seeds) == 0:

@@ -41,7 +41,7 @@ _LABEL = "column label"
 _EXPECTED = (
     "{as_written:.0f} % of the detections lie where the odometry expects them, and {share:.0f} % if it is so"
 )
-_TURNED = "static cones move as they would for a sensor that is turned by {angle}"
+_MOVES_TURNED = "static cones move as they would for a sensor that is turned by {angle}"
 _BY_READINGS = "--noise measured takes what is measured"
 _CUT = "check that the record has all of the detections; convert with"
 _CLASSES = "the classes of the detector were not turned into left and right"
@@ -104,7 +104,7 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
         "column {thin} varies by {least:.2g} m only, the other one by {most:.2g} m",
         "the detections are in the frame of a camera, with z ahead, x to the right and y down",
         "put z into column x and -x into column y"),
-    "turned": ("sensor frame", DETECTIONS_FILE, _XY, _TURNED,
+    "turned": ("sensor frame", DETECTIONS_FILE, _XY, _MOVES_TURNED,
         "the sensor is turned by {angle} in the vehicle{side}",
         "state the sensor's mounting, or turn the detections by that into the vehicle's frame"),
     "place": ("mounting", DETECTIONS_FILE, _XY,

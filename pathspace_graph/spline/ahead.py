@@ -22,12 +22,12 @@ from .centre_line import points_across
 
 LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
 MOST_POINTS: Final = 200_000  # largest number of points of a line, which bounds the memory
-_SAMPLE_STEP: Final = 0.5  # of boundaries (m); the circle at a sample is right to a millimetre
-_ACROSS: Final = 2  # stride of the samples among which the points across are searched
-_BEHIND: Final = 3.0  # distance behind the vehicle at which the samples begin (m), since it may stand askew
-_OUTER: Final = 1.8  # largest ratio of the length of a turn's outer boundary to that of the centre line
+_AHEAD_STEP: Final = 0.5  # of boundaries (m); the circle at a sample is right to a millimetre
+_ACROSS_STRIDE: Final = 2  # stride of the samples among which the points across are searched
+_SAMPLES_BEHIND: Final = 3.0  # of the first sample behind the vehicle (m), since it may stand askew
+_OUTER_LENGTH: Final = 1.8  # largest length of a turn's outer boundary by that of the centre line
 _SETTLING_STEPS: Final = 8  # largest number of Newton steps that settle the stations; mostly two are enough
-_SETTLED: Final = 1e-3  # largest difference of the distances from both boundaries on the line (m)
+_LINE_SETTLED: Final = 1e-3  # largest difference of the distances from both boundaries on the line (m)
 _LARGEST_GAP: Final = 2.0  # largest number of steps between neighbours
 
 
@@ -120,8 +120,8 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     samples = {label: _sampled(curve, distance) for label, curve in curves.items()}
     sides = [np.zeros((0, 2)) for _ in BOUNDARIES]
     for label, one in samples.items():
-        beside = (one.station >= -_SETTLED) & (one.station <= distance + _SETTLED)
-        sides[label] = to_vehicle(one.points[beside][::_ACROSS], pose[None])
+        beside = (one.station >= -_LINE_SETTLED) & (one.station <= distance + _LINE_SETTLED)
+        sides[label] = to_vehicle(one.points[beside][::_ACROSS_STRIDE], pose[None])
     line = _first_line(samples[LEFT], samples[RIGHT]) if len(samples) == len(BOUNDARIES) else None
     if line is None or len(line) < 2:
         no, none = np.zeros(0), np.zeros((0, 2))
@@ -143,15 +143,15 @@ class _Samples:
 
 def _sampled(curve: CurveAhead, distance: float) -> _Samples:
     tables = curve.tables
-    begin, end = curve.beside - _BEHIND, curve.beside + _OUTER * distance + _BEHIND
+    begin, end = curve.beside - _SAMPLES_BEHIND, curve.beside + _OUTER_LENGTH * distance + _SAMPLES_BEHIND
     if tables.periodic:
         end = min(end, begin + tables.length)  # at most once round
     else:
         begin, end = max(begin, tables.low), min(end, tables.high, curve.until)
     # a sample is beside the vehicle, if the curve is there
-    first = int(np.floor((begin - curve.beside) / _SAMPLE_STEP + _SETTLED))
-    last = int(np.ceil((end - curve.beside) / _SAMPLE_STEP - _SETTLED))
-    u = curve.beside + _SAMPLE_STEP * np.arange(first, last + 1)
+    first = int(np.floor((begin - curve.beside) / _AHEAD_STEP + _LINE_SETTLED))
+    last = int(np.ceil((end - curve.beside) / _AHEAD_STEP - _LINE_SETTLED))
+    u = curve.beside + _AHEAD_STEP * np.arange(first, last + 1)
     u = np.minimum(np.maximum(u, begin), max(end, begin))
     values, span = tables.evaluate(u, 2)
     columns = span[:, None] + np.arange(-tables.degree, 1)
@@ -178,7 +178,7 @@ def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Arra
     share = (lengths[:-1] / (lengths[:-1] + lengths[1:]))[:, None]
     inner = unit[:-1] * (1.0 - share) + unit[1:] * share
     slopes = np.concatenate([slope[None] / np.hypot(*slope), inner, unit[-1:]])
-    counts = np.maximum(np.ceil(lengths / _SAMPLE_STEP).astype(int), 1)
+    counts = np.maximum(np.ceil(lengths / _AHEAD_STEP).astype(int), 1)
     piece = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(len(piece)) - np.repeat(np.cumsum(counts) - counts, counts) + 1.0
     x, h = (within / counts[piece])[:, None], lengths[piece][:, None]
@@ -194,7 +194,7 @@ def _first_line(left: _Samples, right: _Samples) -> Array:
 
     Each row (4,) is a middle (m, map frame) and the stations of both samples (m).
     """
-    of = slice(None, None, _ACROSS)
+    of = slice(None, None, _ACROSS_STRIDE)
     lefts, rights = left.points[of], right.points[of]
     stations = left.station[of], right.station[of]
     apart = 0.5 * min(left.station[-1], right.station[-1])  # a loop must not be paired across its ends
@@ -202,7 +202,7 @@ def _first_line(left: _Samples, right: _Samples) -> Array:
     forward = j >= np.maximum.accumulate(j)
     i, j = i[forward], j[forward]
     line = np.column_stack([0.5 * (lefts[i] + rights[j]), stations[0][i], stations[1][j]])
-    apart_enough = _distances(line[:, :2]) > _SETTLED
+    apart_enough = _distances(line[:, :2]) > _LINE_SETTLED
     apart_enough[:1] = True
     return line[apart_enough]
 
@@ -217,7 +217,7 @@ def _from_beside(line: Array, position: Array, distance: float, step: float) -> 
     nearest = int(dot(away, away).argmin())
     lengths = np.append(0.0, np.cumsum(np.sqrt(squares)))
     begin = lengths[nearest] + share[nearest] * (lengths[nearest + 1] - lengths[nearest])
-    count = int(min(distance, lengths[-1] - begin) / step + _SETTLED)
+    count = int(min(distance, lengths[-1] - begin) / step + _LINE_SETTLED)
     at = begin + step * np.arange(count + 1)
     return np.column_stack([np.interp(at, lengths, values) for values in line.T])
 
@@ -234,10 +234,10 @@ def _settled(
         both = feet[0].normal + feet[1].normal
         square = np.maximum(dot(both, both), np.finfo(float).tiny)[:, None]
         inside = feet[0].inside & feet[1].inside
-        if not (inside & ((np.abs(off) > _SETTLED) | feet[0].slid | feet[1].slid)).any():
+        if not (inside & ((np.abs(off) > _LINE_SETTLED) | feet[0].slid | feet[1].slid)).any():
             break
         points = points - off[:, None] / square * both
-    good = (np.abs(off) <= _SETTLED) & (feet[0].distance < 0.0) & (feet[1].distance > 0.0)
+    good = (np.abs(off) <= _LINE_SETTLED) & (feet[0].distance < 0.0) & (feet[1].distance > 0.0)
     good &= inside & (_distances(points) <= _LARGEST_GAP * step)
     n = len(good) if good.all() else int(good.argmin())
     normal = both / np.sqrt(square)
@@ -288,7 +288,7 @@ class _Feet:
         self.distance = (2.0 * self.b - self.k * (self.a**2 + self.b**2)) / (1.0 + q)
         tangent, normal = samples.tangents[nearest], self._normals[nearest]
         self.normal = (cosine / q)[:, None] * normal - (sine / q)[:, None] * tangent
-        beyond = np.abs(self.a / self.spread) > 0.5 * _SAMPLE_STEP + _SETTLED
+        beyond = np.abs(self.a / self.spread) > 0.5 * _AHEAD_STEP + _LINE_SETTLED
         self.inside = ~(beyond & ((nearest == 0) | (nearest == last)))
         self.confirmed = samples.confirmed[nearest]
 
@@ -301,7 +301,7 @@ class _Feet:
 
     def _spread(self, distance: Array) -> Array:
         spread = 1.0 - self.k * distance
-        return np.where(np.abs(spread) > _SETTLED, spread, _SETTLED)
+        return np.where(np.abs(spread) > _LINE_SETTLED, spread, _LINE_SETTLED)
 
     @property
     def offset_curvature(self) -> Array:

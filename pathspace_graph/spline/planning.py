@@ -98,9 +98,9 @@ def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Arra
     return np.array(reached)
 
 
-_FEWEST: Final = 4  # smallest number of points of a line
-_NEIGHBOURS: Final = 10  # number of points apart up to which normals must not cross
-_SHORT: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
+_FEWEST_POINTS: Final = 4  # smallest number of points of a line
+_NORMALS_APART: Final = 10  # number of points apart up to which normals must not cross
+_WIDTH_SHARE: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -168,7 +168,7 @@ def centre_line(
     line = find_line(left, right, closed)
     centre = line.ribbon.centre
     length = centre.length()
-    count = max(round(length / step), _FEWEST)
+    count = max(round(length / step), _FEWEST_POINTS)
     arc_length = np.linspace(0.0, length, count + 1)
     u, own = centre.parameters_at(arc_length), slice(count if closed else None)
     points, tangent, crossings = centre.evaluate(u)[own], centre.tangent_unit(u), line.crossings(u)
@@ -201,7 +201,7 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
     """
     left, right = (width.copy() for width in widths)
     count = len(points)
-    for apart in range(1, min(_NEIGHBOURS, count - 1) + 1):
+    for apart in range(1, min(_NORMALS_APART, count - 1) + 1):
         i = np.arange(count if closed else count - apart)
         j = (i + apart) % count
         turn, way = cross(normal[i], normal[j]), points[j] - points[i]
@@ -210,8 +210,8 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
         b = np.divide(cross(way, normal[i]), turn, out=np.full(len(i), np.inf), where=known)
         for width, side in ((left, 1.0), (right, -1.0)):
             meet = (side * a > 0.0) & (side * b > 0.0) & (side * a <= width[i]) & (side * b <= width[j])
-            np.minimum.at(width, i[meet], _SHORT * np.abs(a[meet]))
-            np.minimum.at(width, j[meet], _SHORT * np.abs(b[meet]))
+            np.minimum.at(width, i[meet], _WIDTH_SHARE * np.abs(a[meet]))
+            np.minimum.at(width, j[meet], _WIDTH_SHARE * np.abs(b[meet]))
     return [left, right]
 
 

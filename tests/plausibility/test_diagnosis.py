@@ -11,7 +11,13 @@ from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import CALIBRATION
 from pathspace_graph.io.results import RunNoise, VehicleState
-from pathspace_graph.plausibility.diagnosis import CAUSES, by_prior, diagnose, measured_line, noise_lines
+from pathspace_graph.plausibility.diagnosis import (
+    CALIBRATION_CAUSES,
+    by_prior,
+    diagnose,
+    measured_line,
+    noise_lines,
+)
 
 SETTINGS = {
     "odometry": {"sigma_scale": 0.005, "sigma_bias": 0.002},
@@ -71,7 +77,7 @@ def test_settings_of_another_estimator_give_no_line() -> None:
 
 
 def test_every_calibration_has_a_cause() -> None:
-    assert set(CAUSES) == {*CALIBRATION, *SENSOR}
+    assert set(CALIBRATION_CAUSES) == {*CALIBRATION, *SENSOR}
 
 
 # --- measured noise --------------------------------------------------------------------------------------
