@@ -32,7 +32,7 @@ from pathspace_graph.scale import solved
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 from . import landmark_association as association
-from .landmark_association import LANDMARK_GATES, find_duplicates
+from .landmark_association import MATCH_GATE, find_duplicates
 from .landmark_fixed_lag import LandmarkFixedLag
 from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
 
@@ -185,14 +185,14 @@ class Reassociation:
         cost = self._costs(rows, landmarks)
         held = detections.landmark[rows] == self.state.numbers[landmarks]
         cost = association.hysteresis_costs(cost, held)
-        relabel(self.state, detections.label, rows, landmarks, cost, LANDMARK_GATES.match)
+        relabel(self.state, detections.label, rows, landmarks, cost, MATCH_GATE)
         detections.landmark[:] = UNASSOCIATED
         free = np.ones(len(detections), bool)
         starts = np.searchsorted(detections.cycle[rows], np.arange(len(self.stamps) + 1))
         for begin, end in pairwise(starts.tolist()):
             self._assign_cycle(rows[begin:end], landmarks[begin:end], cost[begin:end], free)
         # a landmark with another label explains it, or one that a new landmark would be merged with
-        known = (cost < LANDMARK_GATES.match) | (distances < self.settings.growth.merge_radius)
+        known = (cost < MATCH_GATE) | (distances < self.settings.growth.merge_radius)
         free[rows[known]] = False
         self._create(np.flatnonzero(free & ~detections.used))
 

@@ -25,7 +25,7 @@ from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
 
 from . import landmark_association as association
-from .landmark_association import CREATE, LANDMARK_GATES, difference_covariances
+from .landmark_association import CREATE, MATCH_GATE, difference_covariances
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 from .online import OnlineBaseline
 
@@ -225,7 +225,7 @@ def detect_loop(
     old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
         return None
-    gate = LANDMARK_GATES.match
+    gate = MATCH_GATE
     test = JointCompatibility(smoother, recent, old, settings.closing.prior_scale)
     seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
     if len(seeds) == 0:

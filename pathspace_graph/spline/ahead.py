@@ -74,14 +74,11 @@ class TrackAhead:
     """Points (k, 2) of the left boundary from beside the vehicle on, in m."""
     right: Array
     """Points (h, 2) of the right boundary from beside the vehicle on, in m."""
+    closed: ClassVar[bool] = False
+    """What is ahead is a stretch, also of a closed track."""
 
     def __repr__(self) -> str:
         return f"TrackAhead({len(self.points)} points on {self.length:.1f} m)"
-
-    @property
-    def closed(self) -> bool:
-        """Return false: what is ahead is a stretch, also of a closed track."""
-        return False
 
     @property
     def length(self) -> float:
@@ -89,27 +86,20 @@ class TrackAhead:
         return float(self.arc_length[-1]) if len(self.arc_length) else 0.0
 
 
-def too_short(name: str, least: float, found: object) -> SettingsError:
-    """Return the error of a length that is less than `least` (m), or no number."""
-    number = f"{float(found):g}" if isinstance(found, Real) else repr(found)
-    return SettingsError(f"{name}: expected a number of at least {least:g} m, found {number}")
-
-
-def check_length(name: str, length: float, least: float = LEAST_STEP) -> None:
-    """Raise a SettingsError unless a length (m) is a number of at least the shortest step."""
-    if not isinstance(length, Real) or not least <= length < np.inf:
-        raise too_short(name, least, length)
+def check_length(name: str, length: float, least: float = 0.0) -> None:
+    """Raise a SettingsError unless a length (m) is a positive number, and at least the given one."""
+    if isinstance(length, Real) and least <= length < np.inf and length > 0.0:
+        return
+    expected = f"a number of at least {least:g} m" if least else "a positive number (m)"
+    found = f"{float(length):g}" if isinstance(length, Real) else repr(length)
+    raise SettingsError(f"{name}: expected {expected}, found {found}")
 
 
 def check_line(distance: float, step: float, scale: float) -> None:
     """Raise a SettingsError unless a scene of this scale can have such a line ahead, in its metres."""
     check_length("step", step, LEAST_STEP * scale)
-    if not isinstance(distance, Real):
-        raise SettingsError(f"distance: expected a number (m), found {distance!r}")
-    if not 0.0 < distance < np.inf:
-        raise SettingsError(f"distance: expected a positive number (m), found {distance:g}")
-    if distance > MOST_POINTS * step:
-        raise too_short("step", distance / MOST_POINTS, step)
+    check_length("distance", distance)
+    check_length("step", step, distance / MOST_POINTS)
 
 
 def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:

@@ -108,10 +108,9 @@ def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float)
     line, found = lines[label], []
     distance, foot = map(np.asarray, KDTree(line.points).query(drive.points))
     inside = (foot > 0) & (foot < len(line.points) - 1)
-    deep = (line.closed | inside) & (
-        distance > CROSSED_DEPTH * aside
-    )  # nothing is beside a curve that has ended
-    reaches = np.asarray(KDTree(drive.points).query(line.points)[0]) > CROSSED_DEPTH * aside
+    depth = CROSSED_DEPTH * aside
+    deep = (line.closed | inside) & (distance > depth)  # nothing is beside a curve that has ended
+    reaches = np.asarray(KDTree(drive.points).query(line.points)[0]) > depth
     for piece in drive.pieces:
         rows, at, share = crossing_segments(drive.points[piece], line.points)
         order = np.argsort(rows + share)
@@ -124,7 +123,7 @@ def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float)
             row, on_line = int(rows[change]), int(at[change])
             step = drive.points[row + 1] - drive.points[row]
             one = Crossing(label, drive.points[row] + share[change] * step, float(drive.length[row]))
-            leaves = (_turn(line.heading[on_line], step) > 0.0) == (label == LEFT)
+            leaves = (cross(line.heading[on_line], step) > 0.0) == (label == LEFT)
             beyond = slice(row + 1, ends[k + 2]) if leaves else slice(ends[k], row + 1)
             is_last = k == (len(changes) - 1 if leaves else 0)
             allowed = is_last and _is_off_road(label, lines, drive, beyond, aside)
@@ -186,8 +185,3 @@ def _is_of_another_lap(one: Crossing, heading: Array, drive: _Way, aside: float)
     beside &= np.abs(dot(drive.heading, off)) < CROSSING_STEP * aside
     beside &= np.abs(drive.heading @ heading) > ALONG_COSINE
     return bool((beside & (np.abs(drive.length - one.driven) > PASSES_APART * aside)).any())
-
-
-def _turn(a: Array, b: Array) -> float:
-    """Return the cross product of two vectors (2,), which is positive where b points to the left of a."""
-    return float(a[0] * b[1] - a[1] * b[0])
