@@ -7,10 +7,11 @@ vehicle ahead, each cone to the row that it fits better.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map, wrap_angle
 from pathspace_graph.io.log import Detections
@@ -55,6 +56,12 @@ class SideJudge:
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
         self._known = self._unknown = 0.0  # newest detections with and without a colour
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other._path, other._cones = self._path and shallow(self._path), self._cones.copy()
+        return other
+
     def update(
         self, pose: Array, twists: Array, detections: Detections, *, in_lane: bool = False
     ) -> Detections:
@@ -94,7 +101,7 @@ class SideJudge:
         stations, lateral = path.locate(near.points[fresh])
         beside = (np.abs(lateral) > MIN_LATERAL) & (np.abs(lateral) < MAX_LATERAL)
         beside &= (stations > path.driven) & (stations < path.driven + REACH)
-        near.judged[fresh[beside]] = True
+        near.judge(fresh[beside])
         is_left = near.votes[fresh, LEFT] > near.votes[fresh, RIGHT]
         agree = (lateral > 0.0) == is_left
         self._agreeing += int((agree & beside).sum())
@@ -203,6 +210,10 @@ class NearCones:
         self.judged: BoolArray = np.zeros(0, bool)  # (n,) whether its colour was compared with its side
         self._last: Array = np.zeros(0)
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: arrays that are written into are new in each call."""
+        return shallow(self)
+
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:
         """Add detections at points (m, 2) with labels (m,), seen at t (s); return the cone (m,) of each."""
         kept = newest_of(self._last, MAX_CONES) & (self._last > t - FORGET_AFTER)
@@ -219,3 +230,8 @@ class NearCones:
         np.add.at(self.points, cones, (points - self.points[cones]) / self.counts[cones, None])
         self._last[cones] = t
         return cones
+
+    def judge(self, cones: IntArray) -> None:
+        """Note that the colours of cones (k,) were compared with their sides."""
+        self.judged = self.judged.copy()
+        self.judged[cones] = True

@@ -1,16 +1,17 @@
 """Cones that no curve explains: tentative tracks, which one may explain later, and orange cones."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, combinations
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 from math import inf
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from scipy.linalg import block_diag
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, move_points, rotated, to_map
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.io.log import Detections
@@ -33,6 +34,10 @@ class TentativeTracks:
         self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
         self.last_t: Array = np.zeros(0)  # (n,) stamp of the newest detection (s)
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
+
     def add(self, points: Array, covariances: Array, t: float) -> None:
         """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
 
@@ -43,7 +48,7 @@ class TentativeTracks:
         if len(points) == 0:
             return
         gate = (self.settings.merge_radius, MERGE_MOST, MERGE_CHI)
-        tracks = _merged(
+        tracks = kernels.merged(
             (self.points, self.information, self.counts, self.last_t), points, covariances, t, gate
         )
         self.points, self.information, self.counts, self.last_t = tracks
@@ -89,53 +94,6 @@ class TentativeTracks:
             self.counts, self.last_t = self.counts[keep], self.last_t[keep]
 
 
-Tracks = tuple[Array, Array, IntArray, Array]
-
-
-@compiled
-def _merged(
-    known: Tracks, points: Array, covariances: Array, t: float, gate: tuple[float, float, float]
-) -> Tracks:
-    """Return the columns of tracks with detections added as `TentativeTracks.add` does.
-
-    The gate is a radius (m), its multiple within which smeared detections are tested, and their sigmas.
-    """
-    radius, most, chi = gate
-    places, inform, counts, last_t = known[0].copy(), known[1].copy(), known[2].copy(), known[3].copy()
-    information = np.linalg.inv(covariances)
-    nearest, near = nearest_within(points, places, radius)
-    offset = points[:, None] - places
-    i, j = np.nonzero(~near[:, None] & ((offset**2).sum(axis=2) < (most * radius) ** 2))
-    if len(i):
-        square, off = np.full(offset.shape[:2], np.inf), offset[i, j]
-        joint = covariances[i] + np.linalg.inv(inform[j])
-        square[i, j] = (off * np.linalg.solve(joint, off[:, :, None])[:, :, 0]).sum(axis=1)
-        smeared = square.min(axis=1) < chi**2
-        nearest[smeared], near[smeared] = square.argmin(axis=1)[smeared], True
-    for row in np.flatnonzero(near):
-        track, weight = nearest[row], information[row]
-        inform[track] += weight
-        places[track] += np.linalg.solve(inform[track], weight @ (points[row] - places[track]))
-        counts[track] += 1
-        last_t[track] = max(last_t[track], t)  # a late detection makes no track older
-    new = int((~near).sum())
-    return (
-        np.concatenate([places, points[~near]]),
-        np.concatenate([inform, information[~near]]),
-        np.concatenate([counts, np.ones(new, np.intp)]),
-        np.concatenate([last_t, np.full(new, t)]),
-    )
-
-
-@compiled
-def _merged_in_turn(points: Array, covariances: Array, gate: tuple[float, float, float]) -> Tracks:
-    """Return the columns of tracks to which detections (m, 2) are added one after another."""
-    tracks: Tracks = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp), np.zeros(0))
-    for k in range(len(points)):
-        tracks = _merged(tracks, points[k : k + 1], covariances[k : k + 1], 0.0, gate)
-    return tracks
-
-
 def merged_in_turn(
     points: Array, covariances: Array, settings: GrowthSettings
 ) -> tuple[Array, Array, IntArray]:
@@ -145,7 +103,7 @@ def merged_in_turn(
     `TentativeTracks.add` does.
     """
     gate = (settings.merge_radius, MERGE_MOST, MERGE_CHI)
-    places, information, counts, _ = _merged_in_turn(points, covariances, gate)
+    places, information, counts, _ = kernels.merged_in_turn(points, covariances, gate)
     return places, information, counts
 
 
@@ -195,6 +153,11 @@ class Sighting:
     twist: Array  # (3,) twist of the vehicle (m/s, m/s, rad/s)
     detections: Detections  # detections of orange cones only
 
+    def placed_by(self, known: Sequence[tuple[int, Array]]) -> Self:
+        """Return the sighting with its pose among poses (P, 3), each from a first cycle on; the last wins."""
+        poses = [poses[self.cycle - first] for first, poses in known if 0 <= self.cycle - first < len(poses)]
+        return replace(self, pose=poses[-1].copy()) if poses else self
+
 
 class OrangeCones:
     """Orange cones as points of the map; they bound no road, and do not hold the vehicle.
@@ -208,29 +171,31 @@ class OrangeCones:
     def __init__(self, settings: GrowthSettings, sigma: float) -> None:
         """Keep how detections are merged, and a standard deviation (m) that none of them averages out."""
         self._settings, self._sigma = settings, sigma
-        self._sightings: list[Sighting] = []
-        self._passes: dict[int, list[_Pass]] = {}  # by label, in order
+        self._sightings: tuple[Sighting, ...] = ()
+        self._passes: dict[int, tuple[_Pass, ...]] = {}  # by label, in order
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def add(self, sighting: Sighting, sensor: Array) -> None:
         """Add the detections of a cycle; `sensor` is the calibration (5,) of the sensor, or (0,)."""
         if len(sighting.detections.labels):
-            self._sightings = [*self._sightings[1 - self.MOST :], sighting]
+            self._sightings = (*self._sightings[1 - self.MOST :], sighting)
             self._place(sighting, sensor)
 
     def place_again(self, sensor: Array, *known: tuple[int, Array]) -> None:
         """Place all detections anew by poses (P, 3), each from a first cycle on; later arguments win."""
         self._passes = {}
-        for k, one in enumerate(self._sightings):
-            for first, poses in known:
-                if first <= one.cycle < first + len(poses):
-                    self._sightings[k] = replace(one, pose=poses[one.cycle - first].copy())
-            self._place(self._sightings[k], sensor)
+        self._sightings = tuple(one.placed_by(known) for one in self._sightings)
+        for one in self._sightings:
+            self._place(one, sensor)
 
     def move(self, motion: Array) -> None:
         """Move all cones by a rigid motion (3,) of the map frame."""
-        self._sightings = [replace(one, pose=compose(motion, one.pose)) for one in self._sightings]
-        for one in chain.from_iterable(self._passes.values()):
-            one.tracks.move(motion)
+        self._sightings = tuple(replace(one, pose=compose(motion, one.pose)) for one in self._sightings)
+        moved = {label: tuple(one.moved(motion) for one in passes) for label, passes in self._passes.items()}
+        self._passes = moved
 
     def points(self) -> dict[int, PointBoundary]:
         """Return the cones that were detected often enough, by label."""
@@ -249,29 +214,38 @@ class OrangeCones:
         places = to_map(points, pose[None])
         for label in np.unique(seen.labels).tolist():
             own = seen.labels == label
-            self._pass(label, seen.t).add(places[own], covariances[own], seen.t)
+            *earlier, present = self._passes_at(label, seen.t)
+            present = present.with_detections(places[own], covariances[own], seen.t)
+            self._passes = {**self._passes, label: (*earlier, present)}
 
-    def _pass(self, label: int, t: float) -> "_Pass":
-        """Return the present pass, which begins where no cone was seen for a while."""
-        passes, settings = self._passes.setdefault(label, []), self._settings
-        if not passes or t - passes[-1].tracks.last_t.max() > settings.forget_after:
-            radius = PASS_RADIUS * settings.merge_radius
-            passes.append(_Pass(TentativeTracks(replace(settings, forget_after=inf, merge_radius=radius))))
-        return passes[-1]
+    def _passes_at(self, label: int, t: float) -> tuple["_Pass", ...]:
+        """Return the passes with the present one, which begins where no cone was seen for a while."""
+        passes, settings = self._passes.get(label, ()), self._settings
+        if passes and t - passes[-1].tracks.last_t.max() <= settings.forget_after:
+            return passes
+        radius = PASS_RADIUS * settings.merge_radius
+        return (*passes, _Pass(TentativeTracks(replace(settings, forget_after=inf, merge_radius=radius))))
 
 
+@dataclass(frozen=True, eq=False)
 class _Pass:
-    """Tracks of one label in one pass, and in how many cycles each two of them were detected together."""
+    """Tracks of one label in one pass, which stay as they are."""
 
-    def __init__(self, tracks: TentativeTracks) -> None:
-        self.tracks = tracks
-        self.together: IntArray = np.zeros((0, 0), np.intp)
+    tracks: TentativeTracks
+    together: IntArray = field(default_factory=lambda: np.zeros((0, 0), np.intp))
+    """(n, n) Number of cycles in which each two of them were detected together."""
 
-    def add(self, points: Array, covariances: Array, t: float) -> None:
-        self.tracks.add(points, covariances, t)
-        new = len(self.tracks.last_t) - len(self.together)
-        seen = self.tracks.last_t == t
-        self.together = np.pad(self.together, ((0, new), (0, new))) + np.outer(seen, seen)
+    def with_detections(self, points: Array, covariances: Array, t: float) -> "_Pass":
+        """Return the pass with detections (m, 2), seen at t (s), and their covariances (m, 2, 2)."""
+        tracks = self.tracks.copy()
+        tracks.add(points, covariances, t)
+        new, seen = len(tracks.last_t) - len(self.together), tracks.last_t == t
+        return _Pass(tracks, np.pad(self.together, ((0, new), (0, new))) + np.outer(seen, seen))
+
+    def moved(self, motion: Array) -> "_Pass":
+        tracks = self.tracks.copy()
+        tracks.move(motion)
+        return replace(self, tracks=tracks)
 
     def cones(self) -> list["_Cone"]:
         """Return the confirmed tracks, merged while two of them may be one cone."""

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BIG_ORANGE, ORANGE
 from pathspace_graph.mapping import tentative as tentative_module
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting, TentativeTracks
 from pathspace_graph.settings.online import GrowthSettings
+
+from ..scenes.digest import digest
 
 Array = NDArray[np.float64]
 
@@ -257,6 +260,34 @@ def test_only_the_newest_sightings_of_orange_cones_are_remembered() -> None:
         cones.add(seen_from(np.zeros(3), cycle), np.zeros(0))
     assert len(cones._sightings) == OrangeCones.MOST
     assert cones._sightings[-1].cycle == OrangeCones.MOST + 19
+
+
+def test_a_copy_of_orange_cones_stays_as_it_is_and_goes_on_as_the_original() -> None:
+    """Nothing that happens to the original shows in a copy: more detections, a motion, and new poses."""
+    cones, pose = OrangeCones(SETTINGS, 0.1), np.array([0.5, 0.0, 0.1])
+    for cycle in range(3):
+        cones.add(seen_from(np.zeros(3), cycle), np.zeros(0))
+    for happens in (
+        lambda cones: cones.add(seen_from(pose, 100), np.zeros(0)),  # a second pass
+        lambda cones: cones.move(np.array([1.0, 2.0, 0.3])),
+        lambda cones: cones.place_again(np.zeros(0), (1, pose + np.zeros((1, 3)))),
+        lambda cones: cones.add(seen_from(pose, 101), np.zeros(0)),
+    ):
+        twin, expected = cones.copy(), copied(cones, {})
+        happens(cones)
+        assert digest(twin) == digest(expected)
+        happens(twin)
+        assert digest(twin) == digest(cones)
+
+
+def test_a_copy_of_tracks_stays_as_it_is() -> None:
+    found = tentative((0.0, 0.0, 1.0, 0.0), (5.0, 0.0, 1.0, 0.2))
+    copy, expected = found.copy(), copied(found, {})
+    found.add(np.array([[0.1, 0.0], [9.0, 0.0]]), round_covariances(1.0, 1.0), 0.3)
+    found.move(np.array([1.0, 0.0, 0.1]))
+    found.restore(np.array([[3.0, 3.0]]), 0.4)
+    found.remove(np.array([0]))
+    assert digest(copy) == digest(expected) != digest(found)
 
 
 def gate(spacing: float) -> Array:
