@@ -25,9 +25,9 @@ from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.detections import NO_STATION
 from pathspace_graph.mapping.motion import vehicle_state, with_size
+from pathspace_graph.mapping.orange import OrangeCones
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.mapping.tentative import OrangeCones
 from pathspace_graph.run import Readings
 from pathspace_graph.settings.mapper import GaugeSettings, MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, check_line, track_ahead

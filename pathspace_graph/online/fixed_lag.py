@@ -23,9 +23,9 @@ from pathspace_graph.lengths import joined, scaled
 from pathspace_graph.loop.closing import simplify
 from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.motion import known_noise, predict
+from pathspace_graph.mapping.orange import OrangeCones, Sighting
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 from pathspace_graph.snapshot import restore, save
