@@ -13,11 +13,14 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from importlib import import_module
+from itertools import takewhile
+from operator import attrgetter
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, FrameType, ModuleType
 from typing import Any
 
 import gtsam
@@ -33,7 +36,6 @@ from pathspace_graph.io.map import read_map
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.results import read_trajectory, write_result
 from pathspace_graph.labels import NAMES
-from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.run import run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim import track_files
@@ -254,28 +256,73 @@ def test_the_bridge_of_the_page_on_ros_maps_json_lines(log: Log) -> None:
     assert answers[-1]["pose"][0] > 1.0
 
 
-def test_each_step_of_the_paper_is_two_calls_from_the_update() -> None:
-    page = text_of(ROOT / "docs" / "architecture.md")
-    owners = {"FixedLagMapper": FixedLagMapper, "TrackLoop": TrackLoop}
-    steps = re.findall(r"^\| [^|]* \| `(\w+)\.(\w+)` \| ([^|]*) \|", page, flags=re.MULTILINE)
-    steps = [step for step in steps if step[0] in owners]
-    assert len(steps) == 7
-    update = inspect.getsource(FixedLagMapper._process)
-    for owner, method, functions in steps:
-        assert f".{method}(" in update or method == "_process"
-        for _, function in NAMED.findall(functions):
-            called = function.rpartition(".")[2]
-            assert f"{called}(" in inspect.getsource(getattr(owners[owner], method)), function
+# --- the page on the architecture ------------------------------------------------------------------------
+
+ARCHITECTURE = ROOT / "docs" / "architecture.md"
 
 
-def test_the_architecture_page_has_the_rooms_in_the_order_of_their_imports() -> None:
-    """A room stands below all that it may import, as `test_rooms` has it."""
-    page = text_of(ROOT / "docs" / "architecture.md")
-    table = page[page.index("## Rooms") : page.index("## What flows where")]
-    listed = re.findall(r"^\| `([a-z_.]+)` \|", table, flags=re.MULTILINE)
-    assert set(listed) == set(ARROWS) - LEAVES - {"cli", "__main__"}
-    for place, room in enumerate(listed):
-        assert ARROWS[room] <= set(listed[:place]), room
+def table_below(page: Path, heading: str) -> list[list[str]]:
+    """The cells of the first table below a heading, row by row, without its header."""
+    text = text_of(page)
+    lines = text[text.index(f"\n## {heading}\n") :].splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith("| "))
+    rows = takewhile(lambda line: line.startswith("|"), lines[first + 2 :])
+    return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in rows]
+
+
+def code_of(module: str, path: str) -> CodeType:
+    """The code of a function, or of a method, which may be inherited."""
+    function = attrgetter(path)(import_module(f"{PACKAGE}.{module}"))
+    return inspect.unwrap(getattr(function, "__func__", function)).__code__
+
+
+def first_calls(update: Callable[[], object], wanted: Mapping[CodeType, str]) -> list[str]:
+    """The wanted functions that are called in an update, by the order of their first calls."""
+    called = dict[str, None]()
+
+    def watch(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and frame.f_code in wanted:
+            called.setdefault(wanted[frame.f_code])
+
+    before = sys.getprofile()
+    sys.setprofile(watch)
+    try:
+        update()
+    finally:
+        sys.setprofile(before)
+    return [*called]
+
+
+def test_a_detection_takes_the_path_of_the_architecture_page(log: Log) -> None:
+    """In the order of the page, in one and the same cycle."""
+    path = [str(cells[1]).strip("`") for cells in table_below(ARCHITECTURE, "The path of a detection")]
+    assert 20 < len(path) <= 30
+    wanted = {code_of(*name.split(":")): name for name in path}
+    mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    paths = [first_calls(partial(mapper.update, *cycle), wanted) for cycle in split_odometry(log)]
+    assert path in paths, max(paths, key=len)
+
+
+def test_the_architecture_page_has_ten_owners() -> None:
+    assert len(table_below(ARCHITECTURE, "Owners")) == 10
+
+
+def named_rooms(cell: str) -> list[str]:
+    return re.findall(r"`([a-z_.]+)`", cell)
+
+
+def test_the_architecture_page_has_the_rooms_and_what_they_may_import() -> None:
+    """As `test_rooms` has it: a room imports from rooms above it, or before it in its row."""
+    above: list[str] = []
+    for rooms, _, imports in table_below(ARCHITECTURE, "Rooms"):
+        only, _, but = imports.partition(" but ")
+        allowed = {*above} - {*named_rooms(but)} if "all above" in only else {*named_rooms(only)}
+        row = named_rooms(rooms)
+        for place, room in enumerate(row):
+            assert ARROWS[room] <= allowed | {*row[:place]}, room
+            assert imports.startswith("some of") or ARROWS[room] == allowed, room
+        above += row
+    assert set(above) == set(ARROWS) - LEAVES - {"cli", "__main__"}
 
 
 # --- formats ---------------------------------------------------------------------------------------------
