@@ -385,13 +385,14 @@ def run_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_tutorial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], png_only: None
 ) -> None:
-    """As a new user types it, on a track of half the length."""
+    """As a new user types it, on a lap of half the length."""
     pytest.importorskip("rosbags")
     pytest.importorskip("rerun")
     monkeypatch.chdir(tmp_path)
     said = []
     for line in tutorial():
-        run_line(line.replace("200 240 --generator.cones 150", "100 130 --generator.cones 80"), monkeypatch)
+        line = line.replace("200 240 --generator.cones 150", "100 130 --generator.cones 80")
+        run_line(line.replace("--laps 2", "--laps 1 --vehicle.overrun 40"), monkeypatch)
         said.append(capsys.readouterr().out)
     online, reference = (read_map(tmp_path / name) for name in ("map", "reference"))
     assert online.closed
