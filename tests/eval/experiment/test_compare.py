@@ -69,7 +69,7 @@ def test_estimators_are_those_named_or_all_that_are_known() -> None:
     with pytest.raises(SettingsError, match=r"a known estimator, found 'nothing'$"):
         choose(("nothing",))
     assert choose_reference(None, ("gaps", "rings")) == "gaps"
-    assert choose_reference(None, ("gaps", registry.DEFAULT)) == registry.DEFAULT
+    assert choose_reference(None, ("gaps", registry.DEFAULT_ONLINE)) == registry.DEFAULT_ONLINE
     with pytest.raises(SettingsError, match="--reference"):
         choose_reference("rings", ("gaps",))
 
