@@ -184,7 +184,7 @@ ASSIGNED = {
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},
     "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
     "mapping.smoother": {"self.window.exact"},
-    "online.fixed_lag": {"self.recovery.failures"},
+    "online.fixed_lag": {"self.failures"},
     "online.outlook": {"row.ended"},
     "commands.options": {"entry.metadata"},  # of dataclasses
     "snapshot": {"array.flags.writeable", "zipped.comment"},  # of numpy and zipfile

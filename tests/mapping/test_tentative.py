@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BIG_ORANGE, ORANGE
@@ -14,6 +13,7 @@ from pathspace_graph.mapping import tentative as tentative_module
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting, TentativeTracks
 from pathspace_graph.settings.online import GrowthSettings
 
+from ..oracles.copied import copied
 from ..scenes.digest import digest
 
 Array = NDArray[np.float64]
@@ -273,7 +273,7 @@ def test_a_copy_of_orange_cones_stays_as_it_is_and_goes_on_as_the_original() -> 
         lambda cones: cones.place_again(np.zeros(0), (1, pose + np.zeros((1, 3)))),
         lambda cones: cones.add(seen_from(pose, 101), np.zeros(0)),
     ):
-        twin, expected = cones.copy(), copied(cones, {})
+        twin, expected = cones.copy(), copied(cones)
         happens(cones)
         assert digest(twin) == digest(expected)
         happens(twin)
@@ -282,7 +282,7 @@ def test_a_copy_of_orange_cones_stays_as_it_is_and_goes_on_as_the_original() -> 
 
 def test_a_copy_of_tracks_stays_as_it_is() -> None:
     found = tentative((0.0, 0.0, 1.0, 0.0), (5.0, 0.0, 1.0, 0.2))
-    copy, expected = found.copy(), copied(found, {})
+    copy, expected = found.copy(), copied(found)
     found.add(np.array([[0.1, 0.0], [9.0, 0.0]]), round_covariances(1.0, 1.0), 0.3)
     found.move(np.array([1.0, 0.0, 0.1]))
     found.restore(np.array([[3.0, 3.0]]), 0.4)

@@ -10,7 +10,6 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, RIGHT
@@ -21,6 +20,8 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings, drive, integrate
+
+from ..oracles.copied import copied
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -147,7 +148,7 @@ def _beginning_of(log: Log, cycles: int, settings: MapperSettings | None) -> Map
 def map_beginning(log: Log, cycles: int, settings: MapperSettings | None = None) -> Mapped:
     """A copy of a mapper after the first cycles of a log that a scene keeps, which is mapped once."""
     mapper, results = _beginning_of(log, cycles, settings)
-    return copied(mapper, {}), [*results]
+    return copied(mapper), [*results]
 
 
 def replay(mapper: FixedLagMapper, odometry: Odometry, detections: Detections) -> CycleResult:
