@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, RIGHT
@@ -23,6 +22,7 @@ from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings, drive, integrate
 
+from ..oracles.copied import copied
 from .session import once, pickled, unpickled
 
 Array = NDArray[np.float64]
@@ -162,13 +162,13 @@ def _beginning_of(log: Log, cycles: int, settings: MapperSettings | None) -> Map
 def map_beginning(log: Log, cycles: int, settings: MapperSettings | None = None) -> Mapped:
     """A copy of a mapper after the first cycles of a log that a scene keeps, which is mapped once."""
     mapper, results = _beginning_of(log, cycles, settings)
-    return copied(mapper, {}), [*results]
+    return copied(mapper), [*results]
 
 
 def mapped(log: Log) -> Mapped:
     """A copy of a mapper after a log, which is mapped once a session, and what it said."""
     mapper, results = once(lambda: map_log(log), "online", log, write=_save, read=_restore)
-    return copied(mapper, {}), [*results]
+    return copied(mapper), [*results]
 
 
 def _save(run: Mapped, folder: Path) -> None:

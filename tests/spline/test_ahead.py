@@ -156,9 +156,9 @@ def test_a_drive_sees_its_centre_line_and_is_not_changed_by_looking() -> None:
     for cycle, (odometry, detections) in enumerate(split_odometry(log)):
         looked.wait()
         looked.update(odometry, detections)
-        before = looked.smoother.variables.values.copy()
+        before = looked.road.smoother.variables.values.copy()
         ahead = looked.ahead(15.0)
-        assert np.array_equal(looked.smoother.variables.values, before)
+        assert np.array_equal(looked.road.smoother.variables.values, before)
         if cycle % 10 or len(ahead.points) < 2:
             continue
         pose = np.tile(looked.poses[-1], (len(ahead.points), 1))
