@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -15,6 +16,25 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 from pathspace_graph.checkpoint import Recovery
+from pathspace_graph.loop import worker
+
+from .scenes import laps
+from .scenes.session import FOLDER
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the folder of the session, which workers find in their environment."""
+    if not hasattr(config, "workerinput"):
+        folder = TemporaryDirectory(prefix="pathspace-tests-")
+        os.environ[FOLDER] = folder.name
+        config.add_cleanup(folder.cleanup)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _laps_are_solved_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worker, "submit", laps.submit)
+        yield
 
 
 @pytest.fixture

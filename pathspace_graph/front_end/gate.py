@@ -8,11 +8,12 @@ A cycle comes in metres of its scene and leaves the gate at scale 1; its result 
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.errors import InputError, ReadingError
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
@@ -83,6 +84,10 @@ class Gate:
         self.refused = 0  # number of cycles that were refused since the last one that was used
         self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
         self._dropping = False
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def admit(self, odometry: Odometry, detections: Detections, newest: Newest) -> Admitted:
         """Return a cycle as an estimator may use it; otherwise raise a ReadingError and count it as refused.

@@ -11,6 +11,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, ray_axes
@@ -250,9 +251,15 @@ class Measurement:
         found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
         return cls(cycles, replace(found, odometry=sigma, interval=interval))
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other._tracker = self._tracker.copy()
+        return other
+
     def _begin(self, found: MeasuredNoise) -> None:
         self._found, self._tracker, self._followed = found, ConeTracker(found), 0
-        self._sightings: list[Sightings] = []
+        self._sightings: tuple[Sightings, ...] = ()
         self._cones: _Cones | None = None
 
     def advance(self) -> MeasuredNoise | None:
@@ -260,11 +267,11 @@ class Measurement:
         if self._cones is not None:
             return self._round(self._cones)
         cycles = self._cycles[self._followed : self._followed + FOLLOWED]
-        self._sightings.append(self._tracker.follow(cycles))
+        self._sightings = (*self._sightings, self._tracker.follow(cycles))
         self._followed += FOLLOWED
         if self._followed < len(self._cycles):
             return None
-        self._sightings = [Sightings.stacked(self._sightings)]
+        self._sightings = (Sightings.stacked(self._sightings),)
         self._cones = _cones(self._sightings[0])
         if self._cones is None:
             return self._passed(self._found)

@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, integrated_odometry
@@ -67,6 +68,13 @@ class MotionCheck:
         self._rest = Rest(sigma)
         self._standstill = Standstill()
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other.errors, other._recent = self.errors.copy(), self._recent.copy()
+        other._rest, other._standstill = self._rest.copy(), self._standstill.copy()
+        return other
 
     def set_noise(self, sigma: Array) -> None:
         """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten."""
@@ -257,6 +265,10 @@ class Rest:
     def __init__(self, sigma: Array) -> None:
         self.sigma = sigma
         self.end()
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def end(self) -> None:
         self._since: float | None = None

@@ -9,10 +9,11 @@ by -psi. Detections that are late by tau lie too far ahead by `tau v`, which cha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import left_of, rotation, to_map
@@ -49,6 +50,10 @@ class RecentDetections:
         self.points: Array = np.zeros((0, 2))  # (n, 2) place of each detection, m
         # a row is [stamp | point as measured | place of the vehicle | derivatives of x | derivatives of y]
         self._table: Array = np.zeros((0, 5 + 2 * len(ERRORS)))
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
         """Add detections (m, 2) at t (s) from a pose (3,), and their derivatives (m, 2, e) by errors."""
@@ -158,6 +163,10 @@ class SensorErrors:
         self._drift: Array = np.diag(np.square(SIGMAS_CHANGES)) / MINUTE
         self._velocity: Array = np.zeros(3)
         self._possible: Array = 0.5 * MEMORY * np.array(settings.accelerations)
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def contradict(self, settings: CalibrationSettings) -> bool:
         """Return whether the errors contradict the sensor's prior, by `settings.doubt` sigmas."""

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from math import comb
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import MeasuredNoise
@@ -49,7 +50,7 @@ class Sightings:
         return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     @classmethod
-    def stacked(cls, tables: "list[Sightings]") -> "Sightings":
+    def stacked(cls, tables: "Sequence[Sightings]") -> "Sightings":
         return cls(*(np.concatenate([getattr(one, column.name) for one in tables]) for column in fields(cls)))
 
 
@@ -71,6 +72,10 @@ class ConeTracker:
         self._cones: Cones = (np.zeros((0, 2)), none, np.zeros(0), np.zeros(0), none)
         self._count = 0
         self._from: tuple[float, Array, Array] | None = None  # stamp, pose and `by_bias` of the latest cycle
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def follow(self, cycles: Sequence[SeenCycle]) -> Sightings:
         """Return the sightings of the next cycles as measured, in order of time, the nearest first."""
@@ -120,12 +125,16 @@ class TwistRecord:
     """Newest twists that were measured while the vehicle drove."""
 
     def __init__(self) -> None:
-        self._parts: list[Odometry] = []
+        self._parts: tuple[Odometry, ...] = ()
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def add(self, odometry: Odometry) -> None:
-        self._parts.append(odometry)
+        self._parts = (*self._parts, odometry)
         if len(self._parts) > MOST_PARTS:
-            self._parts = [Odometry(*self._newest)]
+            self._parts = (Odometry(*self._newest),)
 
     @property
     def _newest(self) -> tuple[Array, Array]:

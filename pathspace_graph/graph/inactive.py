@@ -18,11 +18,12 @@ oldest link holds the origin of the map frame. To bring it back to (0, 0, 0), th
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final, Protocol, Self
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.linear import keys_of_factor
@@ -52,6 +53,13 @@ class InactiveMap:
         self._shared: list[gtsam.GaussianFactor] = []
         self._active: tuple[Layout, Layout, IntArray] | None = None
         """Layout of all variables, that of the active ones, and their columns in the former."""
+
+    def copy(self) -> Self:
+        """Return a map to which conditionals can be added independently."""
+        other = shallow(self)
+        other.net = gtsam.GaussianBayesNet()
+        other.net.push_back(self.net)
+        return other
 
     def __len__(self) -> int:
         return int(self.net.size())
@@ -94,7 +102,7 @@ class InactiveMap:
         self._given = np.setdiff1d(
             np.union1d(self._given, separator), np.append(self.keys, self._old_anchors)
         )
-        self._shared += shared
+        self._shared = [*self._shared, *shared]
         self._active = None
         return remaining
 
@@ -150,6 +158,13 @@ class InactiveChain(InactiveMap):
         self.links: list[Link] = []
         self._pose_keys: IntArray = NO_KEYS  # (a,) keys of the origin and of past anchors, ascending
         self.poses: dict[int, Array] = {}  # (3,) of the origin and of past anchors by key, as of `refresh`
+
+    def copy(self) -> Self:
+        """Return a chain that can grow independently."""
+        other = super().copy()
+        other.links = self.links.copy()
+        other.poses = self.poses.copy()
+        return other
 
     def __len__(self) -> int:
         return len(self.links)

@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice
+from typing import Self
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.se2 import compose, relative, wrap_angle
@@ -144,6 +146,14 @@ class Submaps:
         self._graph: gtsam.GaussianFactorGraph | None = None
         self._keyframe = 0
         self._driven = 0.0
+
+    def copy(self) -> Self:
+        """Return submaps that can go on independently."""
+        other = shallow(self)
+        other.finished = self.finished.copy()
+        other.keyframes = self.keyframes.copy()
+        other._attached = self._attached.copy()
+        return other
 
     def add_pose(self, pose: int, factors: gtsam.GaussianFactorGraph, variables: Variables) -> None:
         """Add the window's oldest pose, by its key, and its factors, without the prior, to the submap.

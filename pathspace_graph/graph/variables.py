@@ -17,13 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from copy import copy
 from functools import cached_property
 from typing import ClassVar, Final
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.sensor import SENSOR_SIZE
@@ -181,7 +181,7 @@ class Variables:
 
     def copy(self) -> Variables:
         """Return variables with the same keys and copies of the values."""
-        other = copy(self)
+        other = shallow(self)
         other.values, other.linearized = self.values.copy(), self.linearized.copy()
         return other
 

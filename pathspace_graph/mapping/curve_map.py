@@ -1,9 +1,10 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, TOLERANCES
@@ -34,6 +35,14 @@ class CurveMap:
         self.stations: Stations | None = None  # these cones, where they hold detections along the curves
         self.reached_inactive = False  # whether the latest `rows` reach inactive control points
         self._refined: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
+
+    def copy(self) -> Self:
+        """Return a map that can change independently."""
+        other = shallow(self)
+        other.state = self.state.copy()
+        other.variables = other.state.variables
+        other.detections = self.detections.copy()
+        return other
 
     # --- detections --------------------------------------------------------------------------------------
 
@@ -144,7 +153,7 @@ class CurveMap:
     @property
     def structure(self) -> object:
         """Return an object that is replaced when the weak priors hold other control points than before."""
-        return self.state.curves if self.state.boundaries else None
+        return self.state.curves.keys if self.state.boundaries else None
 
     def gauge(self, whole: bool) -> list[Rows]:
         """Return `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`, on all points if `whole`."""

@@ -7,6 +7,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotated
@@ -168,6 +169,13 @@ class DetectionTable(DetectionColumns):
     def refine(self, rows: IntArray, u: Array) -> None:
         """Store the refreshed foot points' parameters (m,); the associations do not change."""
         self.u[rows] = u
+
+    def copy(self) -> Self:
+        """Return a table whose associations can change independently; other columns are only replaced."""
+        other = shallow(self)
+        for column in ("boundary", "u", "used", "station", "changed"):
+            vars(other)[column] = vars(self)[column].copy()
+        return other
 
     @property
     def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array]:

@@ -5,6 +5,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import move_points
@@ -54,6 +55,10 @@ class DrivenPath:
         self.length = 0.0  # length of the driven path: the station of the vehicle (m)
         self.curvature = 0.0  # smoothed curvature of the present turn (1/m), left positive
         self._last: Array = np.zeros(2)
+
+    def copy(self) -> Self:
+        """Return a path that can grow independently; its arrays are only replaced."""
+        return shallow(self)
 
     def update(self, pose: Array) -> None:
         """Extend the path to `pose` (3,), map frame."""

@@ -41,6 +41,7 @@ from ..scenes.digest import digest
 from ..scenes.drives import bean_track, lap_log, map_log, noisy, replay, true_poses
 from ..scenes.holes import unseen
 from ..scenes.kidnapped import laps_log, pear_track
+from ..scenes.laps import IN_A_PROCESS, solved
 
 Work = Callable[..., Any]
 PERIOD, NEVER = 0.1, -1
@@ -61,7 +62,7 @@ class Slow(Future[LapMarginal]):
         return super().result(0.0)
 
     def end(self) -> None:
-        self.set_result(solve_lap(self.lap))
+        self.set_result(solved(self.lap))
 
 
 @pytest.fixture
@@ -212,8 +213,8 @@ def test_a_slow_machine_changes_nothing_of_a_replay(monkeypatch: pytest.MonkeyPa
     def submit(work: Work, *arguments: Any) -> Future[Any]:
         future: Future[Any] = Future()
         if work is solve_lap:
-            solved = replace(solve_lap(*arguments), seconds=5.0)  # type: ignore[type-var]
-            Timer(1.0, future.set_result, [solved]).start()
+            slower = replace(solved(*arguments), seconds=5.0)
+            Timer(1.0, future.set_result, [slower]).start()
         return future
 
     expected, mapper = with_settings(), with_settings()
@@ -321,6 +322,7 @@ def test_where_no_process_can_be_begun_there_is_a_notice(stem: Stem, monkeypatch
 
     worker._worker.cache_clear()
     monkeypatch.setattr(loky, "ProcessPoolExecutor", lambda **_: Executor())
+    monkeypatch.setattr(worker, "submit", IN_A_PROCESS)
     mapper = stem.mapper()
     results = [replay(mapper, *cycle) for cycle in stem.rest(log())]
     failed = own_prior("the batch of the lap has failed: OSError: out of memory")
@@ -362,7 +364,7 @@ def test_a_late_batch_is_sent_again_by_a_restored_mapper(
     restored = FixedLagMapper.restore(tmp_path / "late.snap")
     (_, lap), (_, same) = futures[-2:]
     for future, arguments in ((futures[-2][0], lap), (futures[-1][0], same)):
-        future.set_result(solve_lap(*arguments))
+        future.set_result(solved(*arguments))
     for cycle in cycles:
         assert mapper.update(*cycle).notice == restored.update(*cycle).notice == ""
     assert mapper.batches().ends == restored.batches().ends == (batch.due + 3,)  # type: ignore[union-attr]
@@ -412,7 +414,7 @@ def says(objection: str) -> Refuse:
     """What ends a batch whose map is objected to."""
 
     def end(batch: Slow) -> None:
-        batch.set_result(replace(solve_lap(batch.lap), objection=objection))
+        batch.set_result(replace(solved(batch.lap), objection=objection))
 
     return end
 

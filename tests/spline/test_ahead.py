@@ -154,6 +154,7 @@ def test_a_drive_sees_its_centre_line_and_is_not_changed_by_looking() -> None:
     looked = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     compared = {False: 0, True: 0}
     for cycle, (odometry, detections) in enumerate(split_odometry(log)):
+        looked.wait()
         looked.update(odometry, detections)
         before = looked.smoother.variables.values.copy()
         ahead = looked.ahead(15.0)
