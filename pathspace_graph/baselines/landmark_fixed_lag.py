@@ -55,7 +55,6 @@ class LandmarkFixedLag(OnlineBaseline):
         other = super().copy()
         other.smoother, other.path = self.smoother.copy(), self.path.copy()
         other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
-        other._last_detected = self._last_detected.copy()
         return other
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
