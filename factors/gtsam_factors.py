@@ -11,13 +11,14 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from . import _kernels as kernels
 from .arrays import Array, BoolArray, IntArray
 from .bspline import SpanPolynomials
 from .footpoint import FootPoints, foot_points
 from .linear import linear_factor
 from .noise import huber_roots, huber_weights
-from .odometry import IntegratedOdometry, odometry_residuals
-from .residuals import sigma_across, station_rows
+from .odometry import IntegratedOdometry
+from .residuals import sigma_across
 from .se2 import rotation, to_map
 from .sensor import corrected, sensor_rows
 
@@ -158,7 +159,7 @@ def _station_factor(
         points, control = to_map(corrected(measured, twists, sensor), poses), curve.control_points(values)
         basis = np.ascontiguousarray(value), np.ascontiguousarray(slope), control[columns]
         seen = measured, twists, sensor
-        residual, sigma, J = station_rows(points, covariances, poses, *basis, *seen, sigma_station)
+        residual, sigma, J = kernels.station_rows(points, covariances, poses, *basis, *seen, sigma_station)
         whitened = residual / sigma
         if H is None:
             return huber_roots(whitened, huber)
@@ -334,7 +335,7 @@ def calibrated_odometry_factor(
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
         start, end = values.atPose2(keys[0]), values.atPose2(keys[1])
-        residual, by_start, by_end = odometry_residuals(
+        residual, by_start, by_end = kernels.odometry_residuals(
             pose_array(start)[None], pose_array(end)[None], odometry.delta[None]
         )
         if H is not None:

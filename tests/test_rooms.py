@@ -16,9 +16,8 @@ MOST_FILES = 15
 EXTRAS = {"distributed", "rerun", "rosbags"}
 """Optional packages, which are imported only where they are needed."""
 
-LATE = {"commands.estimate": {"eval.view.recording"}, "factors.kernels": {"factors._kernels"}}
-LATE["io.brief"] = {"eval.figures.map_plot", "frames"}
-"""Modules that are imported by name when needed: matplotlib is slow, and kernels may not be built."""
+LATE = {"commands.estimate": {"eval.view.recording"}, "io.brief": {"eval.figures.map_plot", "frames"}}
+"""Modules that are imported by name when needed, since matplotlib is slow."""
 ASKED = {"io.brief"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""
 

@@ -112,7 +112,7 @@ class Online:
         if self.resume is None:
             return log, estimators.make_online(self.estimator, self.settings, log)
         mapper = FixedLagMapper.restore(self.resume)
-        times = mapper.smoother.times
+        times = mapper.road.smoother.times
         cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])
         if not cycles:
             expected = f"expected cycles after {times[-1]:g} s, where {self.resume} ends"

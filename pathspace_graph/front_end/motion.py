@@ -1,12 +1,13 @@
 """The motion between two cycles: odometry, checked against what the detections say of it."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import replace
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
@@ -70,7 +71,7 @@ class MotionCheck:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently."""
-        other = copy(self)
+        other = shallow(self)
         other.errors, other._recent = self.errors.copy(), self._recent.copy()
         other._rest, other._standstill = self._rest.copy(), self._standstill.copy()
         return other
@@ -224,7 +225,7 @@ class MotionCheck:
         """Return how far the detections are from the predicted pose (3,), in the vehicle's frame."""
         known = matched.pose, matched.information, self._excess, predicted, odometry.covariance
         way = rotation(predicted[2]).T @ (predicted[:2] - self._recent.seen_from)
-        return Difference(*scans.off_prediction(*known), self.errors.shifts(way, odometry.twist))
+        return Difference(*kernels.off_prediction(*known), self.errors.shifts(way, odometry.twist))
 
     @property
     def _excess(self) -> float:
@@ -267,7 +268,7 @@ class Rest:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def end(self) -> None:
         self._since: float | None = None

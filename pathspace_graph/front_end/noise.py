@@ -1,13 +1,13 @@
 """Noise that is used in a drive: what the log states, or what the drive itself has shown so far."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import replace
 from math import inf
 from typing import Any, Final, Literal, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
@@ -47,7 +47,7 @@ class NoiseLearner:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently."""
-        other = copy(self)
+        other = shallow(self)
         other._twists = self._twists.copy()
         other._measurement = self._measurement and self._measurement.copy()
         return other

@@ -5,12 +5,12 @@ path decide together what colours mean. Where most have none, two rows of cones 
 vehicle ahead, each cone to the row that it fits better.
 """
 
-from copy import copy
 from dataclasses import replace
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections
@@ -53,8 +53,8 @@ class SideJudge:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently."""
-        other = copy(self)
-        other._path, other._cones = copy(self._path), self._cones.copy()
+        other = shallow(self)
+        other._path, other._cones = self._path and shallow(self._path), self._cones.copy()
         return other
 
     def update(
@@ -159,7 +159,7 @@ class NearCones:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: arrays that are written into are new in each call."""
-        return copy(self)
+        return shallow(self)
 
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:
         """Add detections at points (m, 2) with labels (m,), seen at t (s); return the cone (m,) of each."""

@@ -6,12 +6,12 @@ nothing is seen of the motion, as between walls, both fit alike, and the odometr
 """
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, move_points, relative
 
@@ -43,7 +43,7 @@ class Standstill:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def add(self, t: float, points: Array, covariances: Array, delta: Array) -> None:
         """Add corrected detections (n, 2), vehicle frame, at t (s) after a motion (3,) by the odometry."""

@@ -4,6 +4,7 @@ The third-degree spherical-radial rule (Arasaratnam and Haykin 2009) is the pape
 """
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
@@ -99,6 +100,12 @@ class Belief:
         known = np.array([*settings.means, *sensor.means])
         belief.mean[POSE : POSE + len(known)] = known
         return belief
+
+    def copy(self) -> Self:
+        other = copy(self)
+        other.mean = self.mean.copy()
+        other.covariance = self.covariance.copy()
+        return other
 
     @property
     def pose(self) -> Array:

@@ -1,7 +1,6 @@
 """Orange cones: points of the map, which bound no road."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from math import inf
@@ -10,6 +9,7 @@ from typing import Final, Self
 import numpy as np
 from scipy.linalg import block_diag
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, rotated, to_map
 from pathspace_graph.factors.sensor import corrected
@@ -58,7 +58,7 @@ class OrangeCones:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def add(self, sighting: Sighting, sensor: Array) -> None:
         """Add the detections of a cycle; `sensor` is the calibration (5,) of the sensor, or (0,)."""

@@ -11,8 +11,8 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.residuals import station_rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY
 
 from .detections import NO_STATION, DetectionTable
@@ -104,7 +104,7 @@ class Stations:
         columns, sensor = self.columns[station], variables.sensor
         measuring = np.array([FIRST_POSE, SENSOR_KEY]) + np.outer(cycle, [1, 0])
         keys = np.concatenate([measuring[:, : 2 if len(sensor) else 1], state.map_keys[columns]], axis=1)
-        residual, sigma, jacobian = station_rows(
+        residual, sigma, jacobian = kernels.station_rows(
             detections.points_map(rows, variables),
             detections.covariance[rows],
             variables.poses_at(cycle),

@@ -1,13 +1,13 @@
 """Tentative tracks: cones that no curve explains yet, which one may explain later."""
 
 from collections.abc import Mapping
-from copy import copy
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import move_points, rotated
 from pathspace_graph.settings.online import GrowthSettings
 
@@ -29,7 +29,7 @@ class TentativeTracks:
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
-        return copy(self)
+        return shallow(self)
 
     def add(self, points: Array, covariances: Array, t: float) -> None:
         """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
@@ -41,7 +41,7 @@ class TentativeTracks:
         if len(points) == 0:
             return
         gate = (self.settings.merge_radius, MERGE_MOST, MERGE_CHI)
-        tracks = _merged(
+        tracks = kernels.merged(
             (self.points, self.information, self.counts, self.last_t), points, covariances, t, gate
         )
         self.points, self.information, self.counts, self.last_t = tracks
@@ -87,53 +87,6 @@ class TentativeTracks:
             self.counts, self.last_t = self.counts[keep], self.last_t[keep]
 
 
-Tracks = tuple[Array, Array, IntArray, Array]
-
-
-@compiled
-def _merged(
-    known: Tracks, points: Array, covariances: Array, t: float, gate: tuple[float, float, float]
-) -> Tracks:
-    """Return the columns of tracks with detections added as `TentativeTracks.add` does.
-
-    The gate is a radius (m), its multiple within which smeared detections are tested, and their sigmas.
-    """
-    radius, most, chi = gate
-    places, inform, counts, last_t = known[0].copy(), known[1].copy(), known[2].copy(), known[3].copy()
-    information = np.linalg.inv(covariances)
-    nearest, near = nearest_within(points, places, radius)
-    offset = points[:, None] - places
-    i, j = np.nonzero(~near[:, None] & ((offset**2).sum(axis=2) < (most * radius) ** 2))
-    if len(i):
-        square, off = np.full(offset.shape[:2], np.inf), offset[i, j]
-        joint = covariances[i] + np.linalg.inv(inform[j])
-        square[i, j] = (off * np.linalg.solve(joint, off[:, :, None])[:, :, 0]).sum(axis=1)
-        smeared = square.min(axis=1) < chi**2
-        nearest[smeared], near[smeared] = square.argmin(axis=1)[smeared], True
-    for row in np.flatnonzero(near):
-        track, weight = nearest[row], information[row]
-        inform[track] += weight
-        places[track] += np.linalg.solve(inform[track], weight @ (points[row] - places[track]))
-        counts[track] += 1
-        last_t[track] = max(last_t[track], t)  # a late detection makes no track older
-    new = int((~near).sum())
-    return (
-        np.concatenate([places, points[~near]]),
-        np.concatenate([inform, information[~near]]),
-        np.concatenate([counts, np.ones(new, np.intp)]),
-        np.concatenate([last_t, np.full(new, t)]),
-    )
-
-
-@compiled
-def _merged_in_turn(points: Array, covariances: Array, gate: tuple[float, float, float]) -> Tracks:
-    """Return the columns of tracks to which detections (m, 2) are added one after another."""
-    tracks: Tracks = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp), np.zeros(0))
-    for k in range(len(points)):
-        tracks = _merged(tracks, points[k : k + 1], covariances[k : k + 1], 0.0, gate)
-    return tracks
-
-
 def merged_in_turn(
     points: Array, covariances: Array, settings: GrowthSettings
 ) -> tuple[Array, Array, IntArray]:
@@ -143,7 +96,7 @@ def merged_in_turn(
     `TentativeTracks.add` does.
     """
     gate = (settings.merge_radius, MERGE_MOST, MERGE_CHI)
-    places, information, counts, _ = _merged_in_turn(points, covariances, gate)
+    places, information, counts, _ = kernels.merged_in_turn(points, covariances, gate)
     return places, information, counts
 
 

@@ -4,17 +4,18 @@ The tentative stretch is no part of the graph: it is fitted anew whenever the ma
 """
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.linalg import block_diag
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.growth import newest, undisputed
 from pathspace_graph.mapping.path import SIDES, DrivenPath
 from pathspace_graph.mapping.rows import ConeRow, extend_rows
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
@@ -22,8 +23,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
-
-from .growth import newest, undisputed
 
 TENTATIVE_REACH: Final = 12.5  # farthest track from the vehicle that the stretch leads through (m)
 UNCONFIRMED_MEMORY: Final = 0.35
@@ -129,7 +128,7 @@ def look_ahead(
     for label, (row, chosen) in extended_rows(track, tentative, path, t).items():
         variances = tentative[label].variances(chosen) + SIGMA_CONE**2
         if label in state.boundaries:
-            known, longer = state.control_points(label), copy(state.boundaries[label])
+            known, longer = state.control_points(label), shallow(state.boundaries[label])
             end = longer.confirmed_end
             placement = longer.extend(len(known), end + row.lengths) if len(chosen) else None
             outlooks[label] = Outlook(longer, known, end, row.cones, variances, placement)
