@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.io.log import Detections, Odometry
@@ -14,6 +13,7 @@ from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
+from ..oracles.copied import copied
 from ..scenes.digest import digest
 from ..scenes.drives import short_drive
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.mapping import tentative as tentative_module
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.online import GrowthSettings
 
+from ..oracles.copied import copied
 from ..scenes.digest import digest
 
 Array = NDArray[np.float64]
