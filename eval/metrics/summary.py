@@ -53,7 +53,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
     if crossed := crossings_of(result):
         summary["crossings"] = [_crossing(one) for one in crossed]
     if hints:
-        summary["hints"] = [hint.texts for hint in hints]
+        summary["hints"] = [vars(hint) for hint in hints]
     told = [record for record in result.cycles if record.jump is not None or record.notice]
     if told:
         keys = ("cycle", "t", "jump", "notice")

@@ -50,7 +50,7 @@ def test_a_copy_stays_as_it_is_and_goes_on_as_the_original() -> None:
     original, copies, readings = FrontEnd(MapperSettings(), noise), {}, []
     for k, cycle in enumerate(cycles):
         if k in COPIED_AT:
-            copies[k] = original.copy(), copied(original, {})
+            copies[k] = original.copy(), copied(original)
         readings.append(digest(update(original, cycle)))
     assert len(cycles) > COPIED_AT[-1] + GOES_ON
     for k, (copy, expected) in copies.items():

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.baselines import ckf_curves as expansion
 from pathspace_graph.baselines.ckf_curves import CurveState, Expansion, beyond_end, proximity_chain
-from pathspace_graph.baselines.filters import REACH
+from pathspace_graph.baselines.filters import FILTER_REACH
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.path import CARRIED_TO, DrivenPath, PathAhead
@@ -30,7 +30,7 @@ def path_along_x(x: float, settings: MapperSettings) -> PathAhead:
     path = DrivenPath()
     for at in np.arange(0.0, x + 0.25, 0.5):
         path.update(np.array([at, 0.0, 0.0]))
-    return path.ahead(np.array([x, 0.0, 0.0]), REACH)
+    return path.ahead(np.array([x, 0.0, 0.0]), FILTER_REACH)
 
 
 def expanded(
@@ -78,7 +78,7 @@ def test_the_curve_is_extended_to_the_last_point_of_the_chain() -> None:
 
 
 def test_a_long_extension_takes_a_point_between(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(expansion, "STRETCH", 5.0)
+    monkeypatch.setattr(expansion, "LONGEST_EXTENSION", 5.0)
     state = straight_rows()
     expanded(state, np.array([[18.5, 2.0], [16.5, 2.0]]))
     assert state.curves[LEFT].size == 6
