@@ -65,7 +65,7 @@ def _run(arguments: list[str], level: str) -> None:
     if first in ("-h", "--help"):
         print(overview())
     elif first == "--version":
-        compiler = import_module(".factors._kernels", __package__).COMPILER
+        compiler = import_module(".factors", __package__).COMPILER
         print(f"{PROGRAM} {version(PROGRAM)} (GTSAM {version('gtsam')}, kernels: {compiler})")
     elif first == "--completion":
         options = import_module(".commands.options", __package__)

@@ -72,6 +72,16 @@ class Loop:
                 found[of_label] = ~self.mapped[label][curve.query(points[of_label])[1]]
         return found
 
+    def compared(self, labels: IntArray, points: Array) -> tuple[BoolArray, BoolArray, BoolArray]:
+        """Return which points (m, 2) with labels (m,) lie on their curve, and which beside a gap of it.
+
+        The third result is false for those that say nothing: they lie on the curve of the other colour alone.
+        """
+        on_curve = self.distances(labels, points, BESIDE_CURVE) < BESIDE_CURVE
+        beside_gap = ~on_curve & self.beside_gaps(labels, points)
+        on_other = self.distances(LEFT + RIGHT - labels, points, BESIDE_CURVE) < BESIDE_CURVE
+        return on_curve, beside_gap, on_curve | ~on_other
+
 
 def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) -> BoolArray:
     """Return which parameters (m,) of a closed curve lie between neighbouring cones at parameters (k,), in m.
@@ -140,31 +150,23 @@ def evidence_of(
     motion, seen_again = reading.motion, reading.seen_again
     if tested is None:
         return Evidence(reading.detections.t, rests=motion.rests, odometry=motion.fault)
-    detections = smoother.map.detections
-    closed, used = smoother.map.state.closed, detections.used[tested.rows]
+    detections, closed = smoother.map.detections, smoother.map.state.closed
+    labels, used = detections.label[tested.rows], detections.used[tested.rows]
     again = seen_again[tested.rows - (len(detections) - len(seen_again))]
     judged = used | ((tested.in_view | closed) & again)
-    labels, explained, unmapped = detections.label[tested.rows], used.copy(), np.zeros(len(used), bool)
+    explained, unmapped = used.copy(), np.zeros(len(used), bool)
     if known is not None and used.sum() < SHARE_DEGRADED * judged.sum():
         others = np.flatnonzero(judged & ~used)
-        rows = tested.rows[others]
-        points, label, loop = (
-            detections.points_map(rows, smoother.variables),
-            labels[others],
-            known.of(smoother),
-        )
-        explained[others] = loop.distances(label, points, BESIDE_CURVE) < BESIDE_CURVE
-        unmapped[others] = ~explained[others] & loop.beside_gaps(label, points)
-        wrong = loop.distances(LEFT + RIGHT - label, points, BESIDE_CURVE) < BESIDE_CURVE
-        judged[others] &= explained[others] | ~wrong
-        unmapped &= judged
-    innovations, offered = tested.innovation[used], judged & ~unmapped
+        points = detections.points_map(tested.rows[others], smoother.variables)
+        on_curve, beside_gap, says = known.of(smoother).compared(labels[others], points)
+        explained[others], unmapped[others], judged[others] = on_curve, beside_gap & says, says
+    offered = judged & ~unmapped
     return Evidence(
         t=reading.detections.t,
         offered=int(offered.sum()),
         explained=int(explained.sum()),
         used=int(used.sum()),
-        innovations=float(innovations @ innovations),
+        innovations=float(tested.innovation[used] @ tested.innovation[used]),
         closed=closed,
         sigma=_sigma_of_position(smoother) if closed else np.nan,
         offered_by=_by_boundary(labels[offered]),

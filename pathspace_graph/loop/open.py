@@ -1,5 +1,6 @@
 """The open road: its map grows, until a return to its beginning starts the batch that closes the loop."""
 
+from dataclasses import replace
 from typing import Final, Self
 
 from pathspace_graph.copies import shallow
@@ -52,63 +53,45 @@ class Open:
         return self, drive.monitor.update(evidence)
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Look for a return, and go on from the batch that it has begun."""
+        """Look for a return, which begins a batch, and go on from the batch or from road met again."""
         learned = drive.inflate_priors(road, reading)
-        found = None if drive.rests(road) else self._registered(road, drive, reading)
-        if found is not None:
-            step = self._close_by_prior(road, drive, found)
-            return Step(step.phase, None, joined([step.notice, learned]))
-        drive.record.estimated(road)
-        if drive.rests(road):
-            return Step(self, notice=learned)
-        step = self._met_again(road, drive, reading, spent)
-        return Step(step.phase, step.jump, joined([step.notice, learned]))
+        rests = drive.rests(road)
+        looks = road.boundaries and not (rests or drive.solver.is_busy)
+        found = self.returns.by_curves(road) if looks else None
+        drive.record.estimated(road)  # after the search, which may have moved the open map
+        step = Step(self) if rests else self._step(road, drive, reading, found, spent)
+        return replace(step, notice=joined([step.notice, learned]))
 
-    def _met_again(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Look for the beginning, or for any earlier road, unless a batch is under way."""
-        if road.path.length > self.settings.closing.min_path:
-            self._look_for_return(road, drive, reading)
+    def _step(
+        self, road: Road, drive: Drive, reading: Reading, found: RefinedMotion | None, spent: float
+    ) -> Step:
+        if found is not None and not self._is_solvable(road, drive):
+            return self._close_by_prior(road, drive, found)
+        if not drive.solver.is_busy:
+            self._begin_batch(road, drive, reading, found)
         if drive.solver.is_busy:
             outcome = drive.outcome(road, spent)
             return Step(self) if outcome is None else self.take(road, drive, outcome)
         revisit = self.revisits.find(road, drive.record, reading.noise)
-        if revisit is None:
-            return Step(self)
-        jump, is_first = lay_on(road, drive.record, revisit), not drive.revisits
-        drive.revisits = (*drive.revisits, revisit)
-        road.place_orange(drive.record.corrected)
-        return Step(self, jump, REVISITED if is_first else "")
+        return Step(self) if revisit is None else self._lay_on(road, drive, revisit)
 
-    # --- the return --------------------------------------------------------------------------------------
+    def _begin_batch(self, road: Road, drive: Drive, reading: Reading, found: RefinedMotion | None) -> None:
+        """Send the lap to a batch where the newest detections, cones or curves lie on earlier ones.
 
-    def _registered(self, road: Road, drive: Drive, reading: Reading) -> RefinedMotion | None:
-        """Return the motion onto the beginning where the newest detections lie there and no batch can come.
-
-        Where one can, it is begun, and closes the loop later if it agrees.
+        It closes the loop later, if it agrees; until then the map stays open.
         """
-        if drive.solver.is_busy or not road.boundaries:
-            return None
-        found = self.returns.by_curves(road)
-        if found is None or drive.record.unsolvable is not None:
-            return found
-        self._begin_batch(road, drive, reading, self.returns.revisit_of(road, drive.record, found))
-        return None
-
-    def _look_for_return(self, road: Road, drive: Drive, reading: Reading) -> None:
-        """Send the lap to a batch where the newest cones lie on early ones, or the newest curves do."""
-        if drive.record.unsolvable is None:
-            drive.solver.prepare()
-        if drive.solver.is_busy or not self._is_solvable(road, drive):
+        record, returns = drive.record, self.returns
+        if road.path.length <= self.settings.closing.min_path or not self._is_solvable(road, drive):
             return
-        record = drive.record
-        revisit = self.returns.by_cones(road, record, reading.noise) or self.returns.by_shape(road, record)
+        drive.solver.prepare()
+        if found is not None:
+            revisit: Revisit | None = returns.revisit_of(road, record, found)
+        else:
+            revisit = returns.by_cones(road, record, reading.noise) or returns.by_shape(road, record)
         if revisit is not None:
-            self._begin_batch(road, drive, reading, revisit)
-
-    def _begin_batch(self, road: Road, drive: Drive, reading: Reading, revisit: Revisit) -> None:
-        self.returns.rest(road, self.settings.open_lap.retry)
-        self.returned_by = revisit
-        drive.begin_batch(road, reading, revisit)
+            returns.rest(road, self.settings.open_lap.retry)
+            self.returned_by = revisit
+            drive.begin_batch(road, reading, revisit)
 
     def _is_solvable(self, road: Road, drive: Drive) -> bool:
         """Return whether the lap can be solved as a batch; a lap of too many cones is given up."""
@@ -116,6 +99,13 @@ class Open:
         if cones > self.settings.open_lap.max_cones:
             drive.record.give_up("the lap has too many cones for a batch")
         return drive.record.unsolvable is None
+
+    def _lay_on(self, road: Road, drive: Drive, revisit: Revisit) -> Step:
+        """Lay the open map on an earlier pass; the notice says so once."""
+        jump, is_first = lay_on(road, drive.record, revisit), not drive.revisits
+        drive.revisits = (*drive.revisits, revisit)
+        road.place_orange(drive.record.corrected)
+        return Step(self, jump, REVISITED if is_first else "")
 
     # --- closing -----------------------------------------------------------------------------------------
 

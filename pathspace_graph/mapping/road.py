@@ -17,9 +17,9 @@ from pathspace_graph.spline.boundary import Boundary
 
 from .growth import Growth
 from .motion import MeasuredMotion, predict
+from .orange import OrangeCones, Sighting
 from .path import DrivenPath
 from .smoother import CurveSmoother, Gating
-from .tentative import OrangeCones, Sighting
 
 
 @dataclass(frozen=True, eq=False)
