@@ -154,8 +154,7 @@ class Optimizer:
 
     def _keep_foot_points(self, at: Evaluation) -> None:
         """Let later evaluations refine the foot points from where they are now."""
-        for projected in at.projected.values():
-            self.system.detections.refine(projected.rows, projected.foot.u)
+        self.system.detections.refine(at.across.rows, at.u)
 
     def _movement(self, before: State, after: State) -> float:
         """Return how far a curve has moved across itself (m), as the poses beside it see it."""

@@ -1,25 +1,24 @@
 """The least-squares problem of a whole log: its cost at a state, and its linear factors there."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import gtsam
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.residuals import ProjectionRows, project, smoothness_matrix
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.footpoint import refine_joint_foot_points
+from pathspace_graph.factors.residuals import smoothness_matrix
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import POINT, POSE, SENSOR_KEY, Layout, are_poses, indices, pose_keys
+from pathspace_graph.graph.variables import POINT, POSE, Layout, are_poses, indices, pose_keys
+from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, rows_across
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.mapping.stations import Stations
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import headings
@@ -195,60 +194,13 @@ class Biweight:
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
-    """The m detections that are used on one boundary, projected on its curve at a state.
-
-    A round holds `sigma` and `inside`: the cost does not jump where an open end slides past a detection.
-    """
-
-    rows: IntArray  # rows (m,) of the detections in their table
-    foot: FootPoints
-    projection: ProjectionRows
-    sigma: Array  # standard deviations (m,) across the curve in m
-    inside: BoolArray  # whether each foot point (m,) was inside the curve when the round began
-    by: SensorRows  # derivatives of the residuals by the calibration of the sensor
-
-    @property
-    def whitened(self) -> Array:
-        """Return the residuals (m,) in sigmas."""
-        return np.asarray(self.by.factor * self.projection.residual / self.sigma)
-
-
-@dataclass(frozen=True, eq=False)
-class AlongStations:
-    """The m used detections that have a station, along their curves at a state; not whitened."""
-
-    stations: Stations
-    detection: IntArray  # (m,) rows in the table of detections
-    station: IntArray  # (m,) station of each
-    keys: IntArray  # (m, k) of [pose | sensor | control points]
-    residual: Array  # (m,) distances beyond the stations (m)
-    sigma: Array  # (m,) standard deviations (m)
-    jacobian: Array  # (m, n)
-
-    @property
-    def whitened(self) -> Array:
-        """Return the residuals (m,) in sigmas."""
-        return np.asarray(self.residual / self.sigma)
-
-    def scale(self, kernel: Biweight) -> Array:
-        """Return the factor (m,) that whitens and weights each row (1/m)."""
-        return np.asarray(np.sqrt(kernel.weights(self.whitened)) / self.sigma)
-
-    def rows(self, kernel: Biweight, cycle: IntArray) -> Rows:
-        """Return whitened rows with robust weights of detections in cycles (m,)."""
-        scale = self.scale(kernel)
-        owner = owners(cycle, self.stations.label[self.station])
-        return Rows(self.keys, self.jacobian * scale[:, None], self.residual * scale, owner)
-
-
-@dataclass(frozen=True, eq=False)
 class Evaluation:
     """Problem at one state."""
 
     state: State
-    projected: dict[int, Projected]  # used detections of each boundary
-    along: AlongStations | None  # used detections at their stations
+    across: DetectionRows  # used detections across the curves; those beyond an end say nothing
+    u: Array  # (m,) parameters of their foot points (m)
+    along: DetectionRows  # used detections at their stations
     drive: list[Rows]  # rows of odometry, priors and revisits
     cost: float  # half the sum of squares, with the robust losses of the detections
 
@@ -264,8 +216,7 @@ class BatchSystem:
         self.gauges: dict[int, CurveGauge] = {}  # weak priors of each boundary
         self.revisits: tuple[Revisit, ...] = ()  # where an open road was driven twice
         self.matches: StationMatches | None = None  # cones of closed curves, where they hold detections
-        count = len(detections)
-        self._sigma, self._inside, self._rates = np.ones(count), np.ones(count, bool), np.zeros((count, 2))
+        self._sigma = np.ones(len(detections))  # across the curves, of this round (m)
 
     def begin(self, state: State, stations: bool = False) -> None:
         """Make the gauges anew, which hold the control points where they are now, when knots have changed.
@@ -286,77 +237,50 @@ class BatchSystem:
         `hold` sets what later evaluations keep. That the sigma depends on the curve's direction has no
         derivative.
         """
-        projected = {label: self._project(state, label, hold) for label in state.boundaries}
         drive = self.chain.rows_at(state.variables, self.settings.calibration)
         drive += [one.rows(state.poses) for one in self.revisits]
-        used = sum(int(p.inside.sum()) for p in projected.values())
-        losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
-        at_gate = self.kernel.gate**2 / 6.0  # the loss of a detection that isn't used
-        cost = losses + at_gate * (len(self.detections) - used) + half_square(drive)
-        along = self._along(state) if self.matches else None
-        if along is not None:
-            cost += float(self.kernel.loss(along.whitened).sum())
-        gauges = (self.gauges[b].cost(state.control_points(b), state.poses) for b in state.boundaries)
-        return Evaluation(state, projected, along, drive, cost + sum(gauges))
+        across, u = self._across(state, hold) if state.boundaries else (NO_ROWS, np.zeros(0))
+        along = self._along(state, self.matches) if self.matches else NO_ROWS
+        unused = len(self.detections) - int(np.isfinite(across.sigma).sum())
+        cost = half_square(drive) + unused * self.kernel.gate**2 / 6.0  # the loss of one at the gate
+        cost += sum(float(self.kernel.loss(seen.whitened).sum()) for seen in (across, along))
+        cost += sum(self.gauges[b].cost(state.control_points(b), state.poses) for b in state.boundaries)
+        return Evaluation(state, across, u, along, drive, cost)
 
-    def _along(self, state: State) -> AlongStations:
-        """Return the matched detections that are in use."""
-        assert self.matches is not None
-        stations, (rows, station, sigma) = self.matches.stations, self.matches.used(self.detections)
-        keys, residual, _, jacobian = stations.rows(state, self.detections, rows, station, sigma)
-        return AlongStations(stations, rows, station, keys, residual, sigma, jacobian)
+    def _across(self, state: State, hold: bool) -> tuple[DetectionRows, Array]:
+        """Return the used detections across the curves, and the parameters (m,) of their foot points.
 
-    def _project(self, state: State, label: int, hold: bool) -> Projected:
-        detections, sensor = self.detections, state.variables.sensor
-        rows = detections.used_on(label)
-        measured, twists = detections.measured[rows], detections.twist[rows]
-        poses = state.variables.poses_at(detections.cycle[rows])
-        points = to_map(detections.corrected(rows, sensor), poses)
-        foot = state.boundaries[label].refine(state.control_points(label), points, detections.u[rows])
-        sigma_model = self.settings.spline.sigma_model
-        projection = project(points, detections.covariance[rows], poses, foot, sigma_model)
+        A round holds the sigmas, and whether a foot point is inside its curve: the cost does not jump where
+        an open end slides past a detection.
+        """
+        detections, curves = self.detections, state.curves
+        rows = np.flatnonzero(detections.used)
+        points, u = detections.points_map(rows, state.variables), detections.u[rows]
+        curve, s = curves.labels.searchsorted(detections.boundary[rows]), curves.boundaries[0].settings
+        stretch = u, u - s.refine_room, np.minimum(u + s.refine_room, curves.trusted[curve])
+        foot = refine_joint_foot_points(
+            curves.spans, state.map_points, points, curve, *stretch, s.refine_iterations
+        )
+        seen = rows_across(state, detections, rows, points, foot, self.settings.spline.sigma_model)
         if hold:
-            self._sigma[rows], self._inside[rows] = projection.sigma, foot.interior
-            self._rates[rows] = range_rates(foot.normal_unit, poses, measured)
-        rates = self._rates[rows]
-        by = sensor_rows(foot.normal_unit, foot.distance, poses, measured, twists, sensor, rates)
-        return Projected(rows, foot, projection, self._sigma[rows], self._inside[rows], by)
+            self._sigma[rows] = np.where(foot.interior, seen.sigma, np.inf)
+        return replace(seen, sigma=self._sigma[rows]), foot.u
+
+    def _along(self, state: State, matches: StationMatches) -> DetectionRows:
+        """Return the matched detections that are in use, with the sigmas that they were matched by."""
+        rows, station, sigma = matches.used(self.detections)
+        return replace(matches.stations.rows(state, self.detections, rows, station, sigma), sigma=sigma)
 
     def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
         """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights."""
-        state = at.state
-        groups = [*at.drive]
-        if at.along is not None:
-            groups.append(at.along.rows(self.kernel, self.detections.cycle[at.along.detection]))
+        state, groups = at.state, [*at.drive]
+        for seen in (at.along, at.across):
+            owner = owners(self.detections.cycle[seen.rows], self.detections.boundary[seen.rows])
+            groups.append(seen.weighted(self.kernel.weights(seen.whitened), owner))
         for label, gauge in (gauges or self.gauges).items():
             points = state.control_points(label)
-            groups += [
-                self.detection_rows(at, label),
-                gauge.beside(points, state.poses),
-                gauge.smooth(points, state.poses),
-                gauge.anchor(),
-            ]
+            groups += [gauge.beside(points, state.poses), gauge.smooth(points, state.poses), gauge.anchor()]
         return groups
-
-    def detection_rows(self, at: Evaluation, label: int) -> Rows:
-        """Return the rows of the used detections on [sensor | control points of their span | pose]."""
-        p, state = at.projected[label], at.state
-        cycle, scale, factor = self.detections.cycle[p.rows], self.scale(p), p.by.factor[:, None]
-        control = state.keys(label)[state.boundaries[label].columns(p.foot.span)]
-        by_control = p.projection.by_control.reshape(len(cycle), 2 * control.shape[1])
-        jacobian = [p.by.by_sensor, factor * by_control, factor * p.projection.by_pose]
-        sensor = [np.full_like(cycle, SENSOR_KEY)] if len(state.variables.sensor) else []
-        return Rows(
-            keys=np.column_stack([*sensor, control, pose_keys(cycle)]),
-            jacobian=np.concatenate(jacobian, axis=1) * scale[:, None],
-            residual=p.by.factor * p.projection.residual * scale,
-            owner=owners(cycle, label),
-        )
-
-    def scale(self, projected: Projected) -> Array:
-        """Return the factor (m,) that whitens and weights each row (1/m), zero for those not inside."""
-        root = np.sqrt(self.kernel.weights(projected.whitened))
-        return np.asarray(root * projected.inside / projected.sigma)
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return all rows as a linear graph, whose solution is the change from the state."""

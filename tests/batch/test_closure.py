@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import objection, share_used
 from pathspace_graph.batch.mapper import BatchMapper, all_cones, find_closed_optimum
+from pathspace_graph.batch.objections import objection, share_used
 from pathspace_graph.batch.optimizer import LOOSE_GATE, Optimizer
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import find_revisits

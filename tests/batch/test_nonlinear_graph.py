@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.mapper import BatchMapper, BatchResult, beside_of, factor_beside, nonlinear_graph
+from pathspace_graph.batch.gtsam_graph import beside_of, factor_beside, nonlinear_graph
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.system import Evaluation
 from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.factors.se2 import rotation

@@ -68,8 +68,7 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
     """Returns the state after some Gauss-Newton steps."""
     for _ in range(steps):
         at = system.evaluate(state)
-        for projected in at.projected.values():
-            system.detections.refine(projected.rows, projected.foot.u)
+        system.detections.refine(at.across.rows, at.u)
         problem = system.eliminated(at)
         state = moved(state, problem.step(np.zeros(problem.map.size)))
     return state
