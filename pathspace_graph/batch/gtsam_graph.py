@@ -1,18 +1,26 @@
 """The batch's problem as GTSAM's nonlinear factors, for whoever wants to go on with them."""
 
-from collections.abc import Callable, Iterator, MutableSequence
+from collections.abc import Iterator, MutableSequence
 from dataclasses import replace
 from typing import Any, Final
 
 import gtsam
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.gtsam_factors import pose_array, spline_projection_factors, station_factors
+from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.gtsam_factors import (
+    fill,
+    pose_array,
+    smoothness_factors,
+    spline_projection_factors,
+    station_factors,
+)
+from pathspace_graph.factors.residuals import smoothness_matrix
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.rows import odometry_factor
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
 from pathspace_graph.mapping.detection_rows import DetectionRows
+from pathspace_graph.mapping.state import State
 from pathspace_graph.spline.boundary import Boundary
 
 from .system import BatchSystem, CurveGauge, Evaluation
@@ -31,7 +39,7 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     """
     factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
     for label, gauge in system.gauges.items():
-        factors += _gauge(gauge, at.state.control_points(label))
+        factors += _priors(gauge, at.state)
         factors += [*_across(system, at, label), *_along(system, at, label)]
     for factor in factors:
         graph.add(factor)
@@ -64,52 +72,36 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
         yield gtsam.PriorFactorVector(sensor_key, np.array(calibration.means), sigmas)
 
 
-def _gauge(gauge: CurveGauge, control_points: Array) -> Iterator[gtsam.NonlinearFactor]:
-    anchor = gtsam.noiseModel.Isotropic.Sigma(2, gauge.sigma_anchor)
-    for j, (key, point) in enumerate(zip(gauge.keys.tolist(), control_points, strict=True)):
-        yield factor_beside(gauge.keys[j : j + 1], int(gauge.cycle[j]), 1, beside_of(gauge, j))
+def _priors(gauge: CurveGauge, state: State) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield the weak priors of a curve's control points: where along it, how smooth, and anchors."""
+    label, boundary = gauge.label, state.boundaries[gauge.label]
+    anchor = gtsam.noiseModel.Isotropic.Sigma(POINT, boundary.gauge.sigma_anchor)
+    for j, (key, point) in enumerate(zip(gauge.keys.tolist(), state.control_points(label), strict=True)):
+        yield factor_beside(gauge, j)
         yield gtsam.PriorFactorPoint2(key, point, anchor)
-    for row in range(len(gauge.smoothness)):
-        keys, cycle = gauge.keys[gauge.neighbours[row]], int(gauge.middle_cycle[row])
-        yield factor_beside(keys, cycle, POINT, bending_of(gauge, row))
+    matrix = smoothness_matrix(boundary.abscissae, boundary.length if boundary.periodic else None)
+    sigma = boundary.gauge.sigma_smoothness * float(np.mean(boundary.nominal))
+    yield from smoothness_factors(gauge.keys.tolist(), matrix, sigma)
 
 
-Terms = Callable[[Array, Array], tuple[Array, Array, Array]]
-"""Whitened residuals of control points as a pose (1, 3) sees them, with derivatives by both."""
-
-
-def beside_of(gauge: CurveGauge, j: int) -> Terms:
-    """Return the terms that hold control point j of a curve beside its pose."""
-    only = slice(j, j + 1)
-    return replace(gauge, keys=gauge.keys[only], cycle=gauge.cycle[only], ahead=gauge.ahead[only]).terms
-
-
-def bending_of(gauge: CurveGauge, row: int) -> Terms:
-    """Return the terms of a second difference of a curve, as the pose beside it sees it."""
-    chosen = gauge.neighbours[row]
-    smoothness = gauge.smoothness[row, chosen][None]
-    return replace(gauge, keys=gauge.keys[chosen], cycle=np.zeros(3, np.intp), smoothness=smoothness).bending
-
-
-def factor_beside(points: IntArray, cycle: int, size: int, terms: Terms) -> gtsam.CustomFactor:
-    """Return the factor of `size` whitened residuals of control points (k,) as the pose of a cycle sees them.
+def factor_beside(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
+    """Return the factor that holds control point j of a curve beside its pose.
 
     GTSAM's tangents of a pose are in its own frame.
     """
-    keys = [*points.tolist(), pose_key(cycle)]
+    point_key, cycle = int(gauge.keys[j]), int(gauge.cycle[j])
+    alone = replace(gauge, ahead=gauge.ahead[j : j + 1])
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
-        pose = values.atPose2(keys[-1])
-        at = np.array([values.atPoint2(key) for key in keys[:-1]])
-        residual, by_points, by_pose = terms(at, pose_array(pose)[None])
+        pose = values.atPose2(pose_key(cycle))
+        point = np.array(values.atPoint2(point_key))
+        residual, by_point, by_pose = alone.terms(point[None], pose_array(pose)[None])
         if H is not None:
-            by_pose[..., :2] = by_pose[..., :2] @ rotation(pose.theta())
-            for k, block in enumerate(np.split(by_points.reshape(size, -1), len(points), axis=1)):
-                H[k] = block
-            H[len(points)] = by_pose.reshape(size, POSE)
-        return residual.ravel()
+            by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
+            fill(H, [by_point, by_pose])
+        return residual
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [point_key, pose_key(cycle)], error)
 
 
 def _across(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:

@@ -9,13 +9,13 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import refine_joint_foot_points
-from pathspace_graph.factors.residuals import smoothness_matrix
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import POINT, POSE, Layout, are_poses, indices, pose_keys
+from pathspace_graph.graph.variables import POINT, Layout, are_poses, pose_keys
+from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, rows_across
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
@@ -27,16 +27,15 @@ from .stations import StationMatches, match_stations
 SIGMA_SLIDE: Final = 2.0
 """Standard deviation of a control point's slide along its curve from beside its first pose (m), where
 stations hold it there."""
-POINTS_A_FACTOR: Final = 8  # neighbouring control points in one factor of their anchors; only for speed
 
 
 @dataclass(frozen=True, eq=False)
 class CurveGauge:
-    """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness` of a curve.
+    """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` of a curve's control points c_j.
 
-    p_k is the position of the pose that control point c_j began beside, h_k its heading, R_k its rotation,
-    and D is `smoothness_matrix`. Detections constrain nothing along a curve, so control points would slide
-    along it; held beside a pose they don't, and the map is as free as before.
+    p_k is the position of the pose that control point c_j began beside, and h_k its heading. Detections
+    constrain nothing along a curve, so control points would slide along it; held beside a pose they don't,
+    and the map is as free as before.
     """
 
     label: int
@@ -44,9 +43,6 @@ class CurveGauge:
     cycle: IntArray  # perception cycles (m,) of the poses beside them
     ahead: Array  # distances (m,) of the control points ahead of their poses (m)
     sigma: float  # standard deviation of that distance (m)
-    smoothness: Array  # D (r, m)
-    sigma_smoothness: float  # standard deviation of a second difference (m)
-    sigma_anchor: float  # that holds each control point where it is linearized (m), without any cost
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
         """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives."""
@@ -56,60 +52,15 @@ class CurveGauge:
         residual = (heading * arm).sum(axis=1) - self.ahead / self.sigma
         return residual, heading, np.column_stack([-heading, by_theta])
 
-    def beside(self, control_points: Array, poses: Array) -> Rows:
+    def rows(self, control_points: Array, poses: Array) -> Rows:
         """Return `terms` as rows on [control point | pose], from all poses (P, 3)."""
         residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
         jacobian = np.column_stack([by_point, by_pose])
         return Rows(self._keys_beside, jacobian, residual, owners(self.cycle, self.label))
 
-    def bending(self, control_points: Array, poses: Array) -> tuple[Array, Array, Array]:
-        """Return the second differences as the poses beside their middles see them, whitened (r, 2).
-
-        Also return their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
-        map frame they would turn with the map, and Gauss-Newton would take that turn for a change of shape.
-        """
-        neighbours, theta = self.neighbours, poses[self.middle_cycle, 2]
-        c, s = np.cos(theta), np.sin(theta)
-        back = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
-        weights = np.take_along_axis(self.smoothness, neighbours, axis=1) / self.sigma_smoothness
-        in_map = (weights[:, :, None] * control_points[neighbours]).sum(axis=1)
-        residual = (back @ in_map[:, :, None])[:, :, 0]
-        by_control = weights[:, None, :, None] * back[:, :, None, :]
-        by_pose = np.zeros((len(residual), POINT, POSE))
-        by_pose[:, 0, 2], by_pose[:, 1, 2] = residual[:, 1], -residual[:, 0]
-        return residual, by_control.reshape(len(residual), POINT, -1), by_pose
-
-    def smooth(self, control_points: Array, poses: Array) -> Rows:
-        """Return `bending` as rows on [three control points | pose], two rows for each second difference."""
-        residual, by_control, by_pose = self.bending(control_points, poses)
-        keys = np.column_stack([self.keys[self.neighbours], pose_keys(self.middle_cycle)])
-        return Rows(
-            keys=np.repeat(keys, POINT, axis=0),
-            jacobian=np.concatenate([by_control, by_pose], axis=2).reshape(residual.size, -1),
-            residual=residual.ravel(),
-            owner=np.repeat(owners(self.middle_cycle, self.label), POINT),
-        )
-
-    @property
-    def neighbours(self) -> IntArray:
-        """Return the three control points (r, 3) of each second difference, by index."""
-        return np.asarray((np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys))
-
-    @property
-    def middle_cycle(self) -> IntArray:
-        """Return the cycle (r,) of the pose beside the middle of each second difference."""
-        return np.asarray(self.cycle[self.neighbours[:, 1]])
-
     @property
     def _keys_beside(self) -> IntArray:
         return np.column_stack([self.keys, pose_keys(self.cycle)])
-
-    def anchor(self) -> Rows:
-        """Return rows that hold each control point where it is."""
-        keys = np.repeat(self.keys, POINT)
-        jacobian = np.tile(np.eye(POINT), (len(self.keys), 1)) / self.sigma_anchor
-        owner = np.asarray(-1 - self.label - 2 * (indices(keys) // POINTS_A_FACTOR))
-        return Rows(keys[:, None], jacobian, np.zeros(len(keys)), owner)
 
     def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
         """Return rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
@@ -130,34 +81,20 @@ class CurveGauge:
         before, after = poses[self.cycle], poses_after[self.cycle]
         return after[:, :2] + turned(control_points - before[:, :2], after[:, 2] - before[:, 2])
 
-    def cost(self, control_points: Array, poses: Array) -> float:
-        """Return half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""
-        beside, _, _ = self.terms(control_points, poses[self.cycle])
-        smooth = self.smoothness @ control_points / self.sigma_smoothness
-        return 0.5 * float(beside @ beside + (smooth**2).sum())
-
 
 def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
     """Return the gauge that holds each control point where it is, beside a pose of a cycle before `until`."""
-    boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
-    mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
-    cycle = _nearest_poses(state, label, until, mean_spacing)
-    return CurveGauge(
-        label=label,
-        keys=state.keys(label),
-        cycle=cycle,
-        ahead=(headings(poses[cycle]) * (control_points - poses[cycle, :2])).sum(axis=1),
-        sigma=sigma,
-        smoothness=smoothness_matrix(boundary.abscissae, boundary.length if boundary.periodic else None),
-        sigma_smoothness=boundary.gauge.sigma_smoothness * mean_spacing,
-        sigma_anchor=boundary.gauge.sigma_anchor,
-    )
+    control_points, cycle = state.control_points(label), _nearest_poses(state, label, until)
+    beside = state.poses[cycle]
+    ahead = (headings(beside) * (control_points - beside[:, :2])).sum(axis=1)
+    return CurveGauge(label, state.keys(label), cycle, ahead, sigma)
 
 
-def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
+def _nearest_poses(state: State, label: int, until: int | None) -> IntArray:
     """Return (m,) the pose nearest to where each control point acts, of those with the curve's direction.
 
-    On an open curve, which may have drifted over itself, it is within `room` (m) of the nearest along it.
+    On an open curve, which may have drifted over itself, it is within the mean distance of control points of
+    the nearest along it.
     """
     boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
     u = boundary.abscissae
@@ -168,6 +105,7 @@ def _nearest_poses(state: State, label: int, until: int | None, room: float) -> 
     square[along <= 0.0] += square.max(initial=0.0)
     if not boundary.periodic:
         away = np.abs(u[:, None] - state.pose_u[label][:until])
+        room = float(np.mean(boundary.nominal))
         square[away > away.min(axis=1, keepdims=True) + room] = np.inf
     return np.asarray(square.argmin(axis=1))
 
@@ -244,7 +182,7 @@ class BatchSystem:
         unused = len(self.detections) - int(np.isfinite(across.sigma).sum())
         cost = half_square(drive) + unused * self.kernel.gate**2 / 6.0  # the loss of one at the gate
         cost += sum(float(self.kernel.loss(seen.whitened).sum()) for seen in (across, along))
-        cost += sum(self.gauges[b].cost(state.control_points(b), state.poses) for b in state.boundaries)
+        cost += half_square(self._priors(state, self.gauges))
         return Evaluation(state, across, u, along, drive, cost)
 
     def _across(self, state: State, hold: bool) -> tuple[DetectionRows, Array]:
@@ -273,14 +211,17 @@ class BatchSystem:
 
     def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
         """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights."""
-        state, groups = at.state, [*at.drive]
+        groups = [*at.drive]
         for seen in (at.along, at.across):
             owner = owners(self.detections.cycle[seen.rows], self.detections.boundary[seen.rows])
             groups.append(seen.weighted(self.kernel.weights(seen.whitened), owner))
-        for label, gauge in (gauges or self.gauges).items():
-            points = state.control_points(label)
-            groups += [gauge.beside(points, state.poses), gauge.smooth(points, state.poses), gauge.anchor()]
-        return groups
+        return groups + self._priors(at.state, gauges or self.gauges)
+
+    def _priors(self, state: State, gauges: Mapping[int, CurveGauge]) -> list[Rows]:
+        """Return the weak priors: the gauges, and as online the smoothness and anchors of control points."""
+        beside = [gauge.rows(state.control_points(label), state.poses) for label, gauge in gauges.items()]
+        on_points = CurveMap(self.settings, state).linear_gauge(whole=True)
+        return beside + [replace(rows, owner=-1 - rows.owner) for rows in on_points]
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return all rows as a linear graph, whose solution is the change from the state."""
