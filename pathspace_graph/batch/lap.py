@@ -30,12 +30,12 @@ from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive
-from .objections import disagreement, objection, share_used
-from .optimizer import LOOSE_GATE, Convergence, Effort, Optimizer
-from .simplification import boundary_of, map_block, own_settings, scatter_of_cones, simplified
+from .objections import speaks_against
+from .optimizer import Convergence, Effort, Optimizer
+from .simplification import boundary_of, map_block, own_settings, simplified
 from .start import start_odometry
 from .stations import StationMatches
-from .system import BatchSystem, Biweight, Evaluation, curve_gauge
+from .system import BatchSystem, Evaluation, curve_gauge
 
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)  # so that it is in time
 FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)
@@ -48,6 +48,14 @@ class ClosedMap:
     splines: dict[int, BSpline]  # closed curves by label, map frame
     poses: Array  # (P, 3) poses of all cycles, map frame
     calibration: Array  # (2,) or (7,) calibration of the odometry, and of the sensor where it is estimated
+
+    def state(self, settings: MapperSettings) -> State:
+        """Return the map and the poses as a state to begin with."""
+        state = State()
+        for label, spline in self.splines.items():
+            state.add_boundary(label, *boundary_of(spline, settings))
+        add_drive(state, self.poses, self.calibration)
+        return state
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +97,9 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
     begin = time.perf_counter()
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
-        settings, detections = system.settings, system.detections
-        few, change = simplified(at.state, detections, settings)
+        simple = simplified(at.state, system.detections, system.settings)
+        few, change, scatter = simple.state, simple.change, simple.scatter
         information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
-        scatter = scatter_of_cones(few, detections, settings)
         stations = dict[int, Array]()
         if system.matches is not None:
             stations = stations_on(few, system.matches, at.state, change, dense)
@@ -108,25 +115,20 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             cones=scatter.places,
             stations=stations,
             seconds=time.perf_counter() - begin,
-            objection=disagreement(system, at.state.poses)
-            or objection(few.splines, at.state.poses, share_used(at, detections), settings),
+            objection=speaks_against(system, at, few.splines, simple.detections),
         )
 
 
 def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem, Evaluation, Convergence]:
     """Return the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
-    settings, detections, start = own_settings(lap.settings), deepcopy(lap.detections), lap.start
-    system = BatchSystem(detections, lap.chain, settings, Biweight(LOOSE_GATE))
+    start, settings = lap.start, own_settings(lap.settings)
+    revisits = [start] if isinstance(start, Revisit) else []
+    system = BatchSystem(deepcopy(lap.detections), lap.chain, settings, revisits)
     if isinstance(start, Revisit):
-        system.revisits = (start,)
-        state = start_odometry(lap.chain, detections, settings, system.revisits)
+        state, usual = start_odometry(system), FROM_ODOMETRY
     else:
-        state = State()
-        for label, spline in start.splines.items():
-            state.add_boundary(label, *boundary_of(spline, settings))
-        add_drive(state, start.poses, start.calibration)
-    effort = effort or (FROM_ODOMETRY if isinstance(start, Revisit) else FROM_MAP)
-    return system, *Optimizer(system, effort).find(state)
+        state, usual = start.state(settings), FROM_MAP
+    return system, *Optimizer(system, effort or usual).find(state)
 
 
 def marginal_of(

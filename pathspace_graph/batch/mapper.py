@@ -1,7 +1,6 @@
 """The offline batch: every pose, every detection and both curves of a log in one least-squares problem."""
 
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import ClassVar, Final
@@ -29,7 +28,7 @@ from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, Vehicle
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE as POSE_LENGTHS
-from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import known_noise, size_of_vehicle, with_inflated_priors, with_size
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import OrangeCones, Sighting
@@ -38,14 +37,11 @@ from pathspace_graph.scale import solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .gtsam_graph import nonlinear_graph
-from .objections import disagreement, objection, share_used, unmapped
-from .optimizer import LOOSE_GATE, Convergence, Optimizer
-from .simplification import Scatter, map_block, own_settings, scatter_of_cones, simplified
+from .objections import speaks_against, unmapped
+from .optimizer import Convergence, Optimizer
+from .simplification import Scatter, Simplified, map_block, own_settings, simplified
 from .start import CurveMapper, find_revisits, start_odometry, start_online
-from .system import BatchSystem, Biweight, Evaluation
-
-Found = tuple[Evaluation, Convergence]
-"""An optimum, and how its search ended."""
+from .system import BatchSystem, Evaluation
 
 NAME: Final = "spline"  # name of the estimator on the command line
 
@@ -98,6 +94,20 @@ class BatchResult(BatchRun):
         return variables.gtsam_values(variables.keys)
 
 
+@dataclass(frozen=True, eq=False)
+class Found:
+    """An optimum, and how the search for it ended."""
+
+    optimizer: Optimizer
+    at: Evaluation
+    convergence: Convergence
+
+    @property
+    def system(self) -> BatchSystem:
+        """Return the problem that was solved."""
+        return self.optimizer.system
+
+
 class BatchMapper:
     """Mapper of a whole log at once."""
 
@@ -132,29 +142,24 @@ class BatchMapper:
     ) -> BatchResult:
         watch, noise = Stopwatch(), known_noise(self.odometry_sigma, scale)
         judged = judge_log(log, noise, own_settings(self.settings))
-        settings, chain = judged.settings, judged.chain
         watch.lap("integrate")
         start = start or self.settings.batch.start
-        optimizer, found, online = self._search(log, judged, noise, start, on_round, watch)
-        system = optimizer.system
-        at, convergence, known = _with_wider_priors(optimizer, *found)
+        begun, online = self._search(log, judged, noise, start, on_round, watch)
+        found, known = _with_wider_priors(begun)
         watch.lap("optimum")
-        size = system.settings.odometry.sigma_size
-        joint = with_size(known.covariance(at.state.map_keys), at.state.map_points.ravel(), size)
-        vehicle = _vehicle(at.state, known, size)
+        at, convergence, settings = found.at, found.convergence, found.system.settings
+        joint, vehicle = _map_covariance(at.state, known, settings), _vehicle(at.state, known, settings)
         watch.lap("covariance")
-        detections = deepcopy(system.detections)  # the result's problem keeps its own associations
-        state, change = simplified(at.state, detections, settings)
-        joint = change @ joint @ change.T
-        scatter = scatter_of_cones(state, detections, settings)
+        few = simplified(at.state, found.system.detections, settings)
+        joint = few.change @ joint @ few.change.T
         watch.lap("simplify")
-        records, laps = _records(state, detections, chain, sum(watch.laps.values()))
+        records, laps = _records(few, judged.chain, sum(watch.laps.values()))
         return BatchResult(
             estimator=NAME,
             settings=settings_dict(replace(self.settings, scale=scale)),
-            map=replace(_map(state, joint, scatter), points=_orange(judged, at.state, settings)),
-            scatter=scatter,
-            trajectory_t=chain.stamps,
+            map=replace(_map(few, joint), points=_orange(judged, at.state)),
+            scatter=few.scatter,
+            trajectory_t=judged.chain.stamps,
             trajectory=at.state.poses.copy(),
             cycles=records,
             laps=laps,
@@ -167,9 +172,9 @@ class BatchMapper:
             vehicle=vehicle,
             online=online,
             seconds=watch.laps,
-            system=system,
+            system=found.system,
             optimum=at,
-            objection=unmapped(detections, state.poses),
+            objection=unmapped(few.detections, few.state.poses),
         )
 
     def _search(
@@ -180,39 +185,70 @@ class BatchMapper:
         start: Start,
         on_round: Callable[[], None] | None,
         watch: Stopwatch,
-    ) -> tuple[Optimizer, Found, RunResult | None]:
-        """Return the optimum with its optimizer, and the online run that the search began with, if it did."""
+    ) -> tuple[Found, RunResult | None]:
+        """Return the optimum, and the online run that the search began with, if it did."""
         revisits: Sequence[Revisit] = ()
         if start != "online":
-            optimizer = _optimizer(judged, on_round)
-            revisits = find_revisits(judged.chain, all_cones(judged), judged.settings)
-            found = find_closed_optimum(optimizer, revisits)
+            revisits = find_revisits(judged)
+            found = find_closed_optimum(_optimizer(judged, on_round, revisits))
             if found is None and start == "odometry":
-                optimizer = _optimizer(judged, on_round)
-                found = find_open_optimum(optimizer)
+                found = find_from_odometry(_optimizer(judged, on_round))
             if found is not None:
-                return optimizer, found, None
+                return found, None
         if self.online is None:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
         watch.lap("optimum")
         mapper = self.online(replace(self.settings, scale=1.0), noise)
         state, online = start_online(log, mapper)
         watch.lap("start")
-        optimizer, found = _optimizer(judged, on_round), None
+        found = None
         if start == "auto" and not revisits:
-            found = find_closed_optimum(optimizer, mapper.closed_by)
+            found = find_closed_optimum(_optimizer(judged, on_round, mapper.closed_by))
         if found is None:
-            optimizer = _optimizer(judged, on_round)
-            optimizer.system.revisits = mapper.revisits
-            found = optimizer.find(state)
-        return optimizer, found, online
+            optimizer = _optimizer(judged, on_round, mapper.revisits)
+            found = Found(optimizer, *optimizer.find(state))
+        return found, online
 
 
-def _optimizer(judged: JudgedLog, on_round: Callable[[], None] | None) -> Optimizer:
+def _optimizer(
+    judged: JudgedLog, on_round: Callable[[], None] | None, revisits: Sequence[Revisit] = ()
+) -> Optimizer:
     """Return an optimizer with a system and detections of its own, so no search begins with another's."""
     detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
-    system = BatchSystem(detections, judged.chain, judged.settings, Biweight(LOOSE_GATE))
-    return Optimizer(system, on_round=on_round)
+    return Optimizer(BatchSystem(detections, judged.chain, judged.settings, revisits), on_round=on_round)
+
+
+def find_from_odometry(optimizer: Optimizer) -> Found:
+    """Return the optimum whose search begins with odometry, and the places that were met again."""
+    return Found(optimizer, *optimizer.find(start_odometry(optimizer.system)))
+
+
+def find_closed_optimum(optimizer: Optimizer) -> Found | None:
+    """Return the optimum whose search begins with odometry and the places that were met again.
+
+    None where there are none, the search fails, or something speaks against the map.
+    """
+    system = optimizer.system
+    if not system.revisits:
+        return None
+    try:
+        found = find_from_odometry(optimizer)
+    except SolveError:
+        return None
+    against = speaks_against(system, found.at, found.at.state.splines, system.detections)
+    return None if against else found
+
+
+def _with_wider_priors(found: Found) -> tuple[Found, FactoredSystem]:
+    """Return the optimum, searched again while it contradicts the prior of a calibration, and `_known`."""
+    system, variables = found.system, found.at.state.variables
+    known = _known(system, found.at)
+    variance = np.diag(known.covariance(variables.calibration_keys))
+    inflated = with_inflated_priors(variables.calibrations, variance, system.settings)
+    if inflated == system.settings:
+        return found, known
+    system.widen_priors(inflated)
+    return _with_wider_priors(Found(found.optimizer, *found.optimizer.find(found.at.state)))
 
 
 def _known(system: BatchSystem, at: Evaluation) -> FactoredSystem:
@@ -222,86 +258,46 @@ def _known(system: BatchSystem, at: Evaluation) -> FactoredSystem:
     return FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
 
 
-def _vehicle(state: State, known: FactoredSystem, sigma_size: float) -> VehicleState:
+# --- the parts of a result -------------------------------------------------------------------------------
+
+
+def _map_covariance(state: State, known: FactoredSystem, settings: MapperSettings) -> Array:
+    """Return the joint covariance (n, n) of the control points, in m^2."""
+    points = state.map_points.ravel()
+    return with_size(known.covariance(state.map_keys), points, settings.odometry.sigma_size)
+
+
+def _vehicle(state: State, known: FactoredSystem, settings: MapperSettings) -> VehicleState:
     """Return the last pose and the calibration, with their joint covariance."""
     variables, last = state.variables, pose_key(len(state.poses) - 1)
     covariance = known.covariance(np.append(last, variables.calibration_keys))
     values = size_of_vehicle(state.poses[-1], len(variables.calibrations))
-    covariance = with_size(covariance, values, sigma_size)
+    covariance = with_size(covariance, values, settings.odometry.sigma_size)
     return VehicleState.split(state.poses[-1], variables.calibrations, covariance)
 
 
-def find_closed_optimum(optimizer: Optimizer, revisits: Sequence[Revisit]) -> Found | None:
-    """Return the optimum whose search begins with odometry and the places that were met again.
-
-    None where there are none, the search fails, or something speaks against the map.
-    """
-    system, settings = optimizer.system, optimizer.system.settings
-    system.revisits = tuple(revisits)
-    if not revisits:
-        return None
-    try:
-        start = start_odometry(system.chain, system.detections, settings, revisits)
-        at, convergence = optimizer.find(start)
-    except SolveError:
-        return None
-    poses, used = at.state.poses, share_used(at, system.detections)
-    why = disagreement(system, poses) or objection(at.state.splines, poses, used, settings)
-    return None if why else (at, convergence)
-
-
-def all_cones(judged: JudgedLog) -> DetectionColumns:
-    """Return the detections of all cones of a log, corrected by the sensor's calibration as it is known."""
-    pairs = zip(judged.cycles, judged.orange, strict=True)
-    table = DetectionColumns.of([one.with_others(other) for one, other in pairs], twists=judged.chain.twists)
-    calibration = judged.settings.calibration
-    table.correct(np.array(calibration.means) if calibration.sensor else np.zeros(0))
-    return table
-
-
-def find_open_optimum(optimizer: Optimizer) -> Found:
-    """Return the optimum whose search begins with an open map along the odometry."""
-    system = optimizer.system
-    return optimizer.find(start_odometry(system.chain, system.detections, system.settings))
-
-
-def _with_wider_priors(
-    optimizer: Optimizer, at: Evaluation, convergence: Convergence
-) -> tuple[Evaluation, Convergence, FactoredSystem]:
-    """Return the optimum, searched again while it contradicts the prior of a calibration, and `_known`."""
-    system, variables = optimizer.system, at.state.variables
-    known = _known(system, at)
-    variance = np.diag(known.covariance(variables.calibration_keys))
-    inflated = with_inflated_priors(variables.calibrations, variance, system.settings)
-    if inflated == system.settings:
-        return at, convergence, known
-    system.settings = inflated
-    system.chain = replace(system.chain, calibration_sigma=np.array(inflated.odometry.sigmas))
-    return _with_wider_priors(optimizer, *optimizer.find(at.state))
-
-
-def _map(state: State, joint: Array, scatter: Scatter) -> Map:
+def _map(few: Simplified, joint: Array) -> Map:
     """Return the curves with their covariance, to which the scatter of the cones is added."""
-    boundaries = {}
+    state, boundaries = few.state, {}
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
-        sigma = np.repeat(scatter.of_control_points(label, boundary), 2)
+        sigma = np.repeat(few.scatter.of_control_points(label, boundary), 2)
         covariance = joint[block, block] + np.diag(sigma**2)
         boundaries[label] = SplineBoundary(state.spline(label), covariance)
     return Map(state.closed, boundaries, joint_covariance(joint, boundaries))
 
 
-def _orange(judged: JudgedLog, state: State, settings: MapperSettings) -> dict[int, PointBoundary]:
-    cones, twists = OrangeCones(settings.growth, settings.spline.sigma_shape), judged.chain.twists
+def _orange(judged: JudgedLog, state: State) -> dict[int, PointBoundary]:
+    settings, twists = judged.settings, judged.chain.twists
+    cones = OrangeCones(settings.growth, settings.spline.sigma_shape)
     for k, detections in enumerate(judged.orange):
         cones.add(Sighting(k, state.poses[k], twists[k], detections), state.variables.sensor)
     return cones.points()
 
 
-def _records(
-    state: State, detections: DetectionTable, chain: LogOdometry, seconds: float
-) -> tuple[tuple[CycleRecord, ...], int]:
+def _records(few: Simplified, chain: LogOdometry, seconds: float) -> tuple[tuple[CycleRecord, ...], int]:
     """Return a record of each cycle, with its share of the seconds, and the number of complete laps."""
+    state, detections = few.state, few.detections
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
     used = np.bincount(detections.cycle[detections.used], minlength=len(chain)).tolist()
     offered = np.bincount(detections.cycle, minlength=len(chain)).tolist()

@@ -71,6 +71,15 @@ def objection(splines: Mapping[int, BSpline], poses: Array, used: float, setting
     return ""
 
 
+def speaks_against(
+    system: BatchSystem, at: Evaluation, splines: Mapping[int, BSpline], detections: DetectionTable
+) -> str:
+    """Return what speaks against closed curves at an optimum, on which detections lie; empty for nothing."""
+    poses = at.state.poses
+    used = share_used(at, detections)
+    return disagreement(system, poses) or objection(splines, poses, used, system.settings)
+
+
 def disagreement(system: BatchSystem, poses: Array) -> str:
     """Return that the poses (P, 3) of an optimum are not those of odometry and revisits; empty if they are.
 

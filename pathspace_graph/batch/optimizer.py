@@ -15,10 +15,9 @@ from pathspace_graph.mapping.state import State
 
 from .association import associate, cone_counts, locate_poses
 from .simplification import reknot
-from .system import BatchSystem, Biweight, Evaluation, moved
+from .system import LOOSE_GATE, BatchSystem, Biweight, Evaluation, moved
 
 STATION_PASSES: Final = 2  # times that detections are matched with the cones of a closed optimum
-LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 SEARCH: Final = 20  # rounds in which associations are found anew
 SETTLE: Final = 8  # most refinements of the foot points before a step

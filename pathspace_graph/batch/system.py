@@ -1,6 +1,6 @@
 """The least-squares problem of a whole log: its cost at a state, and its linear factors there."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -24,6 +24,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .association import headings
 from .stations import StationMatches, match_stations
 
+LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 SIGMA_SLIDE: Final = 2.0
 """Standard deviation of a control point's slide along its curve from beside its first pose (m), where
 stations hold it there."""
@@ -147,14 +148,25 @@ class BatchSystem:
     """Problem of minimizing `sum rho(detections) + 1/2 |odometry, revisits, gauge, priors|^2`."""
 
     def __init__(
-        self, detections: DetectionTable, chain: LogOdometry, settings: MapperSettings, kernel: Biweight
+        self,
+        detections: DetectionTable,
+        chain: LogOdometry,
+        settings: MapperSettings,
+        revisits: Sequence[Revisit] = (),
     ) -> None:
-        self.detections, self.chain = detections, chain
-        self.settings, self.kernel = settings, kernel
-        self.gauges: dict[int, CurveGauge] = {}  # weak priors of each boundary
-        self.revisits: tuple[Revisit, ...] = ()  # where an open road was driven twice
+        self.detections = detections
+        self.chain = chain
+        self.settings = settings
+        self.revisits = tuple(revisits)  # where the road was driven twice
+        self.kernel = Biweight(LOOSE_GATE)
+        self.gauges: dict[int, CurveGauge] = {}  # of each boundary
         self.matches: StationMatches | None = None  # cones of closed curves, where they hold detections
         self._sigma = np.ones(len(detections))  # across the curves, of this round (m)
+
+    def widen_priors(self, settings: MapperSettings) -> None:
+        """Take the priors of the calibrations from other settings."""
+        self.settings = settings
+        self.chain = replace(self.chain, calibration_sigma=np.array(settings.odometry.sigmas))
 
     def begin(self, state: State, stations: bool = False) -> None:
         """Make the gauges anew, which hold the control points where they are now, when knots have changed.

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.mapper import all_cones
 from pathspace_graph.batch.objections import BENT_SIGMAS, disagreement
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import (
@@ -40,7 +39,7 @@ SETTINGS = own_settings(MapperSettings())
 def found_in(log: Log) -> tuple[LogOdometry, tuple[Revisit, ...]]:
     """Return the odometry of a log, and its revisits."""
     judged = judge_log(log, log.noise, SETTINGS)
-    return judged.chain, find_revisits(judged.chain, all_cones(judged), judged.settings)
+    return judged.chain, find_revisits(judged)
 
 
 # --- revisits --------------------------------------------------------------------------------------------

@@ -150,7 +150,8 @@ def test_a_station_s_sigma_is_how_it_moves_along_the_few_curve() -> None:
     """By drawing dense control points of their covariance: the few ones follow by the change."""
     system, at, lap = optimum()
     assert system.matches is not None
-    few, change = simplified(at.state, system.detections, system.settings)
+    simple = simplified(at.state, system.detections, system.settings)
+    few, change = simple.state, simple.change
     _, _, dense = marginal_of(system, at, few, change, lap.first_kept)
     stations = stations_on(few, system.matches, at.state, change, dense)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(dense)), dense, 2000)
