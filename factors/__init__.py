@@ -3,5 +3,4 @@
 try:
     from ._kernels import COMPILER  # noqa: F401 - so that a missing build is told before anything else
 except ModuleNotFoundError:
-    message = "pathspace_graph.factors._kernels is missing: run pip install -e ."
-    raise ImportError(message) from None
+    raise ImportError("pathspace_graph.factors._kernels is missing: run pip install -e .") from None
