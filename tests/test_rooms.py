@@ -21,11 +21,11 @@ LATE = {"commands.estimate": {"eval.view.recording"}, "io.brief": {"eval.figures
 ASKED = {"io.brief"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""
 
-LEAVES = {"errors", "labels", "console", "lengths"}
+LEAVES = {"errors", "labels", "console", "lengths", "copies"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "baselines"}
 BELOW_MAPPING = {
-    *("factors", "settings", "spline", "io", "graph", "laps", "health", "run", "checkpoint", "snapshot"),
+    *("factors", "settings", "spline", "io", "graph", "laps", "health", "run", "snapshot"),
     "scale",
 }
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
@@ -44,8 +44,7 @@ ARROWS: dict[str, set[str]] = {
     "health": set(),
     "run": {"factors", "io", "laps", "health"},
     "scale": {"factors", "settings", "io", "run"},
-    "checkpoint": set(),
-    "snapshot": {"factors", "io", "graph", "checkpoint"},
+    "snapshot": {"factors", "io", "graph"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
     "plausibility": {"factors", "settings", "spline", "io", "front_end", "scale"},
