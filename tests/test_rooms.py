@@ -183,10 +183,12 @@ ASSIGNED = {
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},
     "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
     "mapping.smoother": {"self.window.exact"},
-    "online.fixed_lag": {"self.failures"},
+    "loop.open": {"drive.closed_by", "drive.revisits"},
+    "mapping.road": {"self.smoother.attached"},
+    "online.fixed_lag": {f"mapper.{part}" for part in ("front_end", "road", "drive", "phase", "health")},
     "online.outlook": {"row.ended"},
     "commands.options": {"entry.metadata"},  # of dataclasses
-    "snapshot": {"array.flags.writeable", "zipped.comment"},  # of numpy and zipfile
+    "snapshot": {"array.flags.writeable"},  # of numpy
 }
 """Attributes that a module assigns to objects of others: no module may have another one."""
 
