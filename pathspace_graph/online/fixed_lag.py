@@ -104,7 +104,7 @@ class FixedLagMapper(MapperEstimate):
 
         Nothing else is raised. Where a step fails, the mapper goes back to before the cycle and takes it
         again with the loop left alone, or without detections, or not at all. The notice says which, and
-        `recovery.failures` counts. If `strict`, it goes back, and what was raised is raised again.
+        `failures` counts. If `strict`, it goes back, and what was raised is raised again.
         """
         factors = tuple(factors)
         cycle, unused = self._admit(odometry, detections, factors), self._unused
