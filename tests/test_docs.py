@@ -33,6 +33,7 @@ from pathspace_graph.io.map import read_map
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.results import read_trajectory, write_result
 from pathspace_graph.labels import NAMES
+from pathspace_graph.loop.open import Open
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.run import run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -256,13 +257,13 @@ def test_the_bridge_of_the_page_on_ros_maps_json_lines(log: Log) -> None:
 
 def test_each_step_of_the_paper_is_two_calls_from_the_update() -> None:
     page = text_of(ROOT / "docs" / "architecture.md")
-    owners = {"FixedLagMapper": FixedLagMapper, "Road": Road}
+    owners = {"Open": Open, "Road": Road}
     steps = re.findall(r"^\| [^|]* \| `(\w+)\.(\w+)` \| ([^|]*) \|", page, flags=re.MULTILINE)
     steps = [step for step in steps if step[0] in owners]
     assert len(steps) == 7
     update = inspect.getsource(FixedLagMapper._process)
     for owner, method, functions in steps:
-        assert f".{method}(" in update or method == "_process"
+        assert f".{method}(" in update
         for _, function in NAMED.findall(functions):
             called = function.rpartition(".")[2]
             assert f"{called}(" in inspect.getsource(getattr(owners[owner], method)), function
