@@ -173,18 +173,16 @@ VIEWS = {"values", "linearized", "poses", "calibrations", "mean"}
 """Arrays of numbers that other rooms write through views (docs/architecture.md, "Owners")."""
 ASSIGNED = {
     "batch.association": {"state.pose_u"},
-    "batch.mapper": {"system.settings", "system.chain", "system.revisits", "optimizer.system.revisits"},
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "eval.view.animation": {"writer.fig"},  # of matplotlib
-    "front_end.motion": {"self._rest.sigma"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
     "baselines.landmark_association": {"detections.landmark"},
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},
     "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
-    "mapping.smoother": {"self.window.exact"},
-    "loop.open": {"drive.closed_by", "drive.revisits"},
+    "loop.open": {"drive.revisits", "drive.closed_by"},
     "mapping.road": {"self.smoother.attached"},
+    "mapping.smoother": {"self.window.exact"},
     "online.fixed_lag": {f"mapper.{part}" for part in ("front_end", "road", "drive", "phase", "health")},
     "online.outlook": {"row.ended"},
     "commands.options": {"entry.metadata"},  # of dataclasses
