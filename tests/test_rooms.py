@@ -184,9 +184,9 @@ ASSIGNED = {
     "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
     "loop.open": {"drive.revisits", "drive.closed_by"},
     "mapping.road": {"self.smoother.attached"},
+    "mapping.rows": {"row.ended"},
     "mapping.smoother": {"self.window.exact"},
     "online.fixed_lag": {f"mapper.{part}" for part in ("front_end", "road", "drive", "phase", "health")},
-    "online.outlook": {"row.ended"},
     "commands.options": {"entry.metadata"},  # of dataclasses
     "snapshot": {"array.flags.writeable"},  # of numpy
 }
