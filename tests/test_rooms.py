@@ -164,7 +164,7 @@ def imported_by(node: ast.AST) -> list[str]:
 
 def test_no_folder_is_crowded() -> None:
     for folder in {file.parent for file in (*modules().values(), *(ROOT / "tests").rglob("*.py"))}:
-        assert len(list(folder.glob("*.py"))) <= MOST_FILES, folder
+        assert sum(file.name != "__init__.py" for file in folder.glob("*.py")) <= MOST_FILES, folder
 
 
 # --- owners ----------------------------------------------------------------------------------------------
@@ -176,6 +176,8 @@ ASSIGNED = {
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "eval.view.animation": {"writer.fig"},  # of matplotlib
+    "graph.changes": {f"smoother.{part}" for part in ("prior", "submaps", "inactive", "held")}
+    | {"smoother.variables.first_cycle"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
     "baselines.landmark_association": {"detections.landmark"},
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},
