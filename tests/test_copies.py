@@ -29,7 +29,7 @@ from pathspace_graph.sim.track import skidpad
 
 from .oracles.copied import copied
 from .scenes.digest import digest
-from .scenes.drives import bean_track, beginning, lap_log, map_beginning, noisy, replay
+from .scenes.drives import beginning, map_beginning, noisy_lap, replay
 from .scenes.holes import unseen
 from .scenes.kidnapped import laps_log, pear_track, put_down
 
@@ -43,7 +43,7 @@ PARTS = "front_end", "road", "drive", "phase", "health"
 
 def closing() -> Log:
     """Return a lap and 40 m more: open, with a batch under way, and closed."""
-    return noisy(lap_log(bean_track(), overrun=40.0), seed=3)
+    return noisy_lap()
 
 
 def revisiting() -> Log:
