@@ -1,8 +1,8 @@
 """Snapshots: a whole estimator as one file, from which it goes on to the same map.
 
 A file is a line with its format, a line with the SHA-256 of the rest, and a pickle of the estimator. It is
-verified before it is read, and no code comes from it: what it names is one of our own classes, made without
-its constructor, or one of `MAKERS`. It is read by the version of the package that wrote it.
+verified before it is read, and no code comes from it: it can call only `new`, which makes an object of one
+of our own classes without its constructor, and `MAKERS`. The version of the package that wrote it reads it.
 """
 
 import io
@@ -106,9 +106,17 @@ def number_of(array: NDArray[Any]) -> Any:
     return array[()]
 
 
-def new(kind: type) -> object:
+def new(module: str, name: str) -> object:
     """Return an object of one of our classes, without its constructor."""
-    return object.__new__(kind)
+    found = getattr(sys.modules.get(module), name, None) if _is_own(module) else None
+    if not isinstance(found, type) or found.__module__ != module:
+        raise ValueError(f"expected a class of an estimator, found {shown(f'{module}.{name}')}")
+    return object.__new__(found)
+
+
+def tree_of(points: NDArray[np.float64]) -> KDTree:
+    """Return the tree of points (n, d)."""
+    return KDTree(points)
 
 
 def nothing() -> None:
@@ -156,7 +164,7 @@ MAKERS: Final[dict[type, tuple[Callable[..., Any], Callable[[Any], Iterable[Any]
     np.ndarray: (array_of, _array_parts),
     slice: (slice, lambda span: (span.start, span.stop, span.step)),
     deque: (deque, lambda ring: ([*ring], ring.maxlen)),
-    KDTree: (KDTree, lambda tree: (np.array(tree.data),)),
+    KDTree: (tree_of, lambda tree: (np.array(tree.data),)),
     Future: (nothing, lambda _: ()),
     gtsam.GaussianFactorGraph: (graph_of, factors_of),
     gtsam.GaussianBayesNet: (bayes_net_of, factors_of),
@@ -180,7 +188,7 @@ class _Pickler(pickle.Pickler):
             return make, tuple(parts(one))
         if isinstance(one, np.generic):
             return number_of, (np.asarray(one),)
-        if any(one is call for call in _CALLED) or (kind is type and _is_own(one.__module__)):
+        if any(one is call for call in _CALLED):
             return NotImplemented
         if not _is_own(kind.__module__):
             raise SettingsError(f"snapshot: expected what can be saved, found a {kind.__qualname__}")
@@ -191,16 +199,13 @@ class _Pickler(pickle.Pickler):
             for name, value in vars(one).items()
             if not isinstance(getattr(kind, name, None), cached_property)
         }
-        return new, (kind,), kept
+        return new, (kind.__module__, kind.__name__), kept
 
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        """Return one of our classes, or one of the functions that make others; nothing else is found."""
+        """Return one of the functions that make objects; no class and nothing else is found."""
         for call in _CALLED:
             if (module, name) == (call.__module__, call.__qualname__):
                 return call
-        found = getattr(sys.modules.get(module), name, None) if _is_own(module) else None
-        if not isinstance(found, type) or found.__module__ != module:
-            raise pickle.UnpicklingError(f"expected a class of an estimator, found {module}.{name}")
-        return found
+        raise pickle.UnpicklingError(f"expected a maker of an estimator's parts, found {module}.{name}")

@@ -391,8 +391,8 @@ def test_the_tutorial(
     monkeypatch.chdir(tmp_path)
     said = []
     for line in tutorial():
-        line = line.replace("200 240 --generator.cones 150", "100 130 --generator.cones 80")
-        run_line(line.replace("--laps 2", "--laps 1 --vehicle.overrun 40"), monkeypatch)
+        half = line.replace("200 240 --generator.cones 150", "100 130 --generator.cones 80")
+        run_line(half.replace("--laps 2", "--laps 1 --vehicle.overrun 40"), monkeypatch)
         said.append(capsys.readouterr().out)
     online, reference = (read_map(tmp_path / name) for name in ("map", "reference"))
     assert online.closed

@@ -1,10 +1,10 @@
 """The paper's state, a pose and control points of clamped splines, and its growth (paper: Expansion)."""
 
-from copy import copy
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
@@ -40,7 +40,7 @@ class CurveState:
         self.pose_u: dict[int, float] = {}  # parameter of the vehicle's foot point on each curve, not wrapped
 
     def copy(self) -> Self:
-        other = copy(self)
+        other = shallow(self)
         other.belief = self.belief.copy()
         other.curves = self.curves.copy()
         other.pose_u = self.pose_u.copy()
@@ -172,8 +172,8 @@ class Expansion:
         self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # lengths (m) since the last cone
 
     def copy(self) -> Self:
-        other = copy(self)
-        other.tentative = {label: copy(tracks) for label, tracks in self.tentative.items()}
+        other = shallow(self)
+        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
         other.observed = {label: known.copy() for label, known in self.observed.items()}
         other._carried = self._carried.copy()
         return other

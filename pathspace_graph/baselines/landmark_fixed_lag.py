@@ -4,13 +4,14 @@ The loop closes where enough of the landmarks seen now are those of the beginnin
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile
 from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.graph.changes import solve_loop
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.map import Map
@@ -50,6 +51,12 @@ class LandmarkFixedLag(OnlineBaseline):
         self.closed = False
         self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
         self._last_check = 0.0
+
+    def copy(self) -> Self:
+        other = super().copy()
+        other.smoother, other.path = self.smoother.copy(), self.path.copy()
+        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
+        return other
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         motion, detections = reading.motion, reading.detections
@@ -246,4 +253,4 @@ def detect_loop(
 def optimize_loop(smoother: LandmarkSmoother, recent: IntArray, old: IntArray) -> None:
     """Solve the whole loop with pairs (k,) held together; merge them later."""
     smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([recent, old])]
-    smoother.solve_loop(smoother.map.settings.closing.iterations, None)
+    solve_loop(smoother, smoother.map.settings.closing.iterations, None)

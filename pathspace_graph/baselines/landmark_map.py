@@ -1,11 +1,11 @@
 """The landmark map: landmarks with their variables, detections with associations, and two rows for each."""
 
-from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Final, Self, TypeAlias
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights, whiteners
 from pathspace_graph.factors.residuals import landmark_residuals
@@ -44,7 +44,7 @@ class LandmarkState:
         self.next_number = 0
 
     def copy(self) -> Self:
-        other = copy(self)
+        other = shallow(self)
         other.variables = self.variables.copy()
         other.votes = self.votes.copy()
         return other
@@ -126,7 +126,7 @@ class LandmarkMap:
         self.merged_into: dict[int, int] = {}  # number that was kept by the one that was merged
 
     def copy(self) -> Self:
-        other = copy(self)
+        other = shallow(self)
         other.state = self.state.copy()
         other.variables = other.state.variables
         other.detections = self.detections.copy()

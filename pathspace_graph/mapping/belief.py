@@ -4,13 +4,13 @@ The third-degree spherical-radial rule (Arasaratnam and Haykin 2009) is the pape
 """
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
 from scipy.linalg import block_diag, lapack
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.se2 import compose, to_map, to_vehicle
@@ -102,7 +102,7 @@ class Belief:
         return belief
 
     def copy(self) -> Self:
-        other = copy(self)
+        other = shallow(self)
         other.mean = self.mean.copy()
         other.covariance = self.covariance.copy()
         return other

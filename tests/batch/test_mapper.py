@@ -238,7 +238,7 @@ def test_a_map_that_is_objected_to_is_written_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("pathspace_graph.batch.mapper.MISSES", 0.0)
-    write_log(broken_off(bean(), 0.3), tmp_path / "log")
+    write_log(bean(), tmp_path / "log")
     arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
     with pytest.raises(SystemExit) as end:
         main(arguments)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.io.log import Detections, Odometry
@@ -14,6 +13,7 @@ from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
+from ..oracles.copied import copied
 from ..scenes.digest import digest
 from ..scenes.drives import short_drive
 
@@ -50,7 +50,7 @@ def test_a_copy_stays_as_it_is_and_goes_on_as_the_original() -> None:
     original, copies, readings = FrontEnd(MapperSettings(), noise), {}, []
     for k, cycle in enumerate(cycles):
         if k in COPIED_AT:
-            copies[k] = original.copy(), copied(original, {})
+            copies[k] = original.copy(), copied(original)
         readings.append(digest(update(original, cycle)))
     assert len(cycles) > COPIED_AT[-1] + GOES_ON
     for k, (copy, expected) in copies.items():

@@ -9,6 +9,7 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose
+from pathspace_graph.graph.changes import merge_points, replace_points, solve_loop
 from pathspace_graph.graph.gaussian import factorize, graph_of, keys_of, normal_equations
 from pathspace_graph.graph.rows import Rows, calibrated_delta
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -84,7 +85,7 @@ def test_merged_points_are_known_as_well_as_both_together() -> None:
     old = Layout(keys_of(smoother.prior))
     before, variables = normal_equations(smoother.prior, old), smoother.variables.copy()
     at_kept = variables.of(kept)
-    smoother.merge(gone, kept)
+    merge_points(smoother, gone, kept)
     assert (smoother.variables.layout.positions(gone) < 0).all()
     np.testing.assert_array_equal(smoother.variables.of(kept), at_kept)
     new = Layout(keys_of(smoother.prior))
@@ -291,7 +292,7 @@ def test_substituted_points_know_what_the_old_ones_did() -> None:
     information, vector = normal_equations(smoother.prior, layout)
     reference = smoother.variables.reference[smoother.variables.layout.entries(layout.keys)].copy()
     change, points = rng.normal(size=(3, 2)), rng.normal(size=(2, 2))
-    smoother.substitute(old, new, points, change, sigma)
+    replace_points(smoother, old, new, points, change, sigma)
     rest = np.setdiff1d(layout.keys, old)
     found_layout = Layout(np.sort(np.append(rest, new)))
     matrix = np.zeros((layout.size, found_layout.size))
@@ -316,7 +317,7 @@ def test_substituted_points_know_what_the_old_ones_did() -> None:
 def drive_bean(settings: MapperSettings, cycles: int) -> FixedLagMapper:
     """A mapper somewhere on a lap, with the tolerances that hold after it has closed."""
     mapper = FixedLagMapper(settings, ODOMETRY_SIGMA)
-    mapper.smoother.window.exact = False
+    mapper.road.smoother.window.exact = False
     for _, (odometry, cycle) in zip(range(cycles), split_odometry(lap_log(bean_track(), 0.0)), strict=False):
         mapper.update(odometry, cycle)
     return mapper
@@ -324,7 +325,7 @@ def drive_bean(settings: MapperSettings, cycles: int) -> FixedLagMapper:
 
 def rows_of(mapper: FixedLagMapper) -> dict[int, Array]:
     """The rows of each cycle as they were linearized last."""
-    kept = mapper.smoother.window.measured
+    kept = mapper.road.smoother.window.measured
     return {
         owner: np.concatenate([rows.residual[rows.owner == owner] for rows in kept.groups])
         for owner in np.unique(kept.owners).tolist()
@@ -336,14 +337,14 @@ def test_the_tolerance_holds_once_the_loop_has_closed() -> None:
     mapper = FixedLagMapper(odometry_sigma=ODOMETRY_SIGMA)
     for odometry, cycle in split_odometry(lap_log(bean_track(), 45.0)):
         mapper.update(odometry, cycle)
-        assert mapper.smoother.window.exact is not mapper.closed
+        assert mapper.road.smoother.window.exact is not mapper.closed
     assert mapper.closed
 
 
 @pytest.mark.parametrize("into_use", [False, True])
 def test_a_reading_that_goes_in_or_out_of_use_makes_its_cycle_stale(into_use: bool) -> None:
     mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
-    smoother, detections = mapper.smoother, mapper.smoother.map.detections
+    smoother, detections = mapper.road.smoother, mapper.road.smoother.map.detections
     cycle = smoother.first_cycle + 5
     row = np.flatnonzero(detections.used & (detections.cycle == cycle))[:1]
     where = detections.boundary[row].copy(), detections.u[row].copy()
@@ -384,7 +385,7 @@ def test_the_steps_system_is_that_of_the_graph_at_the_estimate() -> None:
 
 def numeric_end(mapper: FixedLagMapper) -> tuple[Array, Array, Array]:
     """Derivatives of the newest pose by the one before, by the calibration, and by the odometry's noise."""
-    start, odometry = mapper.poses[-2].copy(), mapper.smoother.window.odometry
+    start, odometry = mapper.poses[-2].copy(), mapper.road.smoother.window.odometry
     delta, G = odometry.deltas[-1], odometry.by_calibration[-1]
     b = mapper.calibration.copy()
 
@@ -409,7 +410,7 @@ def numeric_end(mapper: FixedLagMapper) -> tuple[Array, Array, Array]:
 def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(together: int) -> None:
     """The newest pose was not in the step: its odometry predicts it and adds noise."""
     mapper = drive_bean(MapperSettings(), 59)
-    smoother, odometry = mapper.smoother, list(split_odometry(lap_log(bean_track(), 0.0)))[59]
+    smoother, odometry = mapper.road.smoother, list(split_odometry(lap_log(bean_track(), 0.0)))[59]
     mapper._predict(mapper.front_end.update(*odometry))
     step = smoother.last_step
     assert step is not None
@@ -457,12 +458,12 @@ def test_covariance_is_the_dense_inverse_of_the_graph_at_the_estimate() -> None:
 
 def test_a_loop_is_solved_with_its_keyframes_and_without_them_afterwards() -> None:
     mapper = drive_bean(MapperSettings(), 100)
-    smoother = mapper.smoother
+    smoother = mapper.road.smoother
     assert smoother.submaps is not None and len(smoother.submaps.keyframes) > 1
     keys = smoother.variables.keys
     stay = ~np.isin(keys, smoother.variables.keyframes)
     before = smoother.variables.of(keys[stay])
-    smoother.solve_loop(2, 10.0)
+    solve_loop(smoother, 2, 10.0)
     assert smoother.submaps is None and len(smoother.inactive) == 0
     np.testing.assert_array_equal(smoother.variables.keys, keys[stay])
     assert len(smoother.variables.keyframes) == 0

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BIG_ORANGE, ORANGE
 from pathspace_graph.mapping.orange import OrangeCones, Sighting
 from pathspace_graph.settings.online import GrowthSettings
 
+from ..oracles.copied import copied
 from ..scenes.digest import digest
 
 Array = NDArray[np.float64]

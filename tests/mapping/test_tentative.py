@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.mapping import tentative as tentative_module
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.online import GrowthSettings
 
+from ..oracles.copied import copied
 from ..scenes.digest import digest
 
 Array = NDArray[np.float64]
@@ -199,7 +199,7 @@ def test_a_cone_that_is_taken_back_from_a_curve_is_confirmed_and_rather_certain(
 
 def test_a_copy_of_tracks_stays_as_it_is() -> None:
     found = tentative((0.0, 0.0, 1.0, 0.0), (5.0, 0.0, 1.0, 0.2))
-    copy, expected = found.copy(), copied(found, {})
+    copy, expected = found.copy(), copied(found)
     found.add(np.array([[0.1, 0.0], [9.0, 0.0]]), round_covariances(1.0, 1.0), 0.3)
     found.move(np.array([1.0, 0.0, 0.1]))
     found.restore(np.array([[3.0, 3.0]]), 0.4)

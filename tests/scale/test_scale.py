@@ -336,8 +336,8 @@ def test_the_smoothed_drive_has_the_size_of_the_scene() -> None:
     one, ten = (FixedLagMapper(MapperSettings(scale=s)) for s in (1.0, 10.0))
     t = np.array([log.cycles[0].t])
     for mapper in (one, ten):
-        mapper.loop.record.stamps[:] = t.tolist()
-        mapper.loop.corrected_poses = np.array([[2.0, 3.0, 0.5]])
+        mapper.drive.record.stamps.append(float(t[0]))
+        mapper.drive.record.corrected = np.array([[2.0, 3.0, 0.5]])
     np.testing.assert_allclose(one.smoothed(t), [[2.0, 3.0, 0.5]])
     np.testing.assert_allclose(ten.smoothed(t), [[20.0, 30.0, 0.5]])
 

@@ -78,7 +78,7 @@ def test_the_curve_is_extended_to_the_last_point_of_the_chain() -> None:
 
 
 def test_a_long_extension_takes_a_point_between(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(expansion, "STRETCH", 5.0)
+    monkeypatch.setattr(expansion, "LONGEST_EXTENSION", 5.0)
     state = straight_rows()
     expanded(state, np.array([[18.5, 2.0], [16.5, 2.0]]))
     assert state.curves[LEFT].size == 6

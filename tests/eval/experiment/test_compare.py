@@ -74,8 +74,8 @@ def test_estimators_are_those_named_or_all_that_are_known() -> None:
         choose_reference("rings", ("gaps",))
 
 
-def test_logs_of_a_folder(folder: Path, tmp_path: Path) -> None:
-    assert [named.name for named in read_logs(folder)] == ["a", "b"]
+def test_logs_of_a_folder(logs: list[NamedLog], folder: Path, tmp_path: Path) -> None:
+    assert [named.name for named in logs] == ["a", "b"]
     assert [named.name for named in read_logs(folder / "a")] == ["a"]
     with pytest.raises(InputError, match="found neither"):
         read_logs(tmp_path)

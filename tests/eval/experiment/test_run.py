@@ -42,14 +42,16 @@ def pretenders(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def study(track: Path) -> Study:
-    return Study(
-        name="small",
-        tracks=(track,),
-        seeds=(0, 1),
-        laps=1,
-        estimators=("pretender", "fragile"),
-        grids=({"lag": [1.0, 2.0]},),
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        register(patch)
+        return Study(
+            name="small",
+            tracks=(track,),
+            seeds=(0, 1),
+            laps=1,
+            estimators=("pretender", "fragile"),
+            grids=({"lag": [1.0, 2.0]},),
+        )
 
 
 @pytest.fixture(scope="module")
