@@ -2114,6 +2114,7 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("columns_of", &columns_of);
   module.def("shifted", &shifted);
   module.def("to_map", &to_map);
+  module.def("detection_rows", &detection_rows);
   module.def("station_rows", &station_rows);
   module.def("placed", &placed);
   module.def("curve_rows", &curve_rows);
