@@ -102,19 +102,8 @@ def refined(
 def to_map(points_vehicle: Array, poses: Array) -> Array:
     """Return `p = R z + t` (m, 2), map frame: points z (m, 2) in the vehicle frames of poses (m, 3)."""
 
-def by_sensor(points_vehicle: Array, twists: Array) -> Array:
-    """Return the derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b.
-
-    z are points_vehicle (m, 2) as measured, in m, and twists (m, 3) are those at their stamps (m/s, m/s,
-    rad/s). With J the quarter turn and `v + wz J z` the motion relative to a point at rest, the columns are
-
-        J z (yaw),   (0, 1) (lateral),   -(v + wz J z) (latency),   -z (range scale),   -z / |z| (range bias)
-
-    The second order is left out: a yaw of 2 degrees shifts a detection at 15 m by 9 mm beside that.
-    """
-
 def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
-    """Return `z + C b` (m, 2) of detections z (m, 2), with C of `by_sensor` and a calibration b (5,)."""
+    """Return `z + C b` (m, 2) of detections z (m, 2): C of `sensor:by_sensor` and a calibration b (5,)."""
 
 def detection_rows(
     points_map: Array,

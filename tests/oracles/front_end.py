@@ -9,11 +9,11 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation
-from pathspace_graph.factors.sensor import SENSOR_SIZE, by_bend
+from pathspace_graph.factors.sensor import SENSOR_SIZE, by_bend, by_sensor
 from pathspace_graph.front_end.measurement import BEND, PRIOR, _runs, pairs
 from pathspace_graph.front_end.sightings import Cones
 
-from .measuring import by_sensor, to_map
+from .measuring import to_map
 
 
 def usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tuple[BoolArray, BoolArray]:

@@ -9,7 +9,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.residuals import sigma_across
 from pathspace_graph.factors.se2 import compose, left_of, se2_exp, wrap_angle
-from pathspace_graph.factors.sensor import SENSOR_SIZE, sensor_rows
+from pathspace_graph.factors.sensor import by_sensor, sensor_rows
 
 
 def to_map(points_vehicle: Array, poses: Array) -> Array:
@@ -17,19 +17,6 @@ def to_map(points_vehicle: Array, poses: Array) -> Array:
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = points_vehicle[:, 0], points_vehicle[:, 1]
     return np.array([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]]).T
-
-
-def by_sensor(points_vehicle: Array, twists: Array) -> Array:
-    """Return the derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b."""
-    turned = left_of(points_vehicle)
-    distance = np.maximum(np.hypot(points_vehicle[:, 0], points_vehicle[:, 1]), np.finfo(float).tiny)
-    columns = np.empty((len(points_vehicle), 2, SENSOR_SIZE))
-    columns[:, :, 0] = turned
-    columns[:, :, 1] = 0.0, 1.0
-    columns[:, :, 2] = -(twists[:, :2] + twists[:, 2:] * turned)
-    columns[:, :, 3] = -points_vehicle
-    columns[:, :, 4] = -points_vehicle / distance[:, None]
-    return columns
 
 
 def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
