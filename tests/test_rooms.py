@@ -185,7 +185,6 @@ ASSIGNED = {
     "mapping.road": {"self.smoother.attached"},
     "mapping.smoother": {"self.window.exact"},
     "online.fixed_lag": {f"mapper.{part}" for part in ("front_end", "road", "drive", "phase", "health")},
-    "online.outlook": {"row.ended"},
     "commands.options": {"entry.metadata"},  # of dataclasses
     "snapshot": {"array.flags.writeable"},  # of numpy
 }

@@ -14,12 +14,13 @@ from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping import path
-from pathspace_graph.mapping.belief import Belief, point_columns
 from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
+
+from .belief import Belief, point_columns
 
 SIGMA_START: Final = 0.3  # of a new curve's control points (m), beyond that of its detections
 

@@ -17,9 +17,9 @@ from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.belief import SENSOR_COLUMNS, to_vehicle_rows, transform
 from pathspace_graph.settings.mapper import CkfSettings
 
+from .belief import SENSOR_COLUMNS, to_vehicle_rows, transform
 from .ckf_curves import CurveState
 
 GAIN_RANK: Final = 1e-9  # singular values of the gain below this share of the largest one count as zero

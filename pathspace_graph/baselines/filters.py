@@ -16,7 +16,6 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.loop.closing import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping import registration
-from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import Motion, near_start
@@ -26,6 +25,7 @@ from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 
+from .belief import HEAD, Belief, point_columns
 from .ckf_curves import CurveState, Expansion, in_map
 from .ckf_update import OnCurve, classify, update
 from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs
