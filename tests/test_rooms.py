@@ -173,7 +173,6 @@ VIEWS = {"values", "linearized", "poses", "calibrations", "mean"}
 """Arrays of numbers that other rooms write through views (docs/architecture.md, "Owners")."""
 ASSIGNED = {
     "batch.association": {"state.pose_u"},
-    "batch.mapper": {"system.settings", "system.chain", "system.revisits", "optimizer.system.revisits"},
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "eval.view.animation": {"writer.fig"},  # of matplotlib

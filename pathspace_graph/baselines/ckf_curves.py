@@ -4,6 +4,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.baselines.ckf_belief import Belief, point_columns
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import clamped_knots
@@ -19,8 +20,6 @@ from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nea
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
-
-from .belief import Belief, point_columns
 
 SIGMA_START: Final = 0.3  # of a new curve's control points (m), beyond that of its detections
 

@@ -5,6 +5,7 @@ from typing import ClassVar, Final, Self
 import numpy as np
 from scipy.linalg import block_diag
 
+from pathspace_graph.baselines.ckf_belief import HEAD, Belief, point_columns
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import left_of, to_map
 from pathspace_graph.front_end.front_end import Reading
@@ -25,7 +26,6 @@ from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 
-from .belief import HEAD, Belief, point_columns
 from .ckf_curves import CurveState, Expansion, in_map
 from .ckf_update import OnCurve, classify, update
 from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs

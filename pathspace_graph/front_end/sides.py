@@ -13,10 +13,10 @@ import numpy as np
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.front_end.cone_rows import ConeRow, deal_out
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, DrivenPath, PathAhead, in_front_row
-from pathspace_graph.mapping.rows import ConeRow, deal_out
 from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.online import SidesSettings
 

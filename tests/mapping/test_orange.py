@@ -91,7 +91,7 @@ def test_a_copy_of_orange_cones_stays_as_it_is_and_goes_on_as_the_original() -> 
         lambda cones: cones.place_again(np.zeros(0), (1, pose + np.zeros((1, 3)))),
         lambda cones: cones.add(seen_from(pose, 101), np.zeros(0)),
     ):
-        twin, expected = cones.copy(), copied(cones, {})
+        twin, expected = cones.copy(), copied(cones)
         happens(cones)
         assert digest(twin) == digest(expected)
         happens(twin)

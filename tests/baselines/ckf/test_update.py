@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.belief import to_vehicle_rows
+from pathspace_graph.baselines.ckf_belief import to_vehicle_rows
 from pathspace_graph.baselines.ckf_update import classify, on_curve, update
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.settings.mapper import CkfSettings
