@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final, Literal, Union, get_args, get_origin, g
 
 from pathspace_graph.errors import NUMBERS, SettingsError
 
-_KINDS: Final[dict[Any, tuple[type[Any], str]]] = {
+_NUMBER_KINDS: Final[dict[Any, tuple[type[Any], str]]] = {
     float: (Real, "a number"),
     int: (Integral, "a whole number"),
 }
@@ -58,8 +58,8 @@ def is_of(value: Any, kind: Any) -> bool:
     if get_origin(kind) is tuple:
         each = options[:1] * len(value) if isinstance(value, tuple) and options[-1] is ... else options
         return isinstance(value, tuple) and len(value) == len(each) and all(map(is_of, value, each))
-    if kind in _KINDS:
-        return isinstance(value, _KINDS[kind][0]) and not isinstance(value, bool)
+    if kind in _NUMBER_KINDS:
+        return isinstance(value, _NUMBER_KINDS[kind][0]) and not isinstance(value, bool)
     return isinstance(value, kind)
 
 
@@ -71,6 +71,6 @@ def in_words(kind: Any) -> str:
         return " or ".join(map(repr, options))
     if get_origin(kind) is tuple:
         return f"a list, each {in_words(options[0])}"
-    if kind in _KINDS:
-        return _KINDS[kind][1]
+    if kind in _NUMBER_KINDS:
+        return _NUMBER_KINDS[kind][1]
     return {bool: "True or False", NoneType: "None"}.get(kind) or f"a {getattr(kind, '__name__', kind)}"
