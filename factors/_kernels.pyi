@@ -116,6 +116,20 @@ def by_sensor(points_vehicle: Array, twists: Array) -> Array:
 def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
     """Return `z + C b` (m, 2) of detections z (m, 2), with C of `by_sensor` and a calibration b (5,)."""
 
+def detection_rows(
+    points_map: Array,
+    covariances: Array,
+    poses: Array,
+    normals: Array,
+    distances: Array,
+    basis: Array,
+    measured: Array,
+    twists: Array,
+    sensor: Array,
+    sigma_model: float,
+) -> tuple[Array, Array, Array]:
+    """Return residuals (m,) and sigmas (m,) of `project`, and derivatives by [pose | sensor | controls]."""
+
 def station_rows(
     points_map: Array,
     covariances: Array,

@@ -5,8 +5,9 @@ A factor holds its measurement and its keys, but no graph. It is a pure function
 
 from __future__ import annotations
 
-from collections.abc import MutableSequence, Sequence
+from collections.abc import Callable, MutableSequence, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -18,12 +19,12 @@ from .footpoint import FootPoints, foot_points
 from .linear import linear_factor
 from .noise import huber_roots, huber_weights
 from .odometry import IntegratedOdometry
-from .residuals import sigma_across
 from .se2 import rotation, to_map
-from .sensor import corrected, sensor_rows
+from .sensor import corrected
 
 JacobianList = MutableSequence[Array]
 
+POSE_SIZE = 3
 GRID_SHARE = 0.25  # coarse step of the foot-point search by the mean knot interval
 
 
@@ -43,11 +44,11 @@ def spline_projection_factors(
 ) -> list[gtsam.CustomFactor]:
     """Return a factor `e_i = n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections of each pose.
 
-    The rows are those of `project`. pose_keys (m,) are the keys of each row's own pose, and those of one pose
-    are neighbours. control_keys (k,) are the keys of all distinct control points; a factor holds those that
-    matter in the stretches [low, high] (m,), where foot points are searched for: a few metres about the
-    expected ones. points_vehicle z (m, 2) and covariances (m, 2, 2) are in the vehicle frame, and sigma_model
-    is in m. A row's weight falls beyond the whitened residual `huber`, which may be infinite.
+    The rows are those of `detection_rows`. pose_keys (m,) are the keys of each row's own pose, and those of
+    one pose are neighbours. control_keys (k,) are the keys of all distinct control points; a factor holds
+    those that matter in the stretches [low, high] (m,), where foot points are searched for: a few metres
+    about the expected ones. points_vehicle z (m, 2) and covariances (m, 2, 2) are in the vehicle frame, and
+    sigma_model is in m. A row's weight falls beyond the whitened residual `huber`, which may be infinite.
 
     With a `sensor_key`, the detections are corrected by the sensor's calibration (5,) of that key (see
     `sensor.by_sensor`), with twists (m, 3) of the vehicle in m/s, m/s and rad/s.
@@ -64,49 +65,11 @@ def spline_projection_factors(
     twists = np.zeros((len(low), 3)) if twists is None else twists
     _require_alike("poses, detections and stretches", pose_keys, points_vehicle, covariances, low, high)
     factors = []
-    for own in np.split(np.arange(len(pose_keys)), np.flatnonzero(np.diff(pose_keys)) + 1):
-        pose_key, curve = int(pose_keys[own[0]]), Curve.of(control_keys, tables, low[own], high[own])
-        measured = points_vehicle[own], covariances[own], twists[own]
-        factors.append(_projection_factor(pose_key, curve, *measured, sigma_model, huber, sensor_key))
+    for own in _of_each_pose(pose_keys):
+        seen = _Seen(int(pose_keys[own[0]]), points_vehicle[own], covariances[own], twists[own], sensor_key)
+        curve = Curve.of(control_keys, tables, low[own], high[own])
+        factors.append(_detection_factor(seen, curve, partial(_across, sigma_model), huber))
     return factors
-
-
-def _projection_factor(
-    pose_key: int,
-    curve: Curve,
-    measured: Array,
-    covariances: Array,
-    twists: Array,
-    sigma_model: float,
-    huber: float,
-    sensor_key: int | None,
-) -> gtsam.CustomFactor:
-    """Return the factor on the pose of the detections, the sensor's calibration and the control points."""
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
-        pose = values.atPose2(pose_key)
-        poses = np.tile(pose_array(pose), (len(measured), 1))
-        sensor = np.zeros(0) if sensor_key is None else np.array(values.atVector(sensor_key))
-        points = to_map(corrected(measured, twists, sensor), poses)
-        foot, residual, gradient, by_control = curve.distances(values, points)
-        sigma = sigma_across(foot.normal_unit, covariances, poses, sigma_model)
-        steepness = np.hypot(gradient[:, 0], gradient[:, 1])
-        direction = gradient / steepness[:, None]
-        by = sensor_rows(direction, residual / steepness, poses, measured, twists, sensor)
-        usable, slots = curve.usable(foot)
-        whitened = by.factor * residual / sigma
-        if H is None:
-            return np.asarray(huber_roots(whitened, huber) * usable)
-        root = np.sqrt(huber_weights(whitened, huber)) * usable
-        scale, arm = by.factor * root / sigma, points - poses[:, :2]
-        by_theta = gradient[:, 1] * arm[:, 0] - gradient[:, 0] * arm[:, 1]
-        by_pose = np.column_stack([gradient @ rotation(pose.theta()), by_theta]) * scale[:, None]
-        by_calibration = [by.by_sensor * (steepness * root / sigma)[:, None]] if len(sensor) else []
-        fill(H, [by_pose, *by_calibration, *curve.by_key(by_control * scale[:, None, None], slots)])
-        return np.asarray(whitened * root)
-
-    keys = [pose_key, *([] if sensor_key is None else [int(sensor_key)]), *curve.keys]
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(measured)), keys, error)
 
 
 def station_factors(
@@ -128,51 +91,82 @@ def station_factors(
     sigma_station (m,) along the curve, in m. The rest is as in `spline_projection_factors`.
     """
     factors = []
-    for own in np.split(np.arange(len(pose_keys)), np.flatnonzero(np.diff(pose_keys)) + 1):
-        if len(own):
-            curve = Curve.of(control_keys, tables, u[own], u[own])
-            measured = points_vehicle[own], covariances[own], twists[own]
-            at = u[own], sigma_station[own]
-            factors.append(_station_factor(int(pose_keys[own[0]]), curve, *at, *measured, huber, sensor_key))
+    for own in _of_each_pose(pose_keys):
+        seen = _Seen(int(pose_keys[own[0]]), points_vehicle[own], covariances[own], twists[own], sensor_key)
+        curve = Curve.of(control_keys, tables, u[own], u[own])
+        factors.append(_detection_factor(seen, curve, partial(_along, u[own], sigma_station[own]), huber))
     return factors
 
 
-def _station_factor(
-    pose_key: int,
-    curve: Curve,
-    u: Array,
-    sigma_station: Array,
-    measured: Array,
-    covariances: Array,
-    twists: Array,
-    huber: float,
-    sensor_key: int | None,
+def _of_each_pose(pose_keys: IntArray) -> list[IntArray]:
+    """Return the rows (k,) of each pose, given the key (m,) of each row's pose."""
+    every = np.arange(len(pose_keys))
+    return np.split(every, np.flatnonzero(np.diff(pose_keys)) + 1) if len(every) else []
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The detections of one pose."""
+
+    pose_key: int
+    measured: Array  # (m, 2) in m, vehicle frame
+    covariances: Array  # (m, 2, 2)
+    twists: Array  # (m, 3)
+    sensor_key: int | None
+
+    def at(self, values: gtsam.Values) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
+        """Return points, covariances and poses, and measured points, twists and the calibration."""
+        poses = np.tile(pose_array(values.atPose2(self.pose_key)), (len(self.measured), 1))
+        sensor = np.zeros(0) if self.sensor_key is None else np.array(values.atVector(self.sensor_key))
+        points = to_map(corrected(self.measured, self.twists, sensor), poses)
+        return (points, self.covariances, poses), (self.measured, self.twists, sensor)
+
+
+Terms = tuple[Array, Array, Array, BoolArray, IntArray]
+"""Residuals, sigmas and derivatives of rows, which of them may contribute, and the slots of their keys."""
+
+
+def _across(sigma_model: float, seen: _Seen, curve: Curve, values: gtsam.Values) -> Terms:
+    """Return the terms of detections across a curve."""
+    placed, measured = seen.at(values)
+    foot = curve.foot(values, placed[0])
+    on_curve = foot.normal_unit, foot.distance, foot.basis
+    terms = kernels.detection_rows(*placed, *on_curve, *measured, sigma_model)
+    return *terms, *curve.usable(foot)
+
+
+def _along(u: Array, sigma_station: Array, seen: _Seen, curve: Curve, values: gtsam.Values) -> Terms:
+    """Return the terms of detections at stations along a curve."""
+    placed, measured = seen.at(values)
+    basis, span = curve.tables.evaluate(u, 1)
+    value, slope = np.ascontiguousarray(basis)
+    control = curve.control_points(values)[span[:, None] + np.arange(-curve.tables.degree, 1)]
+    terms = kernels.station_rows(*placed, value, slope, control, *measured, sigma_station)
+    return *terms, np.ones(len(u), bool), curve.slots(span)
+
+
+def _detection_factor(
+    seen: _Seen, curve: Curve, terms: Callable[[_Seen, Curve, gtsam.Values], Terms], huber: float
 ) -> gtsam.CustomFactor:
     """Return the factor on the pose of the detections, the sensor's calibration and the control points."""
-    (value, slope), span = curve.tables.evaluate(u, 1)
-    columns, slots = span[:, None] + np.arange(-curve.tables.degree, 1), curve.slots(span)
+    sensor_keys = [] if seen.sensor_key is None else [int(seen.sensor_key)]
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
-        pose = values.atPose2(pose_key)
-        poses = np.tile(pose_array(pose), (len(measured), 1))
-        sensor = np.zeros(0) if sensor_key is None else np.array(values.atVector(sensor_key))
-        points, control = to_map(corrected(measured, twists, sensor), poses), curve.control_points(values)
-        basis = np.ascontiguousarray(value), np.ascontiguousarray(slope), control[columns]
-        seen = measured, twists, sensor
-        residual, sigma, J = kernels.station_rows(points, covariances, poses, *basis, *seen, sigma_station)
+        residual, sigma, J, usable, slots = terms(seen, curve, values)
         whitened = residual / sigma
         if H is None:
-            return huber_roots(whitened, huber)
-        root = np.sqrt(huber_weights(whitened, huber))
-        J *= (root / sigma)[:, None]
-        by_pose = np.column_stack([J[:, :2] @ rotation(pose.theta()), J[:, 2]])
-        by_calibration = [J[:, 3 : 3 + len(sensor)]] if len(sensor) else []
-        by_control = J[:, 3 + len(sensor) :].reshape(*slots.shape, 2)
-        fill(H, [by_pose, *by_calibration, *curve.by_key(by_control, slots)])
+            return np.asarray(huber_roots(whitened, huber) * usable)
+        root = np.sqrt(huber_weights(whitened, huber)) * usable
+        by_pose, by_sensor, by_control = np.split(
+            J * (root / sigma)[:, None], [POSE_SIZE, J.shape[1] - 2 * slots.shape[1]], axis=1
+        )
+        by_pose[:, :2] = by_pose[:, :2] @ rotation(values.atPose2(seen.pose_key).theta())
+        by_key = curve.by_key(by_control.reshape(*slots.shape, 2), slots)
+        fill(H, [by_pose, *([by_sensor] if sensor_keys else []), *by_key])
         return np.asarray(whitened * root)
 
-    keys = [pose_key, *([] if sensor_key is None else [int(sensor_key)]), *curve.keys]
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(measured)), keys, error)
+    keys = [seen.pose_key, *sensor_keys, *curve.keys]
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(seen.measured)), keys, error)
 
 
 def boundary_point_factor(
@@ -194,12 +188,13 @@ def boundary_point_factor(
     curve = Curve.of(control_keys, tables, low, high)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
-        foot, distance, _normal, by_control = curve.distances(values, points_map)
+        foot = curve.foot(values, points_map)
         usable, slots = curve.usable(foot)
         scale = usable / sigma
         if H is not None:
-            fill(H, [*curve.by_key(by_control * scale[:, None, None], slots)])
-        return np.asarray(distance * scale)
+            by_control = -foot.basis[:, :, None] * (scale[:, None] * foot.normal_unit)[:, None, :]
+            fill(H, [*curve.by_key(by_control, slots)])
+        return np.asarray(foot.distance * scale)
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(low)), list(curve.keys), error)
 
@@ -231,15 +226,10 @@ class Curve:
         distinct[self.touched] = [values.atPoint2(key) for key in self.keys]
         return np.asarray(distinct[np.arange(len(self.tables.starts) + self.tables.degree) % size])
 
-    def distances(self, values: gtsam.Values, points: Array) -> tuple[FootPoints, Array, Array, Array]:
-        """Return foot points, distances (m,), and their derivatives (m, 2) and (m, degree + 1, 2).
-
-        The derivatives are by the points (m, 2), map frame, and by the control points of each span.
-        """
+    def foot(self, values: gtsam.Values, points: Array) -> FootPoints:
+        """Return the foot points of points (m, 2), map frame, each in its stretch."""
         step = GRID_SHARE * self.tables.length / len(self.tables.starts)
-        line = self.control_points(values)
-        foot = foot_points(self.tables, line, points, self.low, self.high, step)
-        return foot, foot.distance, foot.normal_unit, -foot.basis[:, :, None] * foot.normal_unit[:, None, :]
+        return foot_points(self.tables, self.control_points(values), points, self.low, self.high, step)
 
     def usable(self, foot: FootPoints) -> tuple[BoolArray, IntArray]:
         """Return which rows (m,) may contribute, and the slots (m, p + 1) of their control points' keys."""

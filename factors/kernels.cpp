@@ -2125,6 +2125,7 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("by_sensor", &by_sensor);
   module.def("shifted", &shifted);
   module.def("to_map", &to_map);
+  module.def("detection_rows", &detection_rows);
   module.def("station_rows", &station_rows);
   module.def("placed", &placed);
   module.def("curve_rows", &curve_rows);

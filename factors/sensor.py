@@ -81,17 +81,16 @@ def sensor_rows(
     measured: Array,
     twists: Array,
     sensor: Array,
-    rates: Array | None = None,
 ) -> SensorRows:
     """Return factors `f = 1 + rates b` and derivatives `f d' R C + r rates` of residuals `r = d . (p - q)`.
 
     d (m, 2) are unit vectors in the map frame and p corrected detections, measured at (m, 2), vehicle frame,
     from poses (m, 3) with twists (m, 3). C is `by_sensor`, b the sensor's calibration (5,) or empty, and
-    `rates` (m, 2) are by default those of `range_rates`.
+    `rates` (m, 2) are `range_rates`, whose change with the direction has no derivative.
     """
     if len(sensor) == 0:
         return SensorRows(np.ones(len(residual)), np.zeros((len(residual), 0)))
-    rates = range_rates(directions, poses, measured) if rates is None else rates
+    rates = range_rates(directions, poses, measured)
     factor = 1.0 + rates @ sensor[RANGE]
     jacobian = np.einsum("mi,mik->mk", in_vehicle(directions, poses), by_sensor(measured, twists))
     jacobian *= factor[:, None]

@@ -173,11 +173,9 @@ VIEWS = {"values", "linearized", "poses", "calibrations", "mean"}
 """Arrays of numbers that other rooms write through views (docs/architecture.md, "Owners")."""
 ASSIGNED = {
     "batch.association": {"state.pose_u"},
-    "batch.mapper": {"system.settings", "system.chain", "system.revisits", "optimizer.system.revisits"},
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "eval.view.animation": {"writer.fig"},  # of matplotlib
-    "front_end.motion": {"self._rest.sigma"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
     "baselines.landmark_association": {"detections.landmark"},
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},

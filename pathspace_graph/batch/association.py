@@ -8,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.residuals import project
+from pathspace_graph.factors.residuals import sigma_across
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
@@ -148,13 +148,14 @@ def _misfit(
         in_view = _in_view(state, detections.cycle[rows], label, settings)
         begin = boundary.find(control_points, points, *in_view).u
         foot = boundary.refine(control_points, points, begin)  # it may lie somewhat beyond
-    projected = project(points, detections.covariance[rows], poses, foot, settings.spline.sigma_model)
+    sigma_model = settings.spline.sigma_model
+    sigma = sigma_across(foot.normal_unit, detections.covariance[rows], poses, sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     if boundary.periodic and not whole:  # it belongs to the nearest stretch, which another pass may be beside
         nearest = boundary.find_anywhere(control_points, points)
         distance = np.hypot(*(points - nearest.position).T) + settings.growth.merge_radius
         possible &= ~nearest.interior | (np.abs(foot.distance) < distance)
-    return np.where(possible, np.abs(foot.distance) / projected.sigma, np.inf), foot.u
+    return np.where(possible, np.abs(foot.distance) / sigma, np.inf), foot.u
 
 
 def _in_view(state: State, cycles: IntArray, label: int, settings: MapperSettings) -> tuple[Array, Array]:

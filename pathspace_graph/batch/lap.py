@@ -9,14 +9,12 @@ The batch of a lap begins at odometry and the revisit that ended the lap, and th
 """
 
 import time
-from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.factors.arrays import Array
@@ -25,23 +23,20 @@ from pathspace_graph.graph.elimination import eliminated_system, linear_graph
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import POSE, Layout, are_poses, indices, pose_keys
-from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.state import SAMPLE, State
+from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import Boundary, at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive
-from .optimizer import LOOSE_GATE, Convergence, Effort, Optimizer
-from .simplification import boundary_of, map_block, own_settings, scatter_of_cones, simplified
-from .start import aligned_odometry, start_odometry
+from .objections import speaks_against
+from .optimizer import Convergence, Effort, Optimizer
+from .simplification import boundary_of, map_block, own_settings, simplified
+from .start import start_odometry
 from .stations import StationMatches
-from .system import BatchSystem, Biweight, Evaluation, curve_gauge
+from .system import BatchSystem, Evaluation, curve_gauge
 
-WIDER: Final = 2.5  # most ratio of a boundary point's distance from the drive to the drive's beside it
-MOST_BENT: Final = 4.0  # most distance of an optimum's poses from odometry and revisits (sigmas)
-MOSTLY: Final = 95.0  # percentile of the poses' distances: the drive may begin or end off the track
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)  # so that it is in time
 FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)
 
@@ -53,6 +48,14 @@ class ClosedMap:
     splines: dict[int, BSpline]  # closed curves by label, map frame
     poses: Array  # (P, 3) poses of all cycles, map frame
     calibration: Array  # (2,) or (7,) calibration of the odometry, and of the sensor where it is estimated
+
+    def state(self, settings: MapperSettings) -> State:
+        """Return the map and the poses as a state to begin with."""
+        state = State()
+        for label, spline in self.splines.items():
+            state.add_boundary(label, *boundary_of(spline, settings))
+        add_drive(state, self.poses, self.calibration)
+        return state
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +97,9 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
     begin = time.perf_counter()
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
-        settings, detections = system.settings, system.detections
-        few, change = simplified(at.state, detections, settings)
+        simple = simplified(at.state, system.detections, system.settings)
+        few, change, scatter = simple.state, simple.change, simple.scatter
         information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
-        scatter = scatter_of_cones(few, detections, settings)
         stations = dict[int, Array]()
         if system.matches is not None:
             stations = stations_on(few, system.matches, at.state, change, dense)
@@ -113,25 +115,20 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             cones=scatter.places,
             stations=stations,
             seconds=time.perf_counter() - begin,
-            objection=disagreement(system, at.state.poses)
-            or objection(few.splines, at.state.poses, share_used(at, detections), settings),
+            objection=speaks_against(system, at, few.splines, simple.detections),
         )
 
 
 def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem, Evaluation, Convergence]:
     """Return the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
-    settings, detections, start = own_settings(lap.settings), deepcopy(lap.detections), lap.start
-    system = BatchSystem(detections, lap.chain, settings, Biweight(LOOSE_GATE))
+    start, settings = lap.start, own_settings(lap.settings)
+    revisits = [start] if isinstance(start, Revisit) else []
+    system = BatchSystem(deepcopy(lap.detections), lap.chain, settings, revisits)
     if isinstance(start, Revisit):
-        system.revisits = (start,)
-        state = start_odometry(lap.chain, detections, settings, system.revisits)
+        state, usual = start_odometry(system), FROM_ODOMETRY
     else:
-        state = State()
-        for label, spline in start.splines.items():
-            state.add_boundary(label, *boundary_of(spline, settings))
-        add_drive(state, start.poses, start.calibration)
-    effort = effort or (FROM_ODOMETRY if isinstance(start, Revisit) else FROM_MAP)
-    return system, *Optimizer(system, effort).find(state)
+        state, usual = start.state(settings), FROM_MAP
+    return system, *Optimizer(system, effort or usual).find(state)
 
 
 def marginal_of(
@@ -199,60 +196,3 @@ def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Ro
             kept = (poses & (indices(rows.keys) < first_kept)).any(axis=1) | ~poses.any(axis=1)
             before.append(rows.where(np.flatnonzero(kept)))
     return before
-
-
-# --- when a loop is believed -----------------------------------------------------------------------------
-
-
-def share_used(at: Evaluation, detections: DetectionTable) -> float:
-    """Return the share of the coloured detections of the first lap that lies on the curves of an optimum."""
-    state = at.state
-    coloured = np.isin(detections.label, list(state.boundaries))
-    again = np.ones(len(state.poses), bool)  # beside a stretch of every boundary that was driven before
-    for label, boundary in state.boundaries.items():
-        again &= state.pose_u[label] - state.pose_u[label][0] >= boundary.length
-    first = coloured & ~again[detections.cycle]
-    return float(detections.used[first].mean()) if first.any() else 0.0
-
-
-def objection(splines: Mapping[int, BSpline], poses: Array, used: float, settings: MapperSettings) -> str:
-    """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
-
-    Both boundaries are closed. They don't cross but at level crossings, the vehicle crosses neither and has
-    driven beside all of both, and a large share of the detections is `used`: it lies on them. Where cycles
-    are missing the drive is not known, so nothing is asked of the boundaries beside a step so long that a
-    point beside its middle would be too far from both poses.
-    """
-    if set(splines) != set(BOUNDARIES) or not all(spline.periodic for spline in splines.values()):
-        return "not both of its boundaries are closed"
-    driven, by_drive = poses[:, :2], KDTree(poses[:, :2])
-    if boundaries_cross(splines, SAMPLE, driven):
-        return "its boundaries cross"
-    for curve in (sampled(spline, SAMPLE) for spline in splines.values()):
-        distance, beside = map(np.asarray, KDTree(curve).query(driven))
-        aside = float(np.percentile(distance, MOSTLY))
-        missing = np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 2.0 * WIDER * aside)
-        pieces = [piece for piece in np.split(driven, missing + 1) if len(piece) > 1]
-        if any(not at_level_crossing(crossings(curve, piece), driven).all() for piece in pieces):
-            return "the vehicle would have crossed a boundary"
-        known = np.ones(len(curve), bool)
-        for first, last in zip(beside[missing], beside[missing + 1], strict=True):
-            known[np.arange(first, last if last >= first else last + len(curve)) % len(curve)] = False
-        wider = float(np.max(by_drive.query(curve[known])[0])) / aside
-        if wider > WIDER:
-            return f"a boundary would be {wider:.1f} times as far from the drive as it is beside it"
-    if used < settings.batch.closure.used:
-        return f"only {used:.0%} of the detections lie on its boundaries".replace("%", " %")
-    return ""
-
-
-def disagreement(system: BatchSystem, poses: Array) -> str:
-    """Return that the poses (P, 3) of an optimum are not those of odometry and revisits; empty if they are.
-
-    Both are estimates of one drive, so their distance is some standard deviations of the less certain one. A
-    wrong optimum bends the drive to the map, by much more.
-    """
-    if not system.revisits:
-        return ""
-    sigmas = aligned_odometry(system.chain, system.revisits).disagreement(poses)
-    return f"the poses are {sigmas:.1f} sigmas from the odometry" if sigmas > MOST_BENT else ""

@@ -15,10 +15,9 @@ from pathspace_graph.mapping.state import State
 
 from .association import associate, cone_counts, locate_poses
 from .simplification import reknot
-from .system import BatchSystem, Biweight, Evaluation, moved
+from .system import LOOSE_GATE, BatchSystem, Biweight, Evaluation, moved
 
 STATION_PASSES: Final = 2  # times that detections are matched with the cones of a closed optimum
-LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 SEARCH: Final = 20  # rounds in which associations are found anew
 SETTLE: Final = 8  # most refinements of the foot points before a step
@@ -154,8 +153,7 @@ class Optimizer:
 
     def _keep_foot_points(self, at: Evaluation) -> None:
         """Let later evaluations refine the foot points from where they are now."""
-        for projected in at.projected.values():
-            self.system.detections.refine(projected.rows, projected.foot.u)
+        self.system.detections.refine(at.across.rows, at.u)
 
     def _movement(self, before: State, after: State) -> float:
         """Return how far a curve has moved across itself (m), as the poses beside it see it."""

@@ -3,6 +3,7 @@
 Simplification: the optimum's curves on few knots, their covariance, and how far cones lie from them.
 """
 
+from copy import deepcopy
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Final
 
@@ -98,55 +99,6 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
     )
 
 
-# --- simplification --------------------------------------------------------------------------------------
-
-
-def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> tuple[State, Array]:
-    """Return the same poses beside curves on few knots, and the change F (k, n) of the control points.
-
-    The paper's Simplification: `C_new = F C_old`, so the covariance is `F Sigma F'`. The optimum isn't solved
-    for on few knots: such a curve passes its cones by a decimetre, on the same side in every lap, which turns
-    vehicle and map by up to a degree in the first seconds. The detections are associated with the new curves.
-    """
-    few = reknot(state, detections, settings)
-    change = np.zeros((few.map_points.size, state.map_points.size))
-    for label, boundary in state.boundaries.items():
-        new, new_points = few.boundaries[label], few.control_points(label)
-        F = new_from_old(boundary, state.control_points(label), new, new_points)
-        change[map_block(few, label), map_block(state, label)] = np.kron(F, np.eye(POINT))
-    locate_poses(few)
-    associate(few, detections, settings, settings.batch.gate, strict=True)
-    return few, change
-
-
-def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
-    """Return F (m_new, m_old): least squares over points of the old curve and their feet on the new."""
-    splines = old.spline(old_points), new.spline(new_points)
-    if new.periodic:
-
-        def nearest_on_new(u: Array) -> Array:
-            return new.find_anywhere(new_points, old.evaluate(old_points, u)).u
-
-        return refit(*splines, nearest_on_new).new_from_old
-    # an open curve that passes the same cones again lies on itself, so it is searched near the same place
-    ends, quarter = np.array([new.tables.low, new.tables.high]), 0.25 * (old.tables.high - old.tables.low)
-    low = np.array([old.tables.low, old.tables.high - quarter])
-    first, last = old.find(old_points, new.evaluate(new_points, ends), low, low + quarter).u.tolist()
-    room = ALIKE[0] + ALIKE[1] * (ends[1] - ends[0])
-
-    def foot_on_new(u: Array) -> Array:
-        alike = ends[0] + (u - first) * (ends[1] - ends[0]) / (last - first)
-        low, high = (np.clip(alike + side * room, *ends) for side in (-1.0, 1.0))
-        return new.find(new_points, old.evaluate(old_points, u), low, high).u
-
-    return refit(*splines, foot_on_new, (first, last)).new_from_old
-
-
-def map_block(state: State, label: int) -> slice:
-    """Return where the control points of a boundary are in a joint covariance of all boundaries."""
-    return Layout(state.map_keys).block(CONTROL_LETTERS[label])
-
-
 # --- scatter ---------------------------------------------------------------------------------------------
 
 
@@ -223,3 +175,63 @@ def cross_validated(points: Array, periodic: bool, settings: MapperSettings, sha
 def _rms(parts: list[Array]) -> float:
     values = np.concatenate([np.zeros(0), *parts])
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+
+# --- simplification --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Simplified:
+    """The poses of an optimum beside curves on few knots."""
+
+    state: State
+    change: Array  # F (k, n) of all control points
+    detections: DetectionTable  # a copy, associated with these curves
+    scatter: Scatter
+
+
+def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> Simplified:
+    """Return the same poses beside curves on few knots.
+
+    The paper's Simplification: `C_new = F C_old`, so the covariance is `F Sigma F'`. The optimum isn't solved
+    for on few knots: such a curve passes its cones by a decimetre, on the same side in every lap, which turns
+    vehicle and map by up to a degree in the first seconds. The detections are associated with the new curves.
+    """
+    few = reknot(state, detections, settings)
+    change = np.zeros((few.map_points.size, state.map_points.size))
+    for label, boundary in state.boundaries.items():
+        new, new_points = few.boundaries[label], few.control_points(label)
+        F = new_from_old(boundary, state.control_points(label), new, new_points)
+        change[map_block(few, label), map_block(state, label)] = np.kron(F, np.eye(POINT))
+    detections = deepcopy(detections)
+    locate_poses(few)
+    associate(few, detections, settings, settings.batch.gate, strict=True)
+    return Simplified(few, change, detections, scatter_of_cones(few, detections, settings))
+
+
+def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
+    """Return F (m_new, m_old): least squares over points of the old curve and their feet on the new."""
+    splines = old.spline(old_points), new.spline(new_points)
+    if new.periodic:
+
+        def nearest_on_new(u: Array) -> Array:
+            return new.find_anywhere(new_points, old.evaluate(old_points, u)).u
+
+        return refit(*splines, nearest_on_new).new_from_old
+    # an open curve that passes the same cones again lies on itself, so it is searched near the same place
+    ends, quarter = np.array([new.tables.low, new.tables.high]), 0.25 * (old.tables.high - old.tables.low)
+    low = np.array([old.tables.low, old.tables.high - quarter])
+    first, last = old.find(old_points, new.evaluate(new_points, ends), low, low + quarter).u.tolist()
+    room = ALIKE[0] + ALIKE[1] * (ends[1] - ends[0])
+
+    def foot_on_new(u: Array) -> Array:
+        alike = ends[0] + (u - first) * (ends[1] - ends[0]) / (last - first)
+        low, high = (np.clip(alike + side * room, *ends) for side in (-1.0, 1.0))
+        return new.find(new_points, old.evaluate(old_points, u), low, high).u
+
+    return refit(*splines, foot_on_new, (first, last)).new_from_old
+
+
+def map_block(state: State, label: int) -> slice:
+    """Return where the control points of a boundary are in a joint covariance of all boundaries."""
+    return Layout(state.map_keys).block(CONTROL_LETTERS[label])

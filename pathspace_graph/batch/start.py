@@ -14,6 +14,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import path_lengths, rotated, to_map
+from pathspace_graph.front_end.front_end import JudgedLog
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph
 from pathspace_graph.graph.relative import Revisit
@@ -37,6 +38,7 @@ from pathspace_graph.spline.boundary import Boundary
 
 from .association import MIN_CONES, add_drive, cluster
 from .simplification import boundary_of, exact_settings, fit_through
+from .system import BatchSystem
 
 ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the passes of a place together
 ALIGN_TOLERANCE: Final = 1e-2  # largest move of a step at which they are together (m, rad)
@@ -83,17 +85,17 @@ def unwrap(poses: Array) -> Array:
 # --- from odometry ---------------------------------------------------------------------------------------
 
 
-def start_odometry(
-    chain: LogOdometry,
-    detections: DetectionTable,
-    settings: MapperSettings,
-    revisits: Sequence[Revisit] = (),
-) -> State:
+def start_odometry(system: BatchSystem) -> State:
     """Return poses by odometry and revisits, and curves through the cones that were seen in the first lap.
 
     The curves are closed if there is a revisit: the first one ends a lap.
     """
-    aligned, calibration, state = aligned_odometry(chain, revisits), np.array(settings.calibrations), State()
+    detections, settings, revisits = system.detections, system.settings, system.revisits
+    aligned, calibration, state = (
+        aligned_odometry(system.chain, revisits),
+        np.array(settings.calibrations),
+        State(),
+    )
     calibration[:CALIBRATION_SIZE] = aligned.calibration
     detections.correct(calibration[CALIBRATION_SIZE:])
     lap = length_of_lap(aligned.poses, revisits[0]) if revisits else np.inf
@@ -159,14 +161,23 @@ def aligned_odometry(chain: LogOdometry, revisits: Sequence[Revisit]) -> Aligned
     return aligned
 
 
-def find_revisits(
-    chain: LogOdometry, table: DetectionColumns, settings: MapperSettings
-) -> tuple[Revisit, ...]:
+def all_cones(judged: JudgedLog) -> DetectionColumns:
+    """Return the detections of all cones of a log, corrected by the sensor's calibration as it is known."""
+    pairs = zip(judged.cycles, judged.orange, strict=True)
+    table = DetectionColumns.of([one.with_others(other) for one, other in pairs], twists=judged.chain.twists)
+    calibration = judged.settings.calibration
+    table.correct(np.array(calibration.means) if calibration.sensor else np.zeros(0))
+    return table
+
+
+def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
     """Return the revisits of a whole drive by its cones: the first return to its beginning, and later ones.
 
     Before the first return the poses are dead reckoned, so it has to be sure. Each revisit aligns the poses,
     and the next is searched for `INTERVAL` metres later, nearby.
     """
+
+    chain, settings, table = judged.chain, judged.settings, all_cones(judged)
 
     def seen_in(cycles: IntArray) -> DetectionColumns:
         return table.where(np.flatnonzero(table.in_cycles(cycles)))

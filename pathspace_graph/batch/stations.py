@@ -85,13 +85,11 @@ class SeenAgain:
     @classmethod
     def of(cls, state: State, detections: DetectionTable, curve: CurveStations) -> Self:
         """Choose the detections in use on a curve."""
-        label, boundary = curve.label, state.boundaries[curve.label]
+        label = curve.label
         rows = detections.used_on(label)
         rows = rows[detections.label[rows] == label]
         u, cycle = detections.u[rows], detections.cycle[rows]
-        tangent = boundary.evaluate(state.control_points(label), u, 1)
-        tangent /= np.hypot(*tangent.T)[:, None]
-        poses = state.variables.poses_at(cycle)
+        tangent, poses = state.spline(label).tangent_unit(u), state.variables.poses_at(cycle)
         sigma = sigma_across(tangent, detections.covariance[rows], poses, 0.0)
         again = laps_of(state, detections, label)[rows] > 0
         block = (path_lengths(state.poses)[cycle] // BLOCK).astype(np.intp)

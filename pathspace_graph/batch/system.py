@@ -1,43 +1,42 @@
 """The least-squares problem of a whole log: its cost at a state, and its linear factors there."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import gtsam
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.residuals import ProjectionRows, project, smoothness_matrix
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.footpoint import refine_joint_foot_points
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.factors.sensor import SensorRows, range_rates, sensor_rows
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import POINT, POSE, SENSOR_KEY, Layout, are_poses, indices, pose_keys
+from pathspace_graph.graph.variables import POINT, Layout, are_poses, pose_keys
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, rows_across
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.mapping.stations import Stations
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import headings
 from .stations import StationMatches, match_stations
 
+LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 SIGMA_SLIDE: Final = 2.0
 """Standard deviation of a control point's slide along its curve from beside its first pose (m), where
 stations hold it there."""
-POINTS_A_FACTOR: Final = 8  # neighbouring control points in one factor of their anchors; only for speed
 
 
 @dataclass(frozen=True, eq=False)
 class CurveGauge:
-    """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` and `R_k' D c / sigma_smoothness` of a curve.
+    """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` of a curve's control points c_j.
 
-    p_k is the position of the pose that control point c_j began beside, h_k its heading, R_k its rotation,
-    and D is `smoothness_matrix`. Detections constrain nothing along a curve, so control points would slide
-    along it; held beside a pose they don't, and the map is as free as before.
+    p_k is the position of the pose that control point c_j began beside, and h_k its heading. Detections
+    constrain nothing along a curve, so control points would slide along it; held beside a pose they don't,
+    and the map is as free as before.
     """
 
     label: int
@@ -45,9 +44,6 @@ class CurveGauge:
     cycle: IntArray  # perception cycles (m,) of the poses beside them
     ahead: Array  # distances (m,) of the control points ahead of their poses (m)
     sigma: float  # standard deviation of that distance (m)
-    smoothness: Array  # D (r, m)
-    sigma_smoothness: float  # standard deviation of a second difference (m)
-    sigma_anchor: float  # that holds each control point where it is linearized (m), without any cost
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
         """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives."""
@@ -57,60 +53,15 @@ class CurveGauge:
         residual = (heading * arm).sum(axis=1) - self.ahead / self.sigma
         return residual, heading, np.column_stack([-heading, by_theta])
 
-    def beside(self, control_points: Array, poses: Array) -> Rows:
+    def rows(self, control_points: Array, poses: Array) -> Rows:
         """Return `terms` as rows on [control point | pose], from all poses (P, 3)."""
         residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
         jacobian = np.column_stack([by_point, by_pose])
         return Rows(self._keys_beside, jacobian, residual, owners(self.cycle, self.label))
 
-    def bending(self, control_points: Array, poses: Array) -> tuple[Array, Array, Array]:
-        """Return the second differences as the poses beside their middles see them, whitened (r, 2).
-
-        Also return their derivatives by the three control points (r, 2, 6) and by the pose (r, 2, 3). In the
-        map frame they would turn with the map, and Gauss-Newton would take that turn for a change of shape.
-        """
-        neighbours, theta = self.neighbours, poses[self.middle_cycle, 2]
-        c, s = np.cos(theta), np.sin(theta)
-        back = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
-        weights = np.take_along_axis(self.smoothness, neighbours, axis=1) / self.sigma_smoothness
-        in_map = (weights[:, :, None] * control_points[neighbours]).sum(axis=1)
-        residual = (back @ in_map[:, :, None])[:, :, 0]
-        by_control = weights[:, None, :, None] * back[:, :, None, :]
-        by_pose = np.zeros((len(residual), POINT, POSE))
-        by_pose[:, 0, 2], by_pose[:, 1, 2] = residual[:, 1], -residual[:, 0]
-        return residual, by_control.reshape(len(residual), POINT, -1), by_pose
-
-    def smooth(self, control_points: Array, poses: Array) -> Rows:
-        """Return `bending` as rows on [three control points | pose], two rows for each second difference."""
-        residual, by_control, by_pose = self.bending(control_points, poses)
-        keys = np.column_stack([self.keys[self.neighbours], pose_keys(self.middle_cycle)])
-        return Rows(
-            keys=np.repeat(keys, POINT, axis=0),
-            jacobian=np.concatenate([by_control, by_pose], axis=2).reshape(residual.size, -1),
-            residual=residual.ravel(),
-            owner=np.repeat(owners(self.middle_cycle, self.label), POINT),
-        )
-
-    @property
-    def neighbours(self) -> IntArray:
-        """Return the three control points (r, 3) of each second difference, by index."""
-        return np.asarray((np.arange(len(self.smoothness))[:, None] + np.arange(3)) % len(self.keys))
-
-    @property
-    def middle_cycle(self) -> IntArray:
-        """Return the cycle (r,) of the pose beside the middle of each second difference."""
-        return np.asarray(self.cycle[self.neighbours[:, 1]])
-
     @property
     def _keys_beside(self) -> IntArray:
         return np.column_stack([self.keys, pose_keys(self.cycle)])
-
-    def anchor(self) -> Rows:
-        """Return rows that hold each control point where it is."""
-        keys = np.repeat(self.keys, POINT)
-        jacobian = np.tile(np.eye(POINT), (len(self.keys), 1)) / self.sigma_anchor
-        owner = np.asarray(-1 - self.label - 2 * (indices(keys) // POINTS_A_FACTOR))
-        return Rows(keys[:, None], jacobian, np.zeros(len(keys)), owner)
 
     def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
         """Return rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
@@ -131,34 +82,20 @@ class CurveGauge:
         before, after = poses[self.cycle], poses_after[self.cycle]
         return after[:, :2] + turned(control_points - before[:, :2], after[:, 2] - before[:, 2])
 
-    def cost(self, control_points: Array, poses: Array) -> float:
-        """Return half the sum of the squared residuals at control points (m, 2) and all poses (P, 3)."""
-        beside, _, _ = self.terms(control_points, poses[self.cycle])
-        smooth = self.smoothness @ control_points / self.sigma_smoothness
-        return 0.5 * float(beside @ beside + (smooth**2).sum())
-
 
 def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
     """Return the gauge that holds each control point where it is, beside a pose of a cycle before `until`."""
-    boundary, control_points, poses = state.boundaries[label], state.control_points(label), state.poses
-    mean_spacing = boundary.length / (len(boundary.knots) - 2 * boundary.degree - 1)
-    cycle = _nearest_poses(state, label, until, mean_spacing)
-    return CurveGauge(
-        label=label,
-        keys=state.keys(label),
-        cycle=cycle,
-        ahead=(headings(poses[cycle]) * (control_points - poses[cycle, :2])).sum(axis=1),
-        sigma=sigma,
-        smoothness=smoothness_matrix(boundary.abscissae, boundary.length if boundary.periodic else None),
-        sigma_smoothness=boundary.gauge.sigma_smoothness * mean_spacing,
-        sigma_anchor=boundary.gauge.sigma_anchor,
-    )
+    control_points, cycle = state.control_points(label), _nearest_poses(state, label, until)
+    beside = state.poses[cycle]
+    ahead = (headings(beside) * (control_points - beside[:, :2])).sum(axis=1)
+    return CurveGauge(label, state.keys(label), cycle, ahead, sigma)
 
 
-def _nearest_poses(state: State, label: int, until: int | None, room: float) -> IntArray:
+def _nearest_poses(state: State, label: int, until: int | None) -> IntArray:
     """Return (m,) the pose nearest to where each control point acts, of those with the curve's direction.
 
-    On an open curve, which may have drifted over itself, it is within `room` (m) of the nearest along it.
+    On an open curve, which may have drifted over itself, it is within the mean distance of control points of
+    the nearest along it.
     """
     boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
     u = boundary.abscissae
@@ -169,6 +106,7 @@ def _nearest_poses(state: State, label: int, until: int | None, room: float) -> 
     square[along <= 0.0] += square.max(initial=0.0)
     if not boundary.periodic:
         away = np.abs(u[:, None] - state.pose_u[label][:until])
+        room = float(np.mean(boundary.nominal))
         square[away > away.min(axis=1, keepdims=True) + room] = np.inf
     return np.asarray(square.argmin(axis=1))
 
@@ -195,60 +133,13 @@ class Biweight:
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
-    """The m detections that are used on one boundary, projected on its curve at a state.
-
-    A round holds `sigma` and `inside`: the cost does not jump where an open end slides past a detection.
-    """
-
-    rows: IntArray  # rows (m,) of the detections in their table
-    foot: FootPoints
-    projection: ProjectionRows
-    sigma: Array  # standard deviations (m,) across the curve in m
-    inside: BoolArray  # whether each foot point (m,) was inside the curve when the round began
-    by: SensorRows  # derivatives of the residuals by the calibration of the sensor
-
-    @property
-    def whitened(self) -> Array:
-        """Return the residuals (m,) in sigmas."""
-        return np.asarray(self.by.factor * self.projection.residual / self.sigma)
-
-
-@dataclass(frozen=True, eq=False)
-class AlongStations:
-    """The m used detections that have a station, along their curves at a state; not whitened."""
-
-    stations: Stations
-    detection: IntArray  # (m,) rows in the table of detections
-    station: IntArray  # (m,) station of each
-    keys: IntArray  # (m, k) of [pose | sensor | control points]
-    residual: Array  # (m,) distances beyond the stations (m)
-    sigma: Array  # (m,) standard deviations (m)
-    jacobian: Array  # (m, n)
-
-    @property
-    def whitened(self) -> Array:
-        """Return the residuals (m,) in sigmas."""
-        return np.asarray(self.residual / self.sigma)
-
-    def scale(self, kernel: Biweight) -> Array:
-        """Return the factor (m,) that whitens and weights each row (1/m)."""
-        return np.asarray(np.sqrt(kernel.weights(self.whitened)) / self.sigma)
-
-    def rows(self, kernel: Biweight, cycle: IntArray) -> Rows:
-        """Return whitened rows with robust weights of detections in cycles (m,)."""
-        scale = self.scale(kernel)
-        owner = owners(cycle, self.stations.label[self.station])
-        return Rows(self.keys, self.jacobian * scale[:, None], self.residual * scale, owner)
-
-
-@dataclass(frozen=True, eq=False)
 class Evaluation:
     """Problem at one state."""
 
     state: State
-    projected: dict[int, Projected]  # used detections of each boundary
-    along: AlongStations | None  # used detections at their stations
+    across: DetectionRows  # used detections across the curves; those beyond an end say nothing
+    u: Array  # (m,) parameters of their foot points (m)
+    along: DetectionRows  # used detections at their stations
     drive: list[Rows]  # rows of odometry, priors and revisits
     cost: float  # half the sum of squares, with the robust losses of the detections
 
@@ -257,15 +148,25 @@ class BatchSystem:
     """Problem of minimizing `sum rho(detections) + 1/2 |odometry, revisits, gauge, priors|^2`."""
 
     def __init__(
-        self, detections: DetectionTable, chain: LogOdometry, settings: MapperSettings, kernel: Biweight
+        self,
+        detections: DetectionTable,
+        chain: LogOdometry,
+        settings: MapperSettings,
+        revisits: Sequence[Revisit] = (),
     ) -> None:
-        self.detections, self.chain = detections, chain
-        self.settings, self.kernel = settings, kernel
-        self.gauges: dict[int, CurveGauge] = {}  # weak priors of each boundary
-        self.revisits: tuple[Revisit, ...] = ()  # where an open road was driven twice
+        self.detections = detections
+        self.chain = chain
+        self.settings = settings
+        self.revisits = tuple(revisits)  # where the road was driven twice
+        self.kernel = Biweight(LOOSE_GATE)
+        self.gauges: dict[int, CurveGauge] = {}  # of each boundary
         self.matches: StationMatches | None = None  # cones of closed curves, where they hold detections
-        count = len(detections)
-        self._sigma, self._inside, self._rates = np.ones(count), np.ones(count, bool), np.zeros((count, 2))
+        self._sigma = np.ones(len(detections))  # across the curves, of this round (m)
+
+    def widen_priors(self, settings: MapperSettings) -> None:
+        """Take the priors of the calibrations from other settings."""
+        self.settings = settings
+        self.chain = replace(self.chain, calibration_sigma=np.array(settings.odometry.sigmas))
 
     def begin(self, state: State, stations: bool = False) -> None:
         """Make the gauges anew, which hold the control points where they are now, when knots have changed.
@@ -286,77 +187,53 @@ class BatchSystem:
         `hold` sets what later evaluations keep. That the sigma depends on the curve's direction has no
         derivative.
         """
-        projected = {label: self._project(state, label, hold) for label in state.boundaries}
         drive = self.chain.rows_at(state.variables, self.settings.calibration)
         drive += [one.rows(state.poses) for one in self.revisits]
-        used = sum(int(p.inside.sum()) for p in projected.values())
-        losses = sum(float(self.kernel.loss(p.whitened[p.inside]).sum()) for p in projected.values())
-        at_gate = self.kernel.gate**2 / 6.0  # the loss of a detection that isn't used
-        cost = losses + at_gate * (len(self.detections) - used) + half_square(drive)
-        along = self._along(state) if self.matches else None
-        if along is not None:
-            cost += float(self.kernel.loss(along.whitened).sum())
-        gauges = (self.gauges[b].cost(state.control_points(b), state.poses) for b in state.boundaries)
-        return Evaluation(state, projected, along, drive, cost + sum(gauges))
+        across, u = self._across(state, hold) if state.boundaries else (NO_ROWS, np.zeros(0))
+        along = self._along(state, self.matches) if self.matches else NO_ROWS
+        unused = len(self.detections) - int(np.isfinite(across.sigma).sum())
+        cost = half_square(drive) + unused * self.kernel.gate**2 / 6.0  # the loss of one at the gate
+        cost += sum(float(self.kernel.loss(seen.whitened).sum()) for seen in (across, along))
+        cost += half_square(self._priors(state, self.gauges))
+        return Evaluation(state, across, u, along, drive, cost)
 
-    def _along(self, state: State) -> AlongStations:
-        """Return the matched detections that are in use."""
-        assert self.matches is not None
-        stations, (rows, station, sigma) = self.matches.stations, self.matches.used(self.detections)
-        keys, residual, _, jacobian = stations.rows(state, self.detections, rows, station, sigma)
-        return AlongStations(stations, rows, station, keys, residual, sigma, jacobian)
+    def _across(self, state: State, hold: bool) -> tuple[DetectionRows, Array]:
+        """Return the used detections across the curves, and the parameters (m,) of their foot points.
 
-    def _project(self, state: State, label: int, hold: bool) -> Projected:
-        detections, sensor = self.detections, state.variables.sensor
-        rows = detections.used_on(label)
-        measured, twists = detections.measured[rows], detections.twist[rows]
-        poses = state.variables.poses_at(detections.cycle[rows])
-        points = to_map(detections.corrected(rows, sensor), poses)
-        foot = state.boundaries[label].refine(state.control_points(label), points, detections.u[rows])
-        sigma_model = self.settings.spline.sigma_model
-        projection = project(points, detections.covariance[rows], poses, foot, sigma_model)
+        A round holds the sigmas, and whether a foot point is inside its curve: the cost does not jump where
+        an open end slides past a detection.
+        """
+        detections, curves = self.detections, state.curves
+        rows = np.flatnonzero(detections.used)
+        points, u = detections.points_map(rows, state.variables), detections.u[rows]
+        curve, s = curves.labels.searchsorted(detections.boundary[rows]), curves.boundaries[0].settings
+        stretch = u, u - s.refine_room, np.minimum(u + s.refine_room, curves.trusted[curve])
+        foot = refine_joint_foot_points(
+            curves.spans, state.map_points, points, curve, *stretch, s.refine_iterations
+        )
+        seen = rows_across(state, detections, rows, points, foot, self.settings.spline.sigma_model)
         if hold:
-            self._sigma[rows], self._inside[rows] = projection.sigma, foot.interior
-            self._rates[rows] = range_rates(foot.normal_unit, poses, measured)
-        rates = self._rates[rows]
-        by = sensor_rows(foot.normal_unit, foot.distance, poses, measured, twists, sensor, rates)
-        return Projected(rows, foot, projection, self._sigma[rows], self._inside[rows], by)
+            self._sigma[rows] = np.where(foot.interior, seen.sigma, np.inf)
+        return replace(seen, sigma=self._sigma[rows]), foot.u
+
+    def _along(self, state: State, matches: StationMatches) -> DetectionRows:
+        """Return the matched detections that are in use, with the sigmas that they were matched by."""
+        rows, station, sigma = matches.used(self.detections)
+        return replace(matches.stations.rows(state, self.detections, rows, station, sigma), sigma=sigma)
 
     def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
         """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights."""
-        state = at.state
         groups = [*at.drive]
-        if at.along is not None:
-            groups.append(at.along.rows(self.kernel, self.detections.cycle[at.along.detection]))
-        for label, gauge in (gauges or self.gauges).items():
-            points = state.control_points(label)
-            groups += [
-                self.detection_rows(at, label),
-                gauge.beside(points, state.poses),
-                gauge.smooth(points, state.poses),
-                gauge.anchor(),
-            ]
-        return groups
+        for seen in (at.along, at.across):
+            owner = owners(self.detections.cycle[seen.rows], self.detections.boundary[seen.rows])
+            groups.append(seen.weighted(self.kernel.weights(seen.whitened), owner))
+        return groups + self._priors(at.state, gauges or self.gauges)
 
-    def detection_rows(self, at: Evaluation, label: int) -> Rows:
-        """Return the rows of the used detections on [sensor | control points of their span | pose]."""
-        p, state = at.projected[label], at.state
-        cycle, scale, factor = self.detections.cycle[p.rows], self.scale(p), p.by.factor[:, None]
-        control = state.keys(label)[state.boundaries[label].columns(p.foot.span)]
-        by_control = p.projection.by_control.reshape(len(cycle), 2 * control.shape[1])
-        jacobian = [p.by.by_sensor, factor * by_control, factor * p.projection.by_pose]
-        sensor = [np.full_like(cycle, SENSOR_KEY)] if len(state.variables.sensor) else []
-        return Rows(
-            keys=np.column_stack([*sensor, control, pose_keys(cycle)]),
-            jacobian=np.concatenate(jacobian, axis=1) * scale[:, None],
-            residual=p.by.factor * p.projection.residual * scale,
-            owner=owners(cycle, label),
-        )
-
-    def scale(self, projected: Projected) -> Array:
-        """Return the factor (m,) that whitens and weights each row (1/m), zero for those not inside."""
-        root = np.sqrt(self.kernel.weights(projected.whitened))
-        return np.asarray(root * projected.inside / projected.sigma)
+    def _priors(self, state: State, gauges: Mapping[int, CurveGauge]) -> list[Rows]:
+        """Return the weak priors: the gauges, and as online the smoothness and anchors of control points."""
+        beside = [gauge.rows(state.control_points(label), state.poses) for label, gauge in gauges.items()]
+        on_points = CurveMap(self.settings, state).linear_gauge(whole=True)
+        return beside + [replace(rows, owner=-1 - rows.owner) for rows in on_points]
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return all rows as a linear graph, whose solution is the change from the state."""

@@ -16,7 +16,7 @@ from typing import Final, Self
 import numpy as np
 
 from pathspace_graph.factors import _kernels as kernels
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import (
     compose,
     path_lengths,
@@ -143,18 +143,18 @@ def _best(poses: Array, informations: Array, squares: Array, counts: Array, away
     """
     misfit = squares / np.maximum(counts, 1.0)
     enough = np.where(counts >= MIN_CONES, misfit, inf)
-    others = enough[_are_apart(poses, int(enough.argmin()))]
-    unseen = min(float(others.min(initial=inf)), UNSEEN)
+    _, unseen = _best_and_next(enough, poses, UNSEEN)
     costs = squares + unseen * (total - counts) + np.minimum(away, FAILED)
-    best = int(costs.argmin())
-    new_road = FAILED + unseen * total
-    odds = costs[_are_apart(poses, best)].min(initial=new_road) - costs[best]
-    return Laid(poses[best], informations[best], int(counts[best]), float(misfit[best]), float(odds))
+    best, rival = _best_and_next(costs, poses, FAILED + unseen * total)  # which may be new road
+    odds = float(rival - costs[best])
+    return Laid(poses[best], informations[best], int(counts[best]), float(misfit[best]), odds)
 
 
-def _are_apart(poses: Array, place: int) -> BoolArray:
-    """Return which of the poses (m, 3) are other places than one of them."""
-    return np.asarray(np.hypot(*(poses[:, :2] - poses[place, :2]).T) > APART)
+def _best_and_next(values: Array, poses: Array, limit: float) -> tuple[int, float]:
+    """Return the pose (of m) with the least value, and the least value of another place, up to a limit."""
+    best = int(values.argmin())
+    others = np.hypot(*(poses[:, :2] - poses[best, :2]).T) > APART
+    return best, float(values[others].min(initial=limit))
 
 
 def _views(poses: Array, points: Array) -> Array:

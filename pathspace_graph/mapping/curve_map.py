@@ -83,9 +83,9 @@ class CurveMap:
             return []
         station = detections.station[rows]
         sigma_station = self.sigma_stations(station)
-        keys, residual, sigma, jacobian = stations.rows(self.state, detections, rows, station, sigma_station)
-        weight = np.sqrt(huber_weights(residual / sigma, self.settings.gate.huber)) / sigma
-        return [Rows(keys, jacobian * weight[:, None], residual * weight, detections.cycle[rows])]
+        seen = stations.rows(self.state, detections, rows, station, sigma_station)
+        weights = huber_weights(seen.whitened, self.settings.gate.huber)
+        return [seen.weighted(weights, detections.cycle[rows])]
 
     def sigma_stations(self, station: IntArray) -> Array:
         """Return the standard deviations (m,) of stations (m,) along their curves, in each detection (m).

@@ -13,8 +13,8 @@ import numpy as np
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY
 
+from .detection_rows import DetectionRows, measuring_keys
 from .detections import NO_STATION, DetectionTable
 from .state import State
 
@@ -94,17 +94,14 @@ class Stations:
 
     def rows(
         self, state: State, detections: DetectionTable, rows: IntArray, station: IntArray, sigma: Array
-    ) -> tuple[IntArray, Array, Array, Array]:
-        """Return keys, residuals (m,), sigmas (m,) and derivatives of detections (m,) at stations (m,).
+    ) -> DetectionRows:
+        """Return `t . (R z + t - S(u))` of detections (m,) at stations (m,), whose sigmas (m,) are in m.
 
-        As `residuals:station_rows`, on [pose | sensor | control points]; sigma (m,) are those of the stations
-        in m.
+        The terms are those of `factors._kernels:station_rows`.
         """
-        cycle, variables = detections.cycle[rows], state.variables
-        columns, sensor = self.columns[station], variables.sensor
-        measuring = np.array([FIRST_POSE, SENSOR_KEY]) + np.outer(cycle, [1, 0])
-        keys = np.concatenate([measuring[:, : 2 if len(sensor) else 1], state.map_keys[columns]], axis=1)
-        residual, sigma, jacobian = kernels.station_rows(
+        cycle, variables, columns = detections.cycle[rows], state.variables, self.columns[station]
+        keys = np.concatenate([measuring_keys(cycle, variables), state.map_keys[columns]], axis=1)
+        terms = kernels.station_rows(
             detections.points_map(rows, variables),
             detections.covariance[rows],
             variables.poses_at(cycle),
@@ -113,7 +110,7 @@ class Stations:
             state.map_points[columns],
             detections.measured[rows],
             detections.twist[rows],
-            sensor,
+            variables.sensor,
             sigma,
         )
-        return keys, residual, sigma, jacobian
+        return DetectionRows(rows, keys, *terms)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import objection, share_used
-from pathspace_graph.batch.mapper import BatchMapper, all_cones, find_closed_optimum
-from pathspace_graph.batch.optimizer import LOOSE_GATE, Optimizer
+from pathspace_graph.batch.mapper import BatchMapper, find_closed_optimum
+from pathspace_graph.batch.objections import objection, share_used
+from pathspace_graph.batch.optimizer import Optimizer
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import find_revisits
-from pathspace_graph.batch.system import BatchSystem, Biweight
+from pathspace_graph.batch.system import BatchSystem
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
@@ -46,11 +46,11 @@ def test_a_course_that_is_driven_again_is_closed() -> None:
     """The detections of both laps lie on its curves."""
     judged = judge_log(driven(1.4), driven(1.4).noise, SETTINGS)
     detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
-    optimizer = Optimizer(BatchSystem(detections, judged.chain, SETTINGS, Biweight(LOOSE_GATE)))
-    found = find_closed_optimum(optimizer, find_revisits(judged.chain, all_cones(judged), SETTINGS))
+    system = BatchSystem(detections, judged.chain, SETTINGS, find_revisits(judged))
+    found = find_closed_optimum(Optimizer(system))
     assert found is not None
-    at, convergence = found
-    assert convergence.converged
+    at = found.at
+    assert found.convergence.converged
     assert all(boundary.periodic for boundary in at.state.boundaries.values())
     assert share_used(at, detections) > 0.95
     release = np.flatnonzero(detections.boundary == LEFT)

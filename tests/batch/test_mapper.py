@@ -14,7 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch import mapper as batch_mapper
-from pathspace_graph.batch.mapper import BatchMapper, BatchResult, unmapped
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
+from pathspace_graph.batch.objections import unmapped
 from pathspace_graph.batch.optimizer import Convergence, Effort, Optimizer
 from pathspace_graph.batch.system import Evaluation
 from pathspace_graph.cli import main
@@ -70,9 +71,7 @@ def test_a_closed_track_is_mapped_within_the_noise(start: Start) -> None:
 def cost_of_a_row(result: BatchResult) -> float:
     """Returns the cost over the number of rows across and along the curves."""
     at = result.optimum
-    assert at.along is not None
-    across = sum(len(projected.rows) for projected in at.projected.values())
-    return result.convergence.cost / (across + len(at.along.detection))
+    return result.convergence.cost / (len(at.across.rows) + len(at.along.rows))
 
 
 def test_both_starts_come_to_one_optimum() -> None:
@@ -237,7 +236,7 @@ def test_a_map_that_lacks_the_cones_of_a_part_of_the_drive_is_objected_to() -> N
 def test_a_map_that_is_objected_to_is_written_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("pathspace_graph.batch.mapper.MISSES", 0.0)
+    monkeypatch.setattr("pathspace_graph.batch.objections.MISS_SHARE", 0.0)
     write_log(bean(), tmp_path / "log")
     arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
     with pytest.raises(SystemExit) as end:

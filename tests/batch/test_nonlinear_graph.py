@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.mapper import BatchMapper, BatchResult, beside_of, factor_beside, nonlinear_graph
+from pathspace_graph.batch.gtsam_graph import factor_beside, nonlinear_graph
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.system import Evaluation
 from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.factors.se2 import rotation
@@ -148,7 +149,7 @@ def test_levenberg_marquardt_finds_the_same_optimum() -> None:
 
 def test_a_control_point_beside_its_pose_has_right_jacobians() -> None:
     gauge = straight()[0].gauges[0]
-    factor = factor_beside(gauge.keys[3:4], int(gauge.cycle[3]), 1, beside_of(gauge, 3))
+    factor = factor_beside(gauge, 3)
     keys, rng = list(factor.keys()), np.random.default_rng(2)
     values = gtsam.Values()
     values.insert(keys[0], rng.normal(size=2))

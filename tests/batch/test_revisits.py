@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import MOST_BENT, disagreement
-from pathspace_graph.batch.mapper import all_cones
+from pathspace_graph.batch.objections import BENT_SIGMAS, disagreement
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import (
     INTERVAL,
@@ -40,7 +39,7 @@ SETTINGS = own_settings(MapperSettings())
 def found_in(log: Log) -> tuple[LogOdometry, tuple[Revisit, ...]]:
     """Return the odometry of a log, and its revisits."""
     judged = judge_log(log, log.noise, SETTINGS)
-    return judged.chain, find_revisits(judged.chain, all_cones(judged), judged.settings)
+    return judged.chain, find_revisits(judged)
 
 
 # --- revisits --------------------------------------------------------------------------------------------
@@ -117,7 +116,7 @@ def test_an_optimum_that_bends_the_drive_is_refused(sigmas: float, why: str) -> 
     chain, truth = course()
     system: Any = SimpleNamespace(chain=chain, revisits=(revisit(truth),))
     known = aligned_odometry(chain, system.revisits)
-    off = MOST_BENT * sigmas
+    off = BENT_SIGMAS * sigmas
     poses = known.poses + off * np.linalg.cholesky(known.covariances).sum(axis=2)
     assert known.disagreement(poses) == pytest.approx(off)
     assert disagreement(system, poses) == why.format(off)

@@ -39,7 +39,7 @@ def by_turn(state: State) -> Array:
 
 def test_the_poses_stay_and_the_curves_have_fewer_control_points_on_the_same_lines() -> None:
     state, detections, settings = dense_scene()
-    few, _ = simplified(state, detections, settings)
+    few = simplified(state, detections, settings).state
     np.testing.assert_array_equal(few.poses, state.poses)
     np.testing.assert_array_equal(few.variables.calibration, state.variables.calibration)
     for label, boundary in few.boundaries.items():
@@ -57,7 +57,7 @@ def test_a_stray_cone_beside_a_curve_does_not_bend_it() -> None:
     detections.measured[own] += [0.0, 1.2]
     detections.release(own)
     assert (np.abs(cones_of_curve(state, detections, LEFT, settings).points[:, 1] - 3.2) < 0.1).sum() == 1
-    few, _ = simplified(state, detections, settings)
+    few = simplified(state, detections, settings).state
     boundary = few.boundaries[LEFT]
     u = np.linspace(boundary.tables.low, boundary.tables.high, 80)
     np.testing.assert_allclose(boundary.evaluate(few.control_points(LEFT), u)[:, 1], 2.0, atol=0.01)
@@ -68,7 +68,8 @@ def test_a_map_that_is_uncertain_as_a_whole_stays_so() -> None:
     for direction in (lambda s: by_shift(s, 0), lambda s: by_shift(s, 1), by_turn):
         state, detections, settings = dense_scene()
         dense = direction(state)
-        few, change = simplified(state, detections, settings)
+        simple = simplified(state, detections, settings)
+        few, change = simple.state, simple.change
         covariance, expected = change @ np.outer(dense, dense) @ change.T, direction(few)
         across = np.arange(1, few.map_points.size, 2)
         np.testing.assert_allclose(

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.gtsam_graph import nonlinear_graph
 from pathspace_graph.batch.lap import OpenLap, along_of, lap_optimum, marginal_of, stations_on
-from pathspace_graph.batch.mapper import BatchMapper, nonlinear_graph
+from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.optimizer import gradient
 from pathspace_graph.batch.simplification import map_block, simplified
 from pathspace_graph.batch.stations import BLOCK, SeenAgain, laps_of, match_stations, shifts
@@ -124,7 +125,7 @@ def test_the_gradient_is_that_of_the_cost() -> None:
     state = moved(at.state, np.random.default_rng(2).normal(0.0, 0.01, at.state.variables.layout.size))
     system.evaluate(state, hold=True)
     here, layout = system.evaluate(state), state.variables.layout
-    assert here.along is not None and len(here.along.residual) > 300
+    assert len(here.along.residual) > 300
     slope = gradient(system.rows(here), layout)
     rng = np.random.default_rng(5)
     for _ in range(3):
@@ -149,7 +150,8 @@ def test_a_station_s_sigma_is_how_it_moves_along_the_few_curve() -> None:
     """By drawing dense control points of their covariance: the few ones follow by the change."""
     system, at, lap = optimum()
     assert system.matches is not None
-    few, change = simplified(at.state, system.detections, system.settings)
+    simple = simplified(at.state, system.detections, system.settings)
+    few, change = simple.state, simple.change
     _, _, dense = marginal_of(system, at, few, change, lap.first_kept)
     stations = stations_on(few, system.matches, at.state, change, dense)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(dense)), dense, 2000)
@@ -166,7 +168,7 @@ def test_a_station_s_sigma_is_how_it_moves_along_the_few_curve() -> None:
 def test_a_setting_leaves_the_pure_projection() -> None:
     lap = open_lap(MapperSettings(stations=False))
     system, at, _ = lap_optimum(lap)
-    assert system.matches is None and at.along is None
+    assert system.matches is None and len(at.along.rows) == 0
     assert system.sigma_slide == system.settings.batch.sigma_slide
     assert optimum()[0].sigma_slide == SIGMA_SLIDE
 

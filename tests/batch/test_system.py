@@ -35,8 +35,9 @@ def small_system() -> tuple[BatchSystem, State]:
     detections = DetectionTable.of(log.cycles)
     noise = np.random.default_rng(1).normal(0.0, 0.1, detections.measured.shape)
     detections.measured = detections.measured + noise
-    state = start_odometry(chain, detections, settings)
-    system = BatchSystem(detections, chain, settings, Biweight(settings.batch.gate))
+    system = BatchSystem(detections, chain, settings)
+    system.kernel = Biweight(settings.batch.gate)
+    state = start_odometry(system)
     system.begin(state)
     state = moved(state, np.random.default_rng(2).normal(0.0, 0.01, state.variables.layout.size))
     locate_poses(state)

@@ -200,6 +200,7 @@ CASES: dict[str, Arguments] = {
     "by_sensor": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng)),
     "shifted": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng), rng.normal(size=5)),
     "to_map": lambda rng: (rng.normal(size=(COUNT, 2)), poses(rng)),
+    "detection_rows": lambda rng: detections(rng, 5),
     "station_rows": lambda rng: at_stations(rng, 5),
     "placed": lambda rng: (*table(rng), 0.1 * rng.normal(size=5)),
     "open_rows": lambda rng: (
@@ -359,6 +360,7 @@ def test_every_compiled_function_has_a_signature() -> None:
         ("to_map", lambda rng: (rng.normal(size=(COUNT, 2)), poses(rng, 1))),
         ("to_map", lambda rng: (rng.normal(size=(1, 2)), poses(rng))),
         ("to_map", lambda rng: (np.zeros((0, 2)), poses(rng, 1))),
+        ("detection_rows", lambda rng: detections(rng, 0)),
         ("station_rows", lambda rng: at_stations(rng, 0)),
         ("placed", lambda rng: (*table(rng), np.zeros(0))),
         ("curve_rows", lambda rng: seen_curves(rng, True)),

@@ -16,7 +16,6 @@ from pathspace_graph.factors.sensor import (
     by_range,
     by_sensor,
     in_vehicle,
-    range_rates,
     restored,
     sensor_rows,
 )
@@ -74,8 +73,7 @@ def rows_at(sensor: Array, pose: Array, seen: Array, direction: Array, base: Arr
     """Returns the multiplied distance past `base` (2,) along a direction, and its derivatives (5,)."""
     corrected = seen + by_sensor(seen[None], TWIST)[0] @ sensor
     residual = direction @ (to_map(corrected[None], pose[None])[0] - base)
-    rates = range_rates(direction[None], pose[None], seen[None])
-    rows = sensor_rows(direction[None], np.array([residual]), pose[None], seen[None], TWIST, sensor, rates)
+    rows = sensor_rows(direction[None], np.array([residual]), pose[None], seen[None], TWIST, sensor)
     return float(rows.factor[0] * residual), rows.by_sensor[0]
 
 
@@ -100,7 +98,6 @@ def test_without_a_calibration_residuals_are_as_they_are() -> None:
         np.ones((2, 2)),
         np.zeros((2, 3)),
         np.zeros(0),
-        np.zeros((2, 2)),
     )
     np.testing.assert_array_equal(rows.factor, 1.0)
     assert rows.by_sensor.shape == (2, 0)

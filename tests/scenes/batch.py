@@ -55,8 +55,9 @@ def straight(
         DetectionTable.of(log.cycles),
     )
     detections.twist[:] = ahead(6.0, 1.0)[0]
-    state = start_odometry(chain, detections, settings)
-    system = BatchSystem(detections, chain, settings, Biweight(LEAST_SQUARES))
+    system = BatchSystem(detections, chain, settings)
+    system.kernel = Biweight(LEAST_SQUARES)
+    state = start_odometry(system)
     system.begin(state)
     locate_poses(state)
     associate(state, detections, settings, settings.batch.gate, True)
@@ -68,8 +69,7 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
     """Returns the state after some Gauss-Newton steps."""
     for _ in range(steps):
         at = system.evaluate(state)
-        for projected in at.projected.values():
-            system.detections.refine(projected.rows, projected.foot.u)
+        system.detections.refine(at.across.rows, at.u)
         problem = system.eliminated(at)
         state = moved(state, problem.step(np.zeros(problem.map.size)))
     return state
@@ -89,8 +89,8 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
         replace(detections, measured=points, u=detections.u.copy()),
         drawn_chain(chain, calibration[:2], rng),
         system.settings,
-        system.kernel,
     )
+    noisy.kernel = system.kernel
     return noisy, calibration
 
 

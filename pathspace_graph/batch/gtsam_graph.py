@@ -1,0 +1,151 @@
+"""The batch's problem as GTSAM's nonlinear factors, for whoever wants to go on with them."""
+
+from collections.abc import Iterator, MutableSequence
+from dataclasses import replace
+from typing import Any, Final
+
+import gtsam
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.gtsam_factors import (
+    fill,
+    pose_array,
+    smoothness_factors,
+    spline_projection_factors,
+    station_factors,
+)
+from pathspace_graph.factors.residuals import smoothness_matrix
+from pathspace_graph.factors.se2 import rotation
+from pathspace_graph.graph.rows import odometry_factor
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
+from pathspace_graph.mapping.detection_rows import DetectionRows
+from pathspace_graph.mapping.state import State
+from pathspace_graph.spline.boundary import Boundary
+
+from .system import BatchSystem, CurveGauge, Evaluation
+
+SEARCH_ROOM: Final = 4.0  # distance from its foot points in which a factor searches them (m along the curve)
+SEARCH_HALVINGS: Final = 6  # most halvings of the room while another foot point in it is nearer, as in a bend
+SAME_FOOT: Final = 1e-3  # distance below which two foot points are the same (m along the curve)
+
+
+def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
+    """Return every factor of the problem, on the keys of `graph.variables`.
+
+    A graph of plain least squares, with the associations of `at` and the sigmas across the curve over the
+    roots of their robust weights. Each control point is anchored where it is. At an optimum its linearization
+    is that of the optimization; its error isn't the robust cost.
+    """
+    factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
+    for label, gauge in system.gauges.items():
+        factors += _priors(gauge, at.state)
+        factors += [*_across(system, at, label), *_along(system, at, label)]
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
+def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield all factors that hold no control point: odometry, first pose and the priors of calibrations."""
+    for k, interval in enumerate(system.chain.odometry.intervals):
+        yield odometry_factor(k, interval)
+    for one in system.revisits:
+        root = one.root.copy()  # GTSAM's tangents are in the frame of the later pose
+        root[:, :2] = root[:, :2] @ rotation(one.local[2])
+        noise = gtsam.noiseModel.Gaussian.Information(root.T @ root)
+        ends = pose_key(one.earlier), pose_key(one.later)
+        yield gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*one.local), noise)
+    chain, calibration, noises = system.chain, system.settings.calibration, gtsam.noiseModel
+    map_from_pose = np.eye(POSE)  # GTSAM's tangents of a pose are in its own frame
+    map_from_pose[:2, :2] = rotation(at.state.poses[0, 2])
+    noise = noises.Gaussian.Information(map_from_pose.T @ chain.first_information @ map_from_pose)
+    yield gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*chain.first), noise)
+    sigmas = noises.Diagonal.Sigmas(chain.calibration_sigma)
+    yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, chain.calibration_mean, sigmas)
+    if chain.bias is not None:
+        noise = noises.Diagonal.Precisions(np.array([0.0, chain.bias.sigma**-2]))
+        yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.array([0.0, chain.bias.value]), noise)
+    sensor_key = at.state.variables.sensor_key
+    if sensor_key is not None:
+        sigmas = noises.Diagonal.Sigmas(np.array(calibration.sigmas))
+        yield gtsam.PriorFactorVector(sensor_key, np.array(calibration.means), sigmas)
+
+
+def _priors(gauge: CurveGauge, state: State) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield the weak priors of a curve's control points: where along it, how smooth, and anchors."""
+    label, boundary = gauge.label, state.boundaries[gauge.label]
+    anchor = gtsam.noiseModel.Isotropic.Sigma(POINT, boundary.gauge.sigma_anchor)
+    for j, (key, point) in enumerate(zip(gauge.keys.tolist(), state.control_points(label), strict=True)):
+        yield factor_beside(gauge, j)
+        yield gtsam.PriorFactorPoint2(key, point, anchor)
+    matrix = smoothness_matrix(boundary.abscissae, boundary.length if boundary.periodic else None)
+    sigma = boundary.gauge.sigma_smoothness * float(np.mean(boundary.nominal))
+    yield from smoothness_factors(gauge.keys.tolist(), matrix, sigma)
+
+
+def factor_beside(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
+    """Return the factor that holds control point j of a curve beside its pose.
+
+    GTSAM's tangents of a pose are in its own frame.
+    """
+    point_key, cycle = int(gauge.keys[j]), int(gauge.cycle[j])
+    alone = replace(gauge, ahead=gauge.ahead[j : j + 1])
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
+        pose = values.atPose2(pose_key(cycle))
+        point = np.array(values.atPoint2(point_key))
+        residual, by_point, by_pose = alone.terms(point[None], pose_array(pose)[None])
+        if H is not None:
+            by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
+            fill(H, [by_point, by_pose])
+        return residual
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [point_key, pose_key(cycle)], error)
+
+
+def _across(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
+    """Return a factor for each cycle, of its used detections on a boundary."""
+    boundary, variables = at.state.boundaries[label], at.state.variables
+    chosen, measured = _measured(system, at, at.across, label)
+    u, points = at.u[chosen], system.detections.points_map(at.across.rows[chosen], variables)
+    room = _room(boundary, at.state.control_points(label), points, u)
+    return spline_projection_factors(low=u - room, high=u + room, sigma_model=0.0, **measured)
+
+
+def _along(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
+    """Return a factor for each cycle, of its used detections at stations of a boundary."""
+    if system.matches is None:
+        return []
+    chosen, measured = _measured(system, at, at.along, label)
+    station = system.matches.used(system.detections)[1][chosen]
+    u, sigma_station = system.matches.stations.u[station], np.zeros(len(station))
+    return station_factors(u=u, sigma_station=sigma_station, **measured)
+
+
+def _measured(
+    system: BatchSystem, at: Evaluation, seen: DetectionRows, label: int
+) -> tuple[BoolArray, dict[str, Any]]:
+    """Return which detections (m,) of a boundary have any weight, and what factors need of these."""
+    detections, scale = system.detections, seen.scale(system.kernel.weights(seen.whitened))
+    chosen = (detections.boundary[seen.rows] == label) & (scale > 0.0)
+    rows = seen.rows[chosen]
+    return chosen, {
+        "pose_keys": pose_keys(detections.cycle[rows]),
+        "control_keys": at.state.keys(label).tolist(),
+        "tables": at.state.boundaries[label].tables,
+        "points_vehicle": detections.measured[rows],
+        "covariances": scale[chosen, None, None] ** -2.0 * np.eye(2),
+        "twists": detections.twist[rows],
+        "huber": np.inf,
+        "sensor_key": at.state.variables.sensor_key,
+    }
+
+
+def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) -> Array:
+    """Return the room (m,) about u in which the nearest foot point of each point (m, 2) is that at u."""
+    room = np.full(len(u), SEARCH_ROOM)
+    for _ in range(SEARCH_HALVINGS):
+        nearest = boundary.find(control_points, points, u - room, u + room).u
+        room[np.abs(nearest - u) > SAME_FOOT] *= 0.5
+    return room

@@ -1,0 +1,117 @@
+"""What speaks against an optimum: against a loop that is to be closed, and against a map as a whole."""
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import path_lengths, to_map
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.lengths import Length, Text, joined
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.state import SAMPLE
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.bspline import BSpline
+
+from .start import aligned_odometry
+from .system import BatchSystem, Evaluation
+
+DRIVE_RATIO: Final = 2.5  # most ratio of a boundary point's distance from the drive to the drive's beside it
+DRIVE_PERCENTILE: Final = 95.0  # of the poses' distances: the drive may begin or end off the track
+BENT_SIGMAS: Final = 4.0  # most distance of an optimum's poses from odometry and revisits (sigmas)
+MISS_STRETCH: Final = 25.0  # length of the stretches of the drive by which a miss is located (m)
+MISS_DETECTIONS: Final = 20  # number of detections below which a stretch says nothing
+MISS_NEAR: Final = 2.5  # farthest from the drive that detections are near it, by used ones' usual distance
+MISS_SHARE: Final = 1.0 / 3.0  # least share of the detections near the drive on no boundary that is a miss
+MISS_SHOWN: Final = 3  # most stretches that are told
+
+
+def share_used(at: Evaluation, detections: DetectionTable) -> float:
+    """Return the share of the coloured detections of the first lap that lies on the curves of an optimum."""
+    state = at.state
+    coloured = np.isin(detections.label, list(state.boundaries))
+    again = np.ones(len(state.poses), bool)  # beside a stretch of every boundary that was driven before
+    for label, boundary in state.boundaries.items():
+        again &= state.pose_u[label] - state.pose_u[label][0] >= boundary.length
+    first = coloured & ~again[detections.cycle]
+    return float(detections.used[first].mean()) if first.any() else 0.0
+
+
+def objection(splines: Mapping[int, BSpline], poses: Array, used: float, settings: MapperSettings) -> str:
+    """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
+
+    Both boundaries are closed. They don't cross but at level crossings, the vehicle crosses neither and has
+    driven beside all of both, and a large share of the detections is `used`: it lies on them. Where cycles
+    are missing the drive is not known, so nothing is asked of the boundaries beside a step so long that a
+    point beside its middle would be too far from both poses.
+    """
+    if set(splines) != set(BOUNDARIES) or not all(spline.periodic for spline in splines.values()):
+        return "not both of its boundaries are closed"
+    driven, by_drive = poses[:, :2], KDTree(poses[:, :2])
+    if boundaries_cross(splines, SAMPLE, driven):
+        return "its boundaries cross"
+    for curve in (sampled(spline, SAMPLE) for spline in splines.values()):
+        distance, beside = map(np.asarray, KDTree(curve).query(driven))
+        aside = float(np.percentile(distance, DRIVE_PERCENTILE))
+        missing = np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 2.0 * DRIVE_RATIO * aside)
+        pieces = [piece for piece in np.split(driven, missing + 1) if len(piece) > 1]
+        if any(not at_level_crossing(crossings(curve, piece), driven).all() for piece in pieces):
+            return "the vehicle would have crossed a boundary"
+        known = np.ones(len(curve), bool)
+        for first, last in zip(beside[missing], beside[missing + 1], strict=True):
+            known[np.arange(first, last if last >= first else last + len(curve)) % len(curve)] = False
+        wider = float(np.max(by_drive.query(curve[known])[0])) / aside
+        if wider > DRIVE_RATIO:
+            return f"a boundary would be {wider:.1f} times as far from the drive as it is beside it"
+    if used < settings.batch.closure.used:
+        return f"only {used:.0%} of the detections lie on its boundaries".replace("%", " %")
+    return ""
+
+
+def speaks_against(
+    system: BatchSystem, at: Evaluation, splines: Mapping[int, BSpline], detections: DetectionTable
+) -> str:
+    """Return what speaks against closed curves at an optimum, on which detections lie; empty for nothing."""
+    poses = at.state.poses
+    used = share_used(at, detections)
+    return disagreement(system, poses) or objection(splines, poses, used, system.settings)
+
+
+def disagreement(system: BatchSystem, poses: Array) -> str:
+    """Return that the poses (P, 3) of an optimum are not those of odometry and revisits; empty if they are.
+
+    Both are estimates of one drive, so their distance is some standard deviations of the less certain one. A
+    wrong optimum bends the drive to the map, by much more.
+    """
+    if not system.revisits:
+        return ""
+    sigmas = aligned_odometry(system.chain, system.revisits).disagreement(poses)
+    return f"the poses are {sigmas:.1f} sigmas from the odometry" if sigmas > BENT_SIGMAS else ""
+
+
+def unmapped(detections: DetectionTable, poses: Array) -> str:
+    """Return that a third of what was detected near a drive lies on no boundary, and where; or nothing.
+
+    What is far from the drive may be of another road, or no cone.
+    """
+    if len(detections.cycle) == 0:
+        return ""
+    driven, used = path_lengths(poses), detections.used
+    points = to_map(detections.measured, poses[detections.cycle])
+    distance = np.asarray(KDTree(poses[:, :2]).query(points)[0])
+    near = distance < MISS_NEAR * np.median(distance[used] if used.any() else distance)
+    missed = near & ~used
+    if missed.sum() < MISS_SHARE * near.sum():
+        return ""
+    stretch = (driven[detections.cycle] // MISS_STRETCH).astype(np.intp)
+    count = np.bincount(stretch, near)
+    poor = (count >= MISS_DETECTIONS) & (np.bincount(stretch, missed, len(count)) >= MISS_SHARE * count)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], poor, [False]])))
+    ends = np.minimum(MISS_STRETCH * edges.reshape(-1, 2), driven[-1]).tolist()[:MISS_SHOWN]
+    told = [Text("{a:.3g} to {b:.3g} m", a=Length(a), b=Length(b)) for a, b in ends]
+    where = Text(" ({stretches} of the drive)", stretches=joined(told, ", ")) if told else ""
+    said = "{share:.0f} % of what was detected near the drive lies on no boundary{where}"
+    return Text(said, share=100.0 * missed.sum() / near.sum(), where=where)

@@ -1,0 +1,80 @@
+"""The model of a detection, for the window and the batch: rows across a curve, and along it at a station."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.factors import _kernels as kernels
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, Variables
+
+from .detections import DetectionTable
+from .state import State
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionRows:
+    """A row for each of m detections on [pose | sensor | control points], not whitened."""
+
+    rows: IntArray  # (m,) detections, by row of their table
+    keys: IntArray  # (m, k)
+    residual: Array  # (m,) distance from the curve or from the station, in m
+    sigma: Array  # (m,) its standard deviation in m; infinite where it says nothing
+    jacobian: Array  # (m, n)
+
+    @property
+    def whitened(self) -> Array:
+        """Return the residuals (m,) in sigmas."""
+        return np.asarray(self.residual / self.sigma)
+
+    def scale(self, weights: Array) -> Array:
+        """Return the factor (m,) that whitens each row and gives it a robust weight (m,), in 1/m."""
+        return np.asarray(np.sqrt(weights) / self.sigma)
+
+    def weighted(self, weights: Array, owner: IntArray) -> Rows:
+        """Return whitened rows with robust weights (m,); each is part of the factor `owner` (m,)."""
+        scale = self.scale(weights)
+        return Rows(self.keys, self.jacobian * scale[:, None], self.residual * scale, owner)
+
+
+NO_ROWS: Final = DetectionRows(
+    np.zeros(0, np.intp), np.zeros((0, 0), np.intp), np.zeros(0), np.zeros(0), np.zeros((0, 0))
+)
+
+
+def rows_across(
+    state: State,
+    detections: DetectionTable,
+    rows: IntArray,
+    points: Array,
+    foot: FootPoints,
+    sigma_model: float,
+) -> DetectionRows:
+    """Return `n . (R z + t - S(u))` of detections (m,) at points (m, 2), map frame.
+
+    The foot points are on `State.curves`, and the terms those of `factors._kernels:detection_rows`.
+    """
+    cycle, variables = detections.cycle[rows], state.variables
+    residual, sigma, jacobian = kernels.detection_rows(
+        points,
+        detections.covariance[rows],
+        variables.poses_at(cycle),
+        foot.normal_unit,
+        foot.distance,
+        foot.basis,
+        detections.measured[rows],
+        detections.twist[rows],
+        variables.sensor,
+        sigma_model,
+    )
+    keys = np.concatenate([measuring_keys(cycle, variables), state.curves.keys[foot.columns]], axis=1)
+    return DetectionRows(rows, keys, residual, sigma, jacobian)
+
+
+def measuring_keys(cycle: IntArray, variables: Variables) -> IntArray:
+    """Return the keys (m, 1) of the poses of cycles (m,), or (m, 2) with the sensor's calibration."""
+    keys = np.array([FIRST_POSE, SENSOR_KEY]) + np.outer(cycle, [1, 0])
+    return np.asarray(keys[:, : 2 if len(variables.sensor) else 1])
