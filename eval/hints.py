@@ -20,7 +20,7 @@ from tyro.conf import arg
 
 from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import PathspaceError, SolveError, check_name
-from pathspace_graph.estimators import DEFAULT, make_online
+from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment.cells import load_tracks
 from pathspace_graph.eval.experiment.frame import write_csv
 from pathspace_graph.eval.experiment.run import OnCell, WorkerDiedError, run_cells
@@ -271,7 +271,7 @@ def mapped(log: Log) -> Row:
         write_log(log, Path(folder) / "log")
         try:
             usable, _ = read_plausible_log(Path(folder) / "log", LimitSettings())
-            result = run_online(usable, make_online(DEFAULT, MapperSettings(), usable))
+            result = run_online(usable, make_online(DEFAULT_ONLINE, MapperSettings(), usable))
         except PathspaceError as error:
             return {"refusal": str(error).replace(str(folder), "")}
     if log.truth is None or not result.map.boundaries:

@@ -31,7 +31,7 @@ from .metrics.summary import summarize
 from .views import Figure, View
 
 RUNS: Final = {  # estimator of each run
-    "online": registry.DEFAULT,
+    "online": registry.DEFAULT_ONLINE,
     "batch": registry.DEFAULT_BATCH,
     "landmarks": "landmark-fixed-lag",
 }

@@ -212,22 +212,6 @@ class Spans:
     by_span: Array  # (n, 3 (p + 1), p + 1) polynomials of the basis and of two derivatives
     values: Array  # (p + 1, n, p + 1) polynomials of the basis, power after power
 
-    def locate(self, v: Array) -> tuple[IntArray, Array]:
-        """Return the span number in [0, n), and s in [0, 1], of each place v (m,) on the axis."""
-        laid = self.starts[1:].searchsorted(v, side="right")
-        s = (v - self.starts.take(laid)) * self.inverse_widths.take(laid)
-        return self.number.take(laid) if self.periodic else laid, s
-
-    def basis(self, number: IntArray, s: Array) -> Array:
-        """Return basis values (m, p + 1) at the result of `locate`, by Horner's rule."""
-        return horner(self.values.take(number, axis=1), s[:, None])
-
-    def curve_coefficients(self, control_points: Array) -> Array:
-        """Return C (p + 1, 3, 2, n): on span i, d^r S / du^r = sum_k C[k, r, :, i] s^k, r <= 2."""
-        by_span = np.matmul(self.by_span, control_points.take(self.columns, axis=0))
-        shape = (len(by_span), self.degree + 1, 3, 2)
-        return np.ascontiguousarray(by_span.reshape(shape).transpose(1, 2, 3, 0))
-
 
 def horner(terms: Array, s: Array) -> Array:
     """Return sum_k terms[k] s^k for terms (p + 1, m, ...) and s, which broadcasts to the shape of a term."""

@@ -12,13 +12,13 @@ from functools import partial
 import gtsam
 import numpy as np
 
+from . import _kernels as kernels
 from .arrays import Array, BoolArray, IntArray
 from .bspline import SpanPolynomials
 from .footpoint import FootPoints, foot_points
 from .linear import linear_factor
 from .noise import huber_roots, huber_weights
-from .odometry import IntegratedOdometry, odometry_residuals
-from .residuals import detection_rows, station_rows
+from .odometry import IntegratedOdometry
 from .se2 import rotation, to_map
 from .sensor import corrected
 
@@ -131,7 +131,7 @@ def _across(sigma_model: float, seen: _Seen, curve: Curve, values: gtsam.Values)
     placed, measured = seen.at(values)
     foot = curve.foot(values, placed[0])
     on_curve = foot.normal_unit, foot.distance, foot.basis
-    terms = detection_rows(*placed, *on_curve, *measured, sigma_model)
+    terms = kernels.detection_rows(*placed, *on_curve, *measured, sigma_model)
     return *terms, *curve.usable(foot)
 
 
@@ -141,7 +141,7 @@ def _along(u: Array, sigma_station: Array, seen: _Seen, curve: Curve, values: gt
     basis, span = curve.tables.evaluate(u, 1)
     value, slope = np.ascontiguousarray(basis)
     control = curve.control_points(values)[span[:, None] + np.arange(-curve.tables.degree, 1)]
-    terms = station_rows(*placed, value, slope, control, *measured, sigma_station)
+    terms = kernels.station_rows(*placed, value, slope, control, *measured, sigma_station)
     return *terms, np.ones(len(u), bool), curve.slots(span)
 
 
@@ -325,7 +325,7 @@ def calibrated_odometry_factor(
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
         start, end = values.atPose2(keys[0]), values.atPose2(keys[1])
-        residual, by_start, by_end = odometry_residuals(
+        residual, by_start, by_end = kernels.odometry_residuals(
             pose_array(start)[None], pose_array(end)[None], odometry.delta[None]
         )
         if H is not None:

@@ -1,5 +1,5 @@
-// Kernels over rows, compiled. Each has the name, the arguments and the results of the function in Python that
-// it takes the place of (see kernels.py), which says what it computes and is what tests hold it against.
+// Kernels over rows. _kernels.pyi says what each computes, and tests hold each against one in numpy in
+// tests/oracles.
 
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
@@ -17,6 +17,16 @@ using Index = py::ssize_t;
 using Array = py::array_t<double, py::array::c_style | py::array::forcecast>;
 using Ints = py::array_t<Index, py::array::c_style | py::array::forcecast>;
 using Shape = std::vector<Index>;
+
+#define QUOTED_(x) #x
+#define QUOTED(x) QUOTED_(x)
+#if defined(__clang__)
+#define COMPILER "clang " QUOTED(__clang_major__) "." QUOTED(__clang_minor__)
+#elif defined(__GNUC__)
+#define COMPILER "gcc " QUOTED(__GNUC__) "." QUOTED(__GNUC_MINOR__)
+#else
+#define COMPILER "MSVC " QUOTED(_MSC_VER)
+#endif
 
 namespace {
 
@@ -2097,7 +2107,8 @@ py::tuple references(const Ints& cone, const Array& t, const Array& ranges, cons
 }  // namespace
 
 PYBIND11_MODULE(_kernels, module) {
-  module.doc() = "Kernels over rows; pathspace_graph.factors.kernels says which functions they take the place of.";
+  module.doc() = "Compiled functions of arrays, which _kernels.pyi describes.";
+  module.attr("COMPILER") = COMPILER;
   module.def("searched", &searched);
   module.def("refined", &refined);
   module.def("summed", &summed);

@@ -6,9 +6,10 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from . import _kernels as kernels
 from .arrays import Array
 from .se2 import left_of
-from .sensor import SENSOR_SIZE, by_bend, shifted
+from .sensor import SENSOR_SIZE, by_bend
 
 
 def whiteners(covariances: Array) -> Array:
@@ -170,7 +171,7 @@ class MeasuredNoise:
         errors, points = self.shown if shown else self.sensor, self.unbent(points)
         if not errors.any():
             return points
-        return shifted(points, np.broadcast_to(twist, (len(points), 3)), errors)
+        return kernels.shifted(points, np.broadcast_to(twist, (len(points), 3)), errors)
 
 
 def ray_axes(points: Array) -> Array:

@@ -3,11 +3,10 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import lapack
 
+from . import _kernels as kernels
 from .arrays import Array
-from .kernels import compiled
-from .se2 import compose, se2_exp, wrap_angle
+from .se2 import se2_exp
 
 MIN_SIGMA = 1e-6  # of integrated odometry (m, rad), which keeps the factor of an empty interval finite
 CALIBRATION_SIZE = 2  # entries of the calibration: scale error of the speeds (-), yaw-rate bias (rad/s)
@@ -55,104 +54,11 @@ def integrate_twists(durations: Array, twists: Array, sigma: Array) -> Integrate
         return integrated_odometry(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
     sigmas = np.empty(twists.shape)
     sigmas[:] = sigma  # `broadcast_to` takes ten times as long
-    motion = _integrated(durations, twists, sigmas)
-    return IntegratedOdometry(*motion, _whitener(motion[1], MIN_SIGMA), twists[-1])
-
-
-@compiled
-def _integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, Array, Array]:
-    """Return end pose (3,), covariance (3, 3) and calibration derivative (3, 2) of `integrate_twists`."""
-    poses = integrate_poses(durations, twists)
-    end = poses[-1]
-    # in the middle of each step the adjoint equals the exponential's right Jacobian to second order
-    adjoints = _adjoints_to_end(compose(poses, se2_exp(-0.5 * twists * durations[:, None])), end)
-    scaled = (adjoints * (durations[:, None] * sigmas)[:, None, :]).transpose(1, 0, 2).reshape(3, -1)
-    by_speed, by_rate = adjoints[:, :, :2] @ twists[:, :2, None], adjoints[:, :, 2:]
-    by_calibration = np.concatenate([by_speed, by_rate], axis=2).transpose(1, 2, 0) @ durations
-    return end, scaled @ scaled.T, by_calibration
+    motion = kernels.integrated(durations, twists, sigmas)
+    return IntegratedOdometry(*motion, kernels.whitener(motion[1], MIN_SIGMA), twists[-1])
 
 
 def integrated_odometry(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
     """Return the odometry with its whitener; `MIN_SIGMA` lifts a covariance of zero."""
-    whitener = _whitener(covariance, MIN_SIGMA)
+    whitener = kernels.whitener(covariance, MIN_SIGMA)
     return IntegratedOdometry(delta, covariance, calibration_jacobian, whitener)
-
-
-@compiled
-def _whitener(covariance: Array, least: float) -> Array:
-    """Return lower triangular W (3, 3) with `W' W` the inverse of a covariance (3, 3) plus `least^2`."""
-    root, _ = lapack.dpotrf(covariance + np.eye(3) * least**2, lower=1)
-    whitener, _ = lapack.dtrtri(root, lower=1)
-    return np.ascontiguousarray(whitener)
-
-
-def _adjoints_to_end(poses: Array, end: Array) -> Array:
-    """Return the adjoint maps (k, 3, 3) that carry a tangent at each pose to one at the end pose."""
-    theta = poses[:, 2] - end[2]
-    c, s = np.cos(theta), np.sin(theta)
-    ce, se = np.cos(end[2]), np.sin(end[2])
-    dx, dy = poses[:, 0] - end[0], poses[:, 1] - end[1]
-    out = np.zeros((len(poses), 3, 3))
-    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = c, -s, -se * dx + ce * dy
-    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = s, c, -(ce * dx + se * dy)
-    out[:, 2, 2] = 1.0
-    return out
-
-
-@compiled
-def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> tuple[Array, Array, Array]:
-    """Return `r = Log(delta^-1 start^-1 end)` (m, 3), and its Jacobians (m, 3, 3) by start and end.
-
-    It is the residual of GTSAM's BetweenFactorPose2, a tangent in the frame of the end (m, m, rad). Poses
-    (m, 3) are in the map frame, deltas (m, 3) in the frame of the start. The Jacobians are by (x, y, theta)
-    in the map frame.
-    """
-    angle = poses_start[:, 2] + deltas[:, 2]
-    c, s = np.cos(angle), np.sin(angle)
-    offset = poses_end[:, :2] - poses_start[:, :2]
-    along, across = c * offset[:, 0] + s * offset[:, 1], -s * offset[:, 0] + c * offset[:, 1]
-    cd, sd = np.cos(deltas[:, 2]), np.sin(deltas[:, 2])
-    dx, dy = along - (cd * deltas[:, 0] + sd * deltas[:, 1]), across - (cd * deltas[:, 1] - sd * deltas[:, 0])
-    phi = wrap_angle(poses_end[:, 2] - angle)
-    a, slope = _inverse_left_terms(phi)
-    h = 0.5 * phi
-    residuals = np.array([a * dx + h * dy, a * dy - h * dx, phi]).T
-    by_phi_x, by_phi_y = slope * dx + 0.5 * dy, slope * dy - 0.5 * dx
-    by_end = np.zeros((len(deltas), 3, 3))
-    by_end[:, 0, 0], by_end[:, 0, 1], by_end[:, 0, 2] = a * c - h * s, a * s + h * c, by_phi_x
-    by_end[:, 1, 0], by_end[:, 1, 1], by_end[:, 1, 2] = -a * s - h * c, a * c - h * s, by_phi_y
-    by_end[:, 2, 2] = 1.0
-    by_start = -by_end
-    by_start[:, 0, 2] += a * across - h * along
-    by_start[:, 1, 2] += -a * along - h * across
-    return residuals, by_start, by_end
-
-
-@compiled
-def whitened_odometry(
-    poses_start: Array,
-    poses_end: Array,
-    deltas: Array,
-    whiteners: Array,
-    by_calibration: Array,
-    calibration: Array,
-) -> tuple[Array, Array]:
-    """Return `W (r + G b)` (m, 3) with r of `odometry_residuals`, and its derivatives (m, 3, 8).
-
-    W (m, 3, 3) are whiteners, and G (m, 3, 2) derivatives by the calibration b (2,). The result's
-    derivatives are by [b | start | end].
-    """
-    residual, *by_poses = odometry_residuals(poses_start, poses_end, deltas)
-    residual = residual + by_calibration @ calibration
-    jacobian = whiteners @ np.concatenate([by_calibration, *by_poses], axis=2)
-    return (whiteners @ residual[:, :, None])[:, :, 0], jacobian
-
-
-def _inverse_left_terms(phi: Array) -> tuple[Array, Array]:
-    """Return `a = (phi/2) cot(phi/2)` of SE(2)'s inverse left Jacobian, and da/dphi."""
-    small = np.abs(phi) < 1e-3  # the next terms of the series are below 1e-15 there
-    half = np.where(small, 0.5, 0.5 * phi)
-    cot = 1.0 / np.tan(half)
-    a = np.where(small, 1.0 - phi**2 / 12.0, half * cot)
-    slope = np.where(small, -phi / 6.0, 0.5 * cot - 0.5 * half * (1.0 + cot**2))
-    return a, slope

@@ -8,9 +8,7 @@ import scipy  # which imports its modules when they are used
 from .arrays import Array
 from .bspline import scatter
 from .footpoint import FootPoints
-from .kernels import compiled
-from .se2 import in_vehicle, left_of, to_vehicle
-from .sensor import sensor_rows
+from .se2 import in_vehicle, to_vehicle
 
 
 @dataclass(frozen=True)
@@ -63,71 +61,6 @@ def project(
         by_pose=np.concatenate([n, by_theta[:, None]], axis=1),
         by_control=-foot.basis[:, :, None] * n[:, None, :],
     )
-
-
-@compiled
-def detection_rows(
-    points_map: Array,
-    covariances: Array,
-    poses: Array,
-    normals: Array,
-    distances: Array,
-    basis: Array,
-    measured: Array,
-    twists: Array,
-    sensor: Array,
-    sigma_model: float,
-) -> tuple[Array, Array, Array]:
-    """Return residuals (m,) and sigmas (m,) of `project`, and derivatives by [pose | sensor | controls].
-
-    normals (m, 2), distances (m,) and basis (m, p + 1) are of the foot points. Residuals and derivatives
-    (m, 3 + 5 + 2 p + 2) are multiplied by the factor of `sensor:sensor_rows`, where the detections were
-    measured at (m, 2), vehicle frame, with twists (m, 3), and the sensor's calibration (5,) is not empty.
-    """
-    arm = points_map - poses[:, :2]
-    by_theta = normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1]
-    by = sensor_rows(normals, distances, poses, measured, twists, sensor)
-    by_pose = np.concatenate([normals, by_theta[:, None]], axis=1)
-    by_control = (-basis[:, :, None] * normals[:, None, :]).reshape(len(basis), 2 * basis.shape[1])
-    factor = by.factor[:, None]
-    jacobian = np.concatenate([factor * by_pose, by.by_sensor, factor * by_control], axis=1)
-    return by.factor * distances, sigma_across(normals, covariances, poses, sigma_model), jacobian
-
-
-@compiled
-def station_rows(
-    points_map: Array,
-    covariances: Array,
-    poses: Array,
-    value: Array,
-    slope: Array,
-    control: Array,
-    measured: Array,
-    twists: Array,
-    sensor: Array,
-    sigma_station: Array,
-) -> tuple[Array, Array, Array]:
-    """Return `r = t . (p - S(u))` (m,) along the tangent t at stations u, their sigmas (m,), and derivatives.
-
-    A station is the parameter of a cone on its curve. value and slope (m, p + 1) are the basis and its
-    derivative there, control (m, p + 1, 2) the control points that they weigh, and sigma_station (m,) the
-    standard deviations of the cones along the curve, in m. With the normal n and the speed |S'|,
-
-        dr/dp = t,   dr/dc_j = -beta_j(u) t + n . (p - S) beta'_j(u) / |S'| n
-
-    The rest is as in `detection_rows`.
-    """
-    at, velocity = (np.einsum("mj,mjd->md", basis, control) for basis in (value, slope))
-    speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    t = velocity / speed[:, None]
-    n, arm = left_of(t), points_map - at
-    along, turning = (arm * t).sum(axis=1), (arm * n).sum(axis=1) / speed
-    seen = measured, twists, sensor
-    residual, sigma, jacobian = detection_rows(points_map, covariances, poses, t, along, value, *seen, 0.0)
-    factor = (jacobian[:, :2] * t).sum(axis=1)
-    by_turn = (factor * turning)[:, None, None] * slope[:, :, None] * n[:, None, :]
-    jacobian[:, -slope.shape[1] * 2 :] += by_turn.reshape(len(t), 2 * slope.shape[1])
-    return residual, np.hypot(sigma, sigma_station), jacobian
 
 
 @dataclass(frozen=True)

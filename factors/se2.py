@@ -1,11 +1,12 @@
 """Rigid motions of the plane, SE(2): a pose is `(x, y, theta)` in m, m and rad."""
 
 from math import cos, sin
+from typing import Final
 
 import numpy as np
 
+from . import _kernels as kernels
 from .arrays import Array
-from .kernels import compiled
 
 
 def wrap_angle(angle: Array) -> Array:
@@ -73,12 +74,8 @@ def path_lengths(path: Array) -> Array:
     return np.append(0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T)))
 
 
-@compiled
-def to_map(points_vehicle: Array, poses: Array) -> Array:
-    """Return `p = R z + t` (m, 2), map frame: points z (m, 2) in the vehicle frames of poses (m, 3)."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x, y = points_vehicle[:, 0], points_vehicle[:, 1]
-    return np.array([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]]).T
+to_map: Final = kernels.to_map
+"""`p = R z + t` (m, 2), map frame: points z (m, 2) in the vehicle frames of poses (m, 3)."""
 
 
 def in_vehicle(directions: Array, poses: Array) -> Array:

@@ -4,12 +4,13 @@ All five are estimated along with the map. They are small, so a detection is cor
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
+from . import _kernels as kernels
 from .arrays import Array
-from .kernels import compiled
-from .se2 import in_vehicle, left_of
+from .se2 import in_vehicle
 
 SENSOR = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 """Entries of the calibration b: yaw (rad) and lateral offset (m), positive to the left, age of detections at
@@ -19,26 +20,8 @@ RANGE = slice(3, 5)  # errors of the ranges
 BENDS_FROM = 8.0  # range from which on ranges may bend: cones beside the vehicle are nearer (m)
 
 
-@compiled
-def by_sensor(points_vehicle: Array, twists: Array) -> Array:
-    """Return the derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b.
-
-    z are points_vehicle (m, 2) as measured, in m, and twists (m, 3) are those at their stamps (m/s, m/s,
-    rad/s). With J the quarter turn and `v + wz J z` the motion relative to a point at rest, the columns are
-
-        J z (yaw),   (0, 1) (lateral),   -(v + wz J z) (latency),   -z (range scale),   -z / |z| (range bias)
-
-    The second order is left out: a yaw of 2 degrees shifts a detection at 15 m by 9 mm beside that.
-    """
-    turned = left_of(points_vehicle)
-    distance = np.maximum(np.hypot(points_vehicle[:, 0], points_vehicle[:, 1]), np.finfo(float).tiny)
-    columns = np.empty((len(points_vehicle), 2, SENSOR_SIZE))
-    columns[:, :, 0] = turned
-    columns[:, :, 1] = 0.0, 1.0
-    columns[:, :, 2] = -(twists[:, :2] + twists[:, 2:] * turned)
-    columns[:, :, 3] = -points_vehicle
-    columns[:, :, 4] = -points_vehicle / distance[:, None]
-    return columns
+by_sensor: Final = kernels.by_sensor
+"""The derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b."""
 
 
 def by_bend(points_vehicle: Array) -> Array:
@@ -53,13 +36,7 @@ def by_bend(points_vehicle: Array) -> Array:
 
 def corrected(measured: Array, twists: Array, sensor: Array) -> Array:
     """Return the detections `z + C b` (m, 2), or z as measured where the calibration b (5,) is empty."""
-    return shifted(measured, twists, sensor) if len(sensor) else measured
-
-
-@compiled
-def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
-    """Return `z + C b` (m, 2) of detections z (m, 2), with C of `by_sensor` and a calibration b (5,)."""
-    return np.asarray(measured + by_sensor(measured, twists) @ sensor)
+    return kernels.shifted(measured, twists, sensor) if len(sensor) else measured
 
 
 def by_range(points_vehicle: Array) -> Array:

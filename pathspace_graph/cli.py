@@ -65,8 +65,8 @@ def _run(arguments: list[str], level: str) -> None:
     if first in ("-h", "--help"):
         print(overview())
     elif first == "--version":
-        kernels = import_module(".factors.kernels", __package__).KERNELS
-        print(f"{PROGRAM} {version(PROGRAM)} (GTSAM {version('gtsam')}, {kernels} kernels)")
+        compiler = import_module(".factors", __package__).COMPILER
+        print(f"{PROGRAM} {version(PROGRAM)} (GTSAM {version('gtsam')}, kernels: {compiler})")
     elif first == "--completion":
         options = import_module(".commands.options", __package__)
         print(options.completion(PROGRAM, {name: command_class(name) for name in COMMANDS}, LEVELS))

@@ -24,17 +24,17 @@ from .run import BatchEstimator, OnlineEstimator
 MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
 MakeBatch = Callable[[MapperSettings, KnownNoise], BatchEstimator]
 
-DEFAULT: Final = "fixed-lag"  # online estimator where none is named
+DEFAULT_ONLINE: Final = "fixed-lag"  # online estimator where none is named
 DEFAULT_BATCH: Final = "spline"  # batch estimator where none is named
 ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add online estimators
 BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
 
 
-_POINTS: Final = entry_points()  # looked up once, since that reads the metadata of every package
+_ENTRY_POINTS: Final = entry_points()  # looked up once, since that reads the metadata of every package
 
 
 def _installed(group: str) -> dict[str, Callable[[MapperSettings, KnownNoise], Any]]:
-    return {point.name: partial(_load, point) for point in _POINTS.select(group=group)}
+    return {point.name: partial(_load, point) for point in _ENTRY_POINTS.select(group=group)}
 
 
 def _load(point: EntryPoint, settings: MapperSettings, noise: KnownNoise) -> Any:
@@ -50,7 +50,7 @@ def _baseline(home: str, settings: MapperSettings, noise: KnownNoise) -> Any:
 
 ONLINE: Final[dict[str, MakeOnline]] = {  # makers, from settings and known noise
     **_installed(ONLINE_GROUP),
-    DEFAULT: FixedLagMapper,
+    DEFAULT_ONLINE: FixedLagMapper,
     "landmark-fixed-lag": partial(_baseline, "landmark_fixed_lag:LandmarkFixedLag"),
     "ckf": partial(_baseline, "filters:CkfMapper"),
     "landmark-ckf": partial(_baseline, "filters:LandmarkCkf"),

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from math import nan
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Self
+
+from pathspace_graph.copies import shallow
 
 from .labels import BOUNDARIES, NAMES
 from .lengths import Length, Text
@@ -64,6 +66,12 @@ class HealthMonitor:
         self._offered = 0  # by all the recent cycles together
         self._last_offered: float | None = None
         self._wrong: int | None = None  # this boundary is wrong, as long as it explains too little
+
+    def copy(self) -> Self:
+        """Return a monitor that can go on independently."""
+        other = shallow(self)
+        other._recent = self._recent.copy()
+        return other
 
     def restart(self) -> None:
         self._recent.clear()

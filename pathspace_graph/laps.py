@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 # what counts as passing the start line, the y axis of the map frame at the first pose
-MIN_PATH: Final = 25.0  # least length of a lap (m along the path); jitter may cross the line sooner
-MIN_DISTANCE: Final = 7.0  # least distance from the start that a lap leads to (m)
-GATE_HALF_WIDTH: Final = 5.0  # of the start line (m), with room for the racing line and a lap's drift
-GATE_DEPTH: Final = 10.0  # distance past the line (m) at which a crossing is noticed where an estimate jumped
-MAX_HEADING: Final = np.pi / 3  # largest difference of the heading from the start's at the line (rad)
-END_TOLERANCE: Final = 5.0  # largest distance before the line at which a last lap is complete (m)
+MIN_LAP_PATH: Final = 25.0  # least length of a lap (m along the path); jitter may cross the line sooner
+MIN_LAP_REACH: Final = 7.0  # least distance from the start that a lap leads to (m)
+LINE_HALF_WIDTH: Final = 5.0  # of the start line (m), with room for the racing line and a lap's drift
+LINE_DEPTH: Final = 10.0  # distance past the line (m) at which a crossing is noticed where an estimate jumped
+LINE_HEADING: Final = np.pi / 3  # largest difference of the heading from the start's at the line (rad)
+LAP_END_TOLERANCE: Final = 5.0  # largest distance before the line at which a last lap is complete (m)
 
 
 class LapCounter:
@@ -41,11 +41,11 @@ class LapCounter:
 
     @property
     def last_lap_is_complete(self) -> bool:
-        """Say whether the current lap has come back to within `END_TOLERANCE` of the start line."""
+        """Say whether the current lap has come back to within `LAP_END_TOLERANCE` of the start line."""
         if self._last is None or not self._has_driven_a_lap():
             return False
         x, y, theta = self._last
-        return self._heads_forward(theta) and float(np.hypot(x, y)) <= END_TOLERANCE
+        return self._heads_forward(theta) and float(np.hypot(x, y)) <= LAP_END_TOLERANCE
 
     @property
     def completed(self) -> int:
@@ -53,10 +53,10 @@ class LapCounter:
         return self.lap - 1 + int(self.last_lap_is_complete)
 
     def _has_driven_a_lap(self) -> bool:
-        return self._path >= MIN_PATH and self._farthest >= MIN_DISTANCE
+        return self._path >= MIN_LAP_PATH and self._farthest >= MIN_LAP_REACH
 
     def _heads_forward(self, theta: float) -> bool:
-        return bool(np.cos(theta) > np.cos(MAX_HEADING))
+        return bool(np.cos(theta) > np.cos(LINE_HEADING))
 
     def _passes_the_line(self, x: float, y: float, theta: float) -> bool:
         assert self._last is not None
@@ -64,8 +64,8 @@ class LapCounter:
             return False
         last_x, last_y, _ = self._last
         crossing_y = last_y + (y - last_y) * last_x / (last_x - x) if last_x < 0.0 else np.inf
-        behind = x <= GATE_DEPTH and abs(y) <= GATE_HALF_WIDTH
-        return bool(behind or abs(crossing_y) <= GATE_HALF_WIDTH)
+        behind = x <= LINE_DEPTH and abs(y) <= LINE_HALF_WIDTH
+        return bool(behind or abs(crossing_y) <= LINE_HALF_WIDTH)
 
 
 def lap_end_indices(poses: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -58,7 +58,7 @@ class CycleResult(Brief):
 
 @runtime_checkable
 class OnlineEstimator(Protocol):
-    """Interface of every online estimator; `docs/extending.md` lists methods that it may have as well."""
+    """Interface of every online estimator; `docs/estimators.md` lists methods that it may have as well."""
 
     @property
     def settings(self) -> Any:

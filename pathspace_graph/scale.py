@@ -23,16 +23,16 @@ from .run import split_odometry
 
 R = TypeVar("R")
 
-WIDTH: Final = 3.5  # m from a cone to the nearest one of the other side in Formula Student, median
-GAP: Final = 3.2  # distance of a cone from the nearest one of its row there, m, median
+SCENE_WIDTH: Final = 3.5  # m from a cone to the nearest one of the other side in Formula Student, median
+SCENE_GAP: Final = 3.2  # distance of a cone from the nearest one of its row there, m, median
 SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)  # within a factor of 1.7 of one, maps are as good
-NEAREST: Final = 5  # number of the nearest cones of each side that tell the scale
-FEWEST: Final = 3  # number of cones of each side that a cycle needs
-SAME: Final = 3.0  # largest distance (sigmas) of two detections of one cone
-FARTHEST: Final = 1e4  # largest distance of a cone (m), in a scene of any scale
-MOVED: Final = 0.1  # share of a gap by which the vehicle moves until the next cycle counts
-ENOUGH: Final = 20  # number of cycles that count after which the scale is final
-PATIENCE: Final = 200  # number of cycles after which it is final in any case
+SCENE_NEAREST: Final = 5  # number of the nearest cones of each side that tell the scale
+SCENE_FEWEST: Final = 3  # number of cones of each side that a cycle needs
+SCENE_SAME: Final = 3.0  # largest distance (sigmas) of two detections of one cone
+SCENE_FARTHEST: Final = 1e4  # largest distance of a cone (m), in a scene of any scale
+SCENE_MOVED: Final = 0.1  # share of a gap by which the vehicle moves until the next cycle counts
+SCENE_ENOUGH: Final = 20  # number of cycles that count after which the scale is final
+SCENE_PATIENCE: Final = 200  # number of cycles after which it is final in any case
 
 
 class SceneScale:
@@ -55,7 +55,7 @@ class SceneScale:
         held = np.diff(np.append(odometry.t, max(detections.t, *odometry.t[-1:], -np.inf)))
         self._driven += float(np.hypot(*odometry.twist[:, :2].T) @ held) if len(held) else 0.0
         width, gap = width_and_gap(detections)
-        if not np.isnan(gap) and self._driven >= MOVED * gap:
+        if not np.isnan(gap) and self._driven >= SCENE_MOVED * gap:
             self._driven = 0.0
             self._gaps.append(gap)
             self._widths.append(width)
@@ -68,7 +68,7 @@ class SceneScale:
     @property
     def is_final(self) -> bool:
         """Return whether the value changes no more."""
-        return len(self._gaps) >= ENOUGH or self._cycles >= PATIENCE
+        return len(self._gaps) >= SCENE_ENOUGH or self._cycles >= SCENE_PATIENCE
 
 
 def scale_of(log: Log) -> float:
@@ -99,12 +99,12 @@ def solved(solve: Callable[[Log, float], R], log: Log, settings: MapperSettings)
 
 def width_and_gap(detections: Detections) -> tuple[float, float]:
     """Return the width of the road and the gap of its rows (m) in a cycle; NaN where they aren't seen."""
-    usable = (np.abs(detections.points_vehicle) < FARTHEST).all(axis=1)  # the gate drops the others
+    usable = (np.abs(detections.points_vehicle) < SCENE_FARTHEST).all(axis=1)  # the gate drops the others
     points, labels = detections.points_vehicle[usable], detections.labels[usable]
     sides = labels if (labels != UNKNOWN).any() else np.where(points[:, 1] > 0.0, LEFT, RIGHT)
     covariances = detections.covariances[usable]
     rows = [_nearest_cones(points[sides == s], covariances[sides == s]) for s in (LEFT, RIGHT)]
-    if min(map(len, rows)) < FEWEST:
+    if min(map(len, rows)) < SCENE_FEWEST:
         return np.nan, np.nan
     nearest = [np.asarray(KDTree(row).query(row, k=2)[0])[:, 1] for row in rows]
     left, right = rows
@@ -117,15 +117,15 @@ def _nearest_cones(points: Array, covariances: Array) -> Array:
     for k in np.argsort(np.hypot(*points.T)).tolist():
         apart = ((points[chosen] - points[k]) ** 2).sum(axis=1)
         variance = 0.5 * np.trace(covariances[chosen] + covariances[k], axis1=1, axis2=2)
-        if (apart > SAME**2 * variance).all():
+        if (apart > SCENE_SAME**2 * variance).all():
             chosen.append(k)
-        if len(chosen) == NEAREST:
+        if len(chosen) == SCENE_NEAREST:
             break
     return np.asarray(points[chosen])
 
 
 def _nearest(widths: list[float], gaps: list[float]) -> float:
-    ratios = np.log10([np.median(widths) / WIDTH, np.median(gaps) / GAP])
+    ratios = np.log10([np.median(widths) / SCENE_WIDTH, np.median(gaps) / SCENE_GAP])
     if ratios[0] * ratios[1] <= 0.0:
         return 1.0
     away = 2.0 * ratios[np.abs(ratios).argmin()]

@@ -319,4 +319,4 @@ FORMATS: Final = (
     TrackFormat("EUFS CSV (tag,x,y,direction)", (".csv",), _parse_csv, _is_eufs, _eufs),
     TrackFormat("TUM CSV (# x_m,y_m,w_tr_right_m,w_tr_left_m)", (".csv",), _parse_csv, _is_tum, _tum),
 )
-"""The first format that recognizes a file reads it; docs/extending.md shows how a format is added."""
+"""The first format that recognizes a file reads it; docs/estimators.md shows how a format is added."""

@@ -8,13 +8,35 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-from pathspace_graph.checkpoint import Recovery
+from pathspace_graph import FixedLagMapper
+from pathspace_graph.loop import worker
+from pathspace_graph.run import CycleResult
+
+from .scenes import laps
+from .scenes.session import FOLDER
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the folder of the session, which workers find in their environment."""
+    if not hasattr(config, "workerinput"):
+        folder = TemporaryDirectory(prefix="pathspace-tests-")
+        os.environ[FOLDER] = folder.name
+        config.add_cleanup(folder.cleanup)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _laps_are_solved_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worker, "submit", laps.submit)
+        yield
 
 
 @pytest.fixture
@@ -27,13 +49,13 @@ def png_only(monkeypatch: pytest.MonkeyPatch) -> None:
 def failures_are_seen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Fails a test in which an update failed, unless it is marked `failing`."""
     failures = list[str]()
-    take_back = Recovery.take_back
+    without = FixedLagMapper._without
 
-    def seen(self: Recovery, *arguments: object) -> None:
-        failures.append("an update failed")
-        take_back(self, *arguments)
+    def seen(self: FixedLagMapper, *arguments: Any) -> CycleResult:
+        failures.append(repr(arguments[-1]))
+        return without(self, *arguments)
 
-    monkeypatch.setattr(Recovery, "take_back", seen)
+    monkeypatch.setattr(FixedLagMapper, "_without", seen)
     yield
     if request.node.get_closest_marker("failing") is None:
-        assert not failures
+        assert not failures, failures

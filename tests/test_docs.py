@@ -6,18 +6,20 @@ import ast
 import csv
 import inspect
 import json
-import os
 import re
 import runpy
 import shlex
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
+from functools import cache, partial
 from importlib import import_module
+from itertools import takewhile
+from operator import attrgetter
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, FrameType
 from typing import Any
 
 import gtsam
@@ -26,24 +28,19 @@ import pytest
 
 from pathspace_graph import FixedLagMapper, Log
 from pathspace_graph.cli import COMMANDS, main, parse_command
-from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import write_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.results import read_trajectory, write_result
 from pathspace_graph.labels import NAMES
-from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.run import run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim import track_files
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from .scenes.drives import beginning
-from .scenes.jacobians import numeric_jacobian
 from .scenes.paths import ROOT, modules
-from .scenes.pretenders import write_round_track
 from .test_prose import texts
 from .test_rooms import ARROWS, LEAVES
 
@@ -119,7 +116,7 @@ OUTSIDE = {
     "eufs/",
 }
 """Files and folders that commands write, and folders of track files."""
-ELSEWHERE = {"dead_reckoning", "compass"}
+ELSEWHERE = {"dead_reckoning"}
 """Modules that a page tells its reader to write."""
 
 
@@ -213,12 +210,17 @@ def test_python_blocks_import_what_exists(page: Path) -> None:
     assert [(module, name) for module, name in own if not hasattr(import_module(module), name)] == []
 
 
-@pytest.fixture(scope="module")
-def log() -> Log:
-    """The first eight seconds of a drive on a generated track."""
+@cache
+def eight_seconds() -> Log:
+    """The beginning of a drive on a generated track."""
     drive = simulate(generate_track(np.random.default_rng(0)), SimulationSettings(laps=1), seed=0)
     first = beginning(drive, 80)
     return replace(first, odometry=drive.odometry.between(0.0, first.cycles[-1].t))
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return eight_seconds()
 
 
 def test_the_graph_is_asked_as_the_page_on_python_does(log: Log) -> None:
@@ -254,28 +256,73 @@ def test_the_bridge_of_the_page_on_ros_maps_json_lines(log: Log) -> None:
     assert answers[-1]["pose"][0] > 1.0
 
 
-def test_each_step_of_the_paper_is_two_calls_from_the_update() -> None:
-    page = text_of(ROOT / "docs" / "architecture.md")
-    owners = {"FixedLagMapper": FixedLagMapper, "TrackLoop": TrackLoop}
-    steps = re.findall(r"^\| [^|]* \| `(\w+)\.(\w+)` \| ([^|]*) \|", page, flags=re.MULTILINE)
-    steps = [step for step in steps if step[0] in owners]
-    assert len(steps) == 7
-    update = inspect.getsource(FixedLagMapper._process)
-    for owner, method, functions in steps:
-        assert f".{method}(" in update or method == "_process"
-        for _, function in NAMED.findall(functions):
-            called = function.rpartition(".")[2]
-            assert f"{called}(" in inspect.getsource(getattr(owners[owner], method)), function
+# --- the page on the architecture ------------------------------------------------------------------------
+
+ARCHITECTURE = ROOT / "docs" / "architecture.md"
 
 
-def test_the_architecture_page_has_the_rooms_in_the_order_of_their_imports() -> None:
-    """A room stands below all that it may import, as `test_rooms` has it."""
-    page = text_of(ROOT / "docs" / "architecture.md")
-    table = page[page.index("## Rooms") : page.index("## What flows where")]
-    listed = re.findall(r"^\| `([a-z_.]+)` \|", table, flags=re.MULTILINE)
-    assert set(listed) == set(ARROWS) - LEAVES - {"cli", "__main__"}
-    for place, room in enumerate(listed):
-        assert ARROWS[room] <= set(listed[:place]), room
+def table_below(page: Path, heading: str) -> list[list[str]]:
+    """The cells of the first table below a heading, row by row, without its header."""
+    text = text_of(page)
+    lines = text[text.index(f"\n## {heading}\n") :].splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith("| "))
+    rows = takewhile(lambda line: line.startswith("|"), lines[first + 2 :])
+    return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in rows]
+
+
+def code_of(module: str, path: str) -> CodeType:
+    """The code of a function, or of a method, which may be inherited."""
+    function = attrgetter(path)(import_module(f"{PACKAGE}.{module}"))
+    return inspect.unwrap(getattr(function, "__func__", function)).__code__
+
+
+def first_calls(update: Callable[[], object], wanted: Mapping[CodeType, str]) -> list[str]:
+    """The wanted functions that are called in an update, by the order of their first calls."""
+    called = dict[str, None]()
+
+    def watch(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and frame.f_code in wanted:
+            called.setdefault(wanted[frame.f_code])
+
+    before = sys.getprofile()
+    sys.setprofile(watch)
+    try:
+        update()
+    finally:
+        sys.setprofile(before)
+    return [*called]
+
+
+def test_a_detection_takes_the_path_of_the_architecture_page(log: Log) -> None:
+    """In the order of the page, in one and the same cycle."""
+    path = [str(cells[1]).strip("`") for cells in table_below(ARCHITECTURE, "The path of a detection")]
+    assert 20 < len(path) <= 30
+    wanted = {code_of(*name.split(":")): name for name in path}
+    mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    paths = [first_calls(partial(mapper.update, *cycle), wanted) for cycle in split_odometry(log)]
+    assert path in paths, max(paths, key=len)
+
+
+def test_the_architecture_page_has_ten_owners() -> None:
+    assert len(table_below(ARCHITECTURE, "Owners")) == 10
+
+
+def named_rooms(cell: str) -> list[str]:
+    return re.findall(r"`([a-z_.]+)`", cell)
+
+
+def test_the_architecture_page_has_the_rooms_and_what_they_may_import() -> None:
+    """As `test_rooms` has it: a room imports from rooms above it, or before it in its row."""
+    above: list[str] = []
+    for rooms, _, imports in table_below(ARCHITECTURE, "Rooms"):
+        only, _, but = imports.partition(" but ")
+        allowed = {*above} - {*named_rooms(but)} if "all above" in only else {*named_rooms(only)}
+        row = named_rooms(rooms)
+        for place, room in enumerate(row):
+            assert ARROWS[room] <= allowed | {*row[:place]}, room
+            assert imports.startswith("some of") or ARROWS[room] == allowed, room
+        above += row
+    assert set(above) == set(ARROWS) - LEAVES - {"cli", "__main__"}
 
 
 # --- formats ---------------------------------------------------------------------------------------------
@@ -305,151 +352,12 @@ def test_the_formats_page_has_every_file_column_and_key(log: Log, tmp_path: Path
         assert f"`{key}`" in page, key
 
 
-# --- extending -------------------------------------------------------------------------------------------
-
-EXTENDING = ROOT / "docs" / "extending.md"
-
-
-def module_of(name: str, code: str) -> ModuleType:
-    module = ModuleType(name)
-    exec(compile(code, f"{name}.py", "exec"), vars(module))
-    return module
-
-
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the page's estimator as pip would install it: the module beside its metadata."""
-    folder = tmp_path_factory.mktemp("site")
-    files = file_blocks(EXTENDING)
-    (folder / "dead_reckoning.py").write_text(files["dead_reckoning.py"])
-    project = tomllib.loads(files["pyproject.toml"])["project"]
-    info = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    )
-    groups = [
-        "\n".join([f"[{group}]", *(f"{name} = {target}" for name, target in points.items())])
-        for group, points in project["entry-points"].items()
-    ]
-    (info / "entry_points.txt").write_text("\n".join(groups) + "\n")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def log_folder(installed: Path, log: Log) -> Path:
-    """The short drive as a log folder."""
-    write_log(log, installed / "log")
-    return installed / "log"
-
-
-def run_command(folder: Path, command: str) -> str:
-    """What a command prints; the folder is both where it runs and where the estimator is installed."""
-    paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    arguments = [sys.executable, "-m", PACKAGE, *command.split()]
-    done = subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+# --- the tutorial ----------------------------------------------------------------------------------------
 
 
 def csv_rows(file: Path) -> list[dict[str, str]]:
     with file.open(encoding="utf-8", newline="") as lines:
         return list(csv.DictReader(lines))
-
-
-def test_the_new_estimator_maps_online(installed: Path, log_folder: Path) -> None:
-    printed = run_command(installed, f"online {log_folder} --out map --estimator dead-reckoning")
-    assert "loop not closed" in printed
-    assert len((installed / "map" / "trajectory.tum").read_text().splitlines()) == 80
-
-
-@pytest.mark.slow
-def test_the_new_estimator_is_compared(installed: Path, log_folder: Path) -> None:
-    names = ["dead-reckoning", "landmark-fixed-lag"]
-    run_command(installed, f"compare {log_folder} --out comparison --estimators {' '.join(names)}")
-    rows = csv_rows(installed / "comparison" / "table.csv")
-    assert [row["estimator"] for row in rows] == names
-    assert all(0.0 < float(row["rmse"]) < 1.0 and float(row["missed"]) < 0.9 for row in rows)
-
-
-@pytest.mark.slow
-def test_the_new_estimator_is_ablated(installed: Path) -> None:
-    (installed / "study.toml").write_text(file_blocks(EXTENDING)["dead_reckoning.toml"])
-    track = write_round_track(installed)
-    run_command(installed, f"ablate study.toml --out study --tracks {track} --jobs 1")
-    rows = csv_rows(installed / "study" / "results.csv")
-    assert {row["estimator"] for row in rows} == {"fixed-lag", "dead-reckoning"}
-    assert all(0.0 < float(row["rmse"]) < 1.0 and float(row["missed"]) < 0.9 for row in rows)
-
-
-@pytest.mark.slow
-def test_the_new_estimator_is_scaled(installed: Path) -> None:
-    run_command(installed, "scale --out scaling --quick --estimators dead-reckoning")
-    rows = csv_rows(installed / "scaling" / "points.csv")
-    assert {row["estimator"] for row in rows} == {"dead-reckoning"}
-
-
-def test_the_new_factor_has_the_jacobian_that_it_says() -> None:
-    factor = module_of("compass", file_blocks(EXTENDING)["compass.py"]).compass_factor(0, 3.1, 0.5)
-
-    def whitened(pose: np.ndarray) -> np.ndarray:
-        values = gtsam.Values()
-        values.insert(0, gtsam.Pose2(1.0, 2.0, -3.0).retract(pose))
-        return np.asarray(factor.whitenedError(values))
-
-    values = gtsam.Values()
-    values.insert(0, gtsam.Pose2(1.0, 2.0, -3.0))
-    jacobian, _ = factor.linearize(values).jacobian()
-    np.testing.assert_allclose(jacobian, numeric_jacobian(whitened, np.zeros(3)), atol=1e-6)
-    np.testing.assert_allclose(whitened(np.zeros(3)), [(2.0 * np.pi - 6.1) / 0.5])
-
-
-def test_the_new_factor_holds_the_heading(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = file_blocks(EXTENDING)
-    monkeypatch.setitem(sys.modules, "compass", module_of("compass", files["compass.py"]))
-    drive = module_of("drive", files["drive.py"]).drive
-    assert log.truth is not None
-    stamps = [cycle.t for cycle in log.cycles]
-    headings = np.interp(stamps, log.truth.pose_t, np.unwrap(log.truth.poses[:, 2]))
-    offset = drive(log, headings + 0.05).poses[-1, 2] - drive(log, headings).poses[-1, 2]
-    assert 0.02 < offset < 0.06
-
-
-def test_the_new_track_format_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    namespace = dict(vars(track_files))
-    exec(compile(file_blocks(EXTENDING)["sim/track_files.py"], "extending.md", "exec"), namespace)
-    line = blocks(EXTENDING, "python")[-1]
-    added: tuple[track_files.TrackFormat, ...] = eval(line, namespace)
-    monkeypatch.setattr(track_files, "FORMATS", (*track_files.FORMATS, *added))
-    file = tmp_path / "oval.json"
-    file.write_text(oval())
-    track = track_files.read_track(file)
-    assert len(track.left) == len(track.right) == 30
-    assert track.name == "oval"
-    file.write_text('{"left": [["a", 0]], "right": []}')
-    with pytest.raises(InputError, match="expected 2 numbers at left"):
-        track_files.read_track(file)
-
-
-def oval() -> str:
-    """A round track in the page's format, driven counterclockwise."""
-    angles = 2.0 * np.pi * np.arange(30) / 30.0
-    left, right = (
-        [[float(radius * np.cos(a)), float(radius * np.sin(a))] for a in angles] for radius in (18.0, 22.0)
-    )
-    return f'{{"left": {left}, "right": {right}, "start": [20.0, 0.0, {np.pi / 2}]}}'
-
-
-def sections(page: Path) -> Iterator[str]:
-    yield from re.findall(r"^## (.*)$", prose(page), flags=re.MULTILINE)
-
-
-def test_the_page_has_what_it_promises() -> None:
-    assert list(sections(EXTENDING)) == ["A new estimator", "A new factor", "A new track format"]
-
-
-# --- the tutorial ----------------------------------------------------------------------------------------
 
 
 def tutorial() -> Iterator[str]:
@@ -477,13 +385,14 @@ def run_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_tutorial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], png_only: None
 ) -> None:
-    """As a new user types it, on a track of half the length."""
+    """As a new user types it, on a lap of half the length."""
     pytest.importorskip("rosbags")
     pytest.importorskip("rerun")
     monkeypatch.chdir(tmp_path)
     said = []
     for line in tutorial():
-        run_line(line.replace("200 240 --generator.cones 150", "100 130 --generator.cones 80"), monkeypatch)
+        half = line.replace("200 240 --generator.cones 150", "100 130 --generator.cones 80")
+        run_line(half.replace("--laps 2", "--laps 1 --vehicle.overrun 40"), monkeypatch)
         said.append(capsys.readouterr().out)
     online, reference = (read_map(tmp_path / name) for name in ("map", "reference"))
     assert online.closed

@@ -103,9 +103,15 @@ def test_the_command_line_starts_without_the_heavy_libraries() -> None:
 
 def test_the_version_names_gtsam_and_the_kernels(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
-    assert re.fullmatch(
-        r"pathspace-graph \S+ \(GTSAM \S+, (compiled|numpy) kernels\)\n", capsys.readouterr().out
-    )
+    built = r"(gcc \d+\.\d+|clang \d+\.\d+|MSVC \d+)"
+    assert re.fullmatch(rf"pathspace-graph \S+ \(GTSAM \S+, kernels: {built}\)\n", capsys.readouterr().out)
+
+
+def test_a_package_that_is_not_built_says_what_to_do() -> None:
+    kernels = "pathspace_graph.factors._kernels"
+    code = f"import sys; sys.modules['{kernels}'] = None; import pathspace_graph.factors.se2"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.splitlines()[-1] == f"ImportError: {kernels} is missing: run pip install -e ."
 
 
 def test_the_package_itself_imports_nothing_but_the_standard_library() -> None:

@@ -16,17 +16,16 @@ MOST_FILES = 15
 EXTRAS = {"distributed", "rerun", "rosbags"}
 """Optional packages, which are imported only where they are needed."""
 
-LATE = {"commands.estimate": {"eval.view.recording"}, "factors.kernels": {"factors._kernels"}}
-LATE["io.brief"] = {"eval.figures.map_plot", "frames"}
-"""Modules that are imported by name when needed: matplotlib is slow, and kernels may not be built."""
+LATE = {"commands.estimate": {"eval.view.recording"}, "io.brief": {"eval.figures.map_plot", "frames"}}
+"""Modules that are imported by name when needed, since matplotlib is slow."""
 ASKED = {"io.brief"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""
 
-LEAVES = {"errors", "labels", "console", "lengths"}
+LEAVES = {"errors", "labels", "console", "lengths", "copies"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "baselines"}
 BELOW_MAPPING = {
-    *("factors", "settings", "spline", "io", "graph", "laps", "health", "run", "checkpoint", "snapshot"),
+    *("factors", "settings", "spline", "io", "graph", "laps", "health", "run", "snapshot"),
     "scale",
 }
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
@@ -45,8 +44,7 @@ ARROWS: dict[str, set[str]] = {
     "health": set(),
     "run": {"factors", "io", "laps", "health"},
     "scale": {"factors", "settings", "io", "run"},
-    "checkpoint": set(),
-    "snapshot": {"factors", "io", "graph", "checkpoint"},
+    "snapshot": {"factors", "io", "graph"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
     "plausibility": {"factors", "settings", "spline", "io", "front_end", "scale"},
@@ -179,16 +177,17 @@ ASSIGNED = {
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "eval.view.animation": {"writer.fig"},  # of matplotlib
     "front_end.motion": {"self._rest.sigma"},
-    "front_end.sides": {"near.judged"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
     "baselines.landmark_association": {"detections.landmark"},
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},
     "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
+    "loop.open": {"drive.revisits", "drive.closed_by"},
+    "mapping.road": {"self.smoother.attached"},
     "mapping.smoother": {"self.window.exact"},
-    "online.fixed_lag": {"self.recovery.failures"},
+    "online.fixed_lag": {f"mapper.{part}" for part in ("front_end", "road", "drive", "phase", "health")},
     "online.outlook": {"row.ended"},
     "commands.options": {"entry.metadata"},  # of dataclasses
-    "snapshot": {"array.flags.writeable", "zipped.comment"},  # of numpy and zipfile
+    "snapshot": {"array.flags.writeable"},  # of numpy
 }
 """Attributes that a module assigns to objects of others: no module may have another one."""
 

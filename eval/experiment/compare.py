@@ -110,7 +110,7 @@ def choose(names: Sequence[str]) -> tuple[str, ...]:
 def choose_reference(name: str | None, estimators: Sequence[str]) -> str:
     """Return the named one, or the default estimator if it is compared, or else the first."""
     if name is None:
-        return registry.DEFAULT if registry.DEFAULT in estimators else estimators[0]
+        return registry.DEFAULT_ONLINE if registry.DEFAULT_ONLINE in estimators else estimators[0]
     check_name(name, estimators, "--reference: expected an estimator that is compared")
     return name
 

@@ -19,7 +19,7 @@ from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, ORANGE, WIDTH
 from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN
 from pathspace_graph.io.files import write_json, write_text
-from pathspace_graph.plausibility.diagnosis import LIMIT
+from pathspace_graph.plausibility.diagnosis import PRIOR_LIMIT
 
 from .frame import RUN, last_laps, write_csv, write_results
 from .study import Study, find_study, read_study
@@ -116,7 +116,7 @@ def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
         "reported": int(runs["reported"].sum()),
         "reported_degraded": float(runs["reported_degraded"].mean()),
         "reported_lost": float(runs["reported_lost"].mean()),
-        "calibration": {titles[key]: value for key, value in sigmas.items() if abs(value) > LIMIT},
+        "calibration": {titles[key]: value for key, value in sigmas.items() if abs(value) > PRIOR_LIMIT},
         "notices": dict(Counter(text for text in runs["notices"] if text).most_common()),
     }
 

@@ -46,7 +46,7 @@ class Study:
     laps: int = 5
     name: str = "study"
     question: str = ""
-    estimators: tuple[str, ...] = (registry.DEFAULT,)
+    estimators: tuple[str, ...] = (registry.DEFAULT_ONLINE,)
     """Estimators to run, online and batch ones; `all` stands for every one."""
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
     """Overrides of the simulation by the name of a noise."""

@@ -9,7 +9,6 @@ from typing import Any, Final, TypeGuard
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.kernels import KERNELS
 from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, HealthStretch, counts, stretches
@@ -38,7 +37,6 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "settings": result.settings,
         "scale": result.scale,
         "versions": versions(),
-        "kernels": KERNELS,
         "lap_count": result.laps,
         "closed": result.map.closed,
         "size": result.map.size,
@@ -55,7 +53,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
     if crossed := crossings_of(result):
         summary["crossings"] = [_crossing(one) for one in crossed]
     if hints:
-        summary["hints"] = [hint.texts for hint in hints]
+        summary["hints"] = [vars(hint) for hint in hints]
     told = [record for record in result.cycles if record.jump is not None or record.notice]
     if told:
         keys = ("cycle", "t", "jump", "notice")

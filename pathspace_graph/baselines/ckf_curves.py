@@ -1,9 +1,10 @@
 """The paper's state, a pose and control points of clamped splines, and its growth (paper: Expansion)."""
 
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
@@ -37,6 +38,13 @@ class CurveState:
         self.belief = belief  # mean and covariance of x
         self.curves: dict[int, BSpline] = {}  # by label; control points: only their number is current
         self.pose_u: dict[int, float] = {}  # parameter of the vehicle's foot point on each curve, not wrapped
+
+    def copy(self) -> Self:
+        other = shallow(self)
+        other.belief = self.belief.copy()
+        other.curves = self.curves.copy()
+        other.pose_u = self.pose_u.copy()
+        return other
 
     @property
     def pose(self) -> Array:
@@ -144,10 +152,10 @@ class CurveState:
         return boundary
 
 
-STRETCH: Final = 12.0  # an extension is at most this long (m), so a longer one takes several
+LONGEST_EXTENSION: Final = 12.0  # an extension is at most this long (m), so a longer one takes several
 SIGMA_CARRY: Final = 1.0  # of the control point that carries on a stranded end (m)
-RECENT: Final = 40  # last cones with which a confirmed track is compared
-AT_END: Final = 1e-6  # a foot point within this distance (m) of the end's parameter is at the end
+RECENT_CONES: Final = 40  # last cones with which a confirmed track is compared
+END_TOLERANCE_U: Final = 1e-6  # a foot point within this distance (m) of the end's parameter is at the end
 
 
 class Expansion:
@@ -163,6 +171,13 @@ class Expansion:
         """All distinct cones that were confirmed, as points (2,) in m, map frame, by label."""
         self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # lengths (m) since the last cone
 
+    def copy(self) -> Self:
+        other = shallow(self)
+        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
+        other.observed = {label: known.copy() for label, known in self.observed.items()}
+        other._carried = self._carried.copy()
+        return other
+
     def observe(self, state: CurveState, detections: Detections) -> None:
         """Add all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
         points, covariances = in_map(detections, state.pose)
@@ -170,7 +185,7 @@ class Expansion:
         for label, tentative in self.tentative.items():
             known, radius = self.observed[label], self.settings.growth.merge_radius
             for point in tentative.points[tentative.confirmed()]:
-                if not known or np.hypot(*(np.array(known[-RECENT:]) - point).T).min() > radius:
+                if not known or np.hypot(*(np.array(known[-RECENT_CONES:]) - point).T).min() > radius:
                     known.append(point.copy())
 
     def expand(
@@ -234,7 +249,7 @@ class Expansion:
         covariances = self._covariances(detections, rows)
         for i in range(len(rows)):
             final = i == len(rows) - 1
-            too_far = not final and np.hypot(*(points[i + 1] - last)) > STRETCH
+            too_far = not final and np.hypot(*(points[i + 1] - last)) > LONGEST_EXTENSION
             if final or (too_far and np.hypot(*(points[i] - last)) > self.settings.ckf.threshold):
                 state.extend(label, detections.points_vehicle[rows[i]], covariances[i])
                 last = points[i]
@@ -269,7 +284,7 @@ def beyond_end(
     The foot point is the end `high`; the point is farther from `C_n` than the growth threshold, and farther
     from `C_{n-1}` than the separation.
     """
-    at_end = u >= high - AT_END
+    at_end = u >= high - END_TOLERANCE_U
     far = np.hypot(*(points - control_points[-1]).T) > settings.threshold
     apart = np.hypot(*(points - control_points[-2]).T) > settings.separation
     return np.asarray(at_end & far & apart)

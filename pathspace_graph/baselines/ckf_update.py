@@ -22,7 +22,7 @@ from pathspace_graph.settings.mapper import CkfSettings
 
 from .ckf_curves import CurveState
 
-RANK: Final = 1e-9  # singular values of the gain below this share of the largest one count as zero
+GAIN_RANK: Final = 1e-9  # singular values of the gain below this share of the largest one count as zero
 LEAST_BASIS: Final = 1e-3  # least sum of a control point's basis values for its update
 
 
@@ -97,7 +97,7 @@ class SplineMeasurement:
     def range_basis(self) -> Array:
         """Return an orthonormal basis (r, q) of the range of G: all that the detections can change."""
         vectors, values, _ = np.linalg.svd(self.gain, full_matrices=False)
-        return np.asarray(vectors[:, values > RANK * values[0]])
+        return np.asarray(vectors[:, values > GAIN_RANK * values[0]])
 
 
 def regularization(basis: Array, settings: CkfSettings) -> Array:

@@ -1,83 +1,52 @@
 """The paper's filters: that of splines, which closes its loop, and its landmark baseline (paper: Results)."""
 
-from abc import abstractmethod
-from dataclasses import replace
-from typing import Final
+from typing import ClassVar, Final, Self
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.se2 import left_of, to_map
-from pathspace_graph.front_end.front_end import FrontEnd
+from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.variables import POINT, POSE, pose_keys
-from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
-from pathspace_graph.io.results import RunNoise, VehicleState
+from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.loop.closing import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping import registration
 from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.motion import MeasuredMotion, known_noise
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import Motion, near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.settings.mapper import MapperSettings, known_settings
+from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 
 from .ckf_curves import CurveState, Expansion, in_map
 from .ckf_update import OnCurve, classify, update
-from .landmark_association import ROUGH, associate, compatible, pair_costs
+from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
+from .online import OnlineBaseline
 
-REACH: Final = 9.0  # a curve is extended up to this far ahead of the vehicle (m along the predicted path)
-SIGMA_MATCH: Final = 0.6  # of a detection in the registration (m), which is worse than online
-PATIENCE: Final = 30.0  # length of the beginning (m) driven again that closes the loop, however uncertain:
-SIGMA_PATIENCE: Final = 1000.0  # replaces `closing.sigma_max` (m) then
+FILTER_REACH: Final = 9.0  # how far ahead of the vehicle a curve is extended (m along the predicted path)
 SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the loop closes (m)
 TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
 
-Used = tuple[int, tuple[int, int], bool]  # number of detections that were used, sizes, whether it has closed
-
-
-class _Filter:
+class _Filter(OnlineBaseline):
     """What both filters share."""
 
-    def __init__(
-        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
-    ) -> None:
-        self.settings = known_settings(settings)
-        self.scale = self.settings.scale or 1.0
-        self.front_end = FrontEnd(self.settings, known_noise(odometry_sigma, self.scale), self.scale)
-        self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
-        self._begin()
-
-    @abstractmethod
     def _begin(self) -> None:
-        """Make what only this filter has."""
+        self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
 
-    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        watch = Stopwatch()
-        cycle = self.front_end.admit(odometry, detections)
-        reading = self.front_end.update(cycle.odometry, cycle.detections)
-        self.belief.follow(reading.motion)
-        detections = self.belief.corrected(reading.detections)
-        used, sizes, closed = self._use(reading.motion, detections, watch)
-        pose = self.belief.pose.copy()
-        return cycle.counted(CycleResult(detections.t, pose, sizes, used, closed, watch.laps))
-
-    @abstractmethod
-    def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
-        """Map a cycle."""
-
-    def noise_used(self) -> RunNoise:
-        return scaled(self.front_end.noise_used, self.scale)
+    def copy(self) -> Self:
+        other = super().copy()
+        other.belief = self.belief.copy()
+        return other
 
     def vehicle_state(self) -> VehicleState:
         return scaled(self.belief.vehicle_state(), self.scale)
@@ -87,6 +56,7 @@ class CkfMapper(_Filter):
     """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points."""
 
     def _begin(self) -> None:
+        super()._begin()
         self.state = CurveState(self.belief, self.settings)
         self.path = DrivenPath()
         self.expansion = Expansion(self.settings)
@@ -94,11 +64,19 @@ class CkfMapper(_Filter):
         self._recent: list[tuple[Array, Detections]] = []
         self._last_check = 0.0
 
-    def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
+    def copy(self) -> Self:
+        other = super().copy()
+        other.state, other.path = self.state.copy(), self.path.copy()
+        other.belief, other.expansion = other.state.belief, self.expansion.copy()
+        return other
+
+    def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         state = self.state
+        self.belief.follow(reading.motion)
+        detections = self.belief.corrected(reading.detections)
         state.locate_vehicle()
         self.path.update(state.pose.copy())
-        self.path.steer(motion.twists)
+        self.path.steer(reading.motion.twists)
         watch.lap("predict")
         found = classify(state, detections)
         watch.lap("classify")
@@ -109,7 +87,8 @@ class CkfMapper(_Filter):
         self._close(detections)
         watch.lap("close")
         left, right = (state.curves[label].size if label in state.curves else 0 for label in BOUNDARIES)
-        return sum(len(on.rows) for on in found.values()), (left, right), self.closed
+        used = sum(len(on.rows) for on in found.values())
+        return CycleResult(detections.t, state.pose.copy(), (left, right), used, self.closed, watch.laps)
 
     def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
         if self.closed:
@@ -118,7 +97,7 @@ class CkfMapper(_Filter):
         free = np.ones(len(detections.labels), bool)
         for on in found.values():
             free[on.rows] = False
-        path_ahead = self.path.ahead(self.state.pose, REACH)
+        path_ahead = self.path.ahead(self.state.pose, FILTER_REACH)
         extended = self.expansion.expand(self.state, detections, path_ahead, free)
         return classify(self.state, detections) if extended else found
 
@@ -127,8 +106,8 @@ class CkfMapper(_Filter):
         settings, state = self.settings.closing, self.state
         if self.closed:
             return
-        self._recent.append((state.pose.copy(), detections))
-        self._recent = [cycle for cycle in self._recent if cycle[1].t > detections.t - registration.WINDOW]
+        recent = [*self._recent, (state.pose.copy(), detections)]
+        self._recent = [cycle for cycle in recent if cycle[1].t > detections.t - registration.WINDOW]
         too_soon = self.path.length - self._last_check < settings.check_interval
         if too_soon or not state.curves or not near_start(self.path, state.pose, settings):
             return
@@ -138,23 +117,28 @@ class CkfMapper(_Filter):
             simplify(state, self.expansion.observed)
             self.closed = True
 
-    def map(self) -> Map:
-        state = self.state
-        curves = {b: SplineBoundary(state.spline(b), state.covariance(b)) for b in state.curves}
-        return scaled(Map(self.closed, curves, state.belief.covariance[HEAD:, HEAD:].copy()), self.scale)
+    def _map(self, with_covariance: bool) -> Map:
+        state, curves = self.state, {}
+        for label in state.curves:
+            covariance = state.covariance(label) if with_covariance else NO_COVARIANCE
+            curves[label] = SplineBoundary(state.spline(label), covariance)
+        joint = state.belief.covariance[HEAD:, HEAD:].copy() if with_covariance else None
+        return Map(self.closed, curves, joint)
 
-    def outline(self) -> Map:
-        curves = {b: SplineBoundary(self.state.spline(b), NO_COVARIANCE) for b in self.state.curves}
-        return scaled(Map(self.closed, curves), self.scale)
+
+class EarlySegmentSettings(ClosingSettings, group="closing"):
+    """The registration of a filter, which is less certain than online, and closes the loop in the end."""
+
+    sigma_reading: ClassVar[float] = 0.6
+    patience: ClassVar[float] = 30.0
+    sigma_patience: ClassVar[float] = 1000.0
 
 
 def associate_early_segment(
     state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
 ) -> Motion | None:
     """Return the motion that moves the newest detections onto the beginning of the curves, or None."""
-    closing = replace(
-        state.settings.closing, sigma_reading=SIGMA_MATCH, patience=PATIENCE, sigma_patience=SIGMA_PATIENCE
-    )
+    closing = EarlySegmentSettings(**vars(state.settings.closing))
     track = CurveMap(state.settings)
     for label in state.curves:
         track.state.add_boundary(label, state.boundary(label), state.control_points(label))
@@ -236,10 +220,18 @@ class LandmarkCkf(_Filter):
     """
 
     def _begin(self) -> None:
+        super()._begin()
         self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
 
-    def _use(self, motion: MeasuredMotion, detections: Detections, watch: Stopwatch) -> Used:
+    def copy(self) -> Self:
+        other = super().copy()
+        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
+        return other
+
+    def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
+        self.belief.follow(reading.motion)
+        detections = self.belief.corrected(reading.detections)
         watch.lap("predict")
         landmark, is_new = self._associate(detections)
         watch.lap("associate")
@@ -247,11 +239,13 @@ class LandmarkCkf(_Filter):
         watch.lap("update")
         self._create(detections, is_new)
         watch.lap("create")
-        return int((landmark != UNASSOCIATED).sum()), landmark_counts(self.labels), False
+        pose, sizes = self.belief.pose.copy(), landmark_counts(self.labels)
+        used = int((landmark != UNASSOCIATED).sum())
+        return CycleResult(detections.t, pose, sizes, used, False, watch.laps)
 
     def _associate(self, detections: Detections) -> tuple[IntArray, BoolArray]:
         points = to_map(detections.points_vehicle, self.belief.pose[None])
-        nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH)[1])
+        nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH_GATE)[1])
         predicted, covariances = np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
         if (k := len(nearby)) > 0:
             seen = self.belief.predict_detections(nearby)
@@ -291,9 +285,6 @@ class LandmarkCkf(_Filter):
             self.belief.add_points(detections.points_vehicle[rows], detections.covariances[rows])
             self.labels = np.concatenate([self.labels, detections.labels[rows]])
 
-    def map(self) -> Map:
-        covariance = self.belief.covariance[HEAD:, HEAD:]
-        return scaled(point_map(self.belief.points, self.labels, covariance, False), self.scale)
-
-    def outline(self) -> Map:
-        return scaled(point_map(self.belief.points, self.labels, None, False), self.scale)
+    def _map(self, with_covariance: bool) -> Map:
+        joint = self.belief.covariance[HEAD:, HEAD:] if with_covariance else None
+        return point_map(self.belief.points, self.labels, joint, False)

@@ -1,7 +1,7 @@
 """Which detection is of which landmark, by the Hungarian assignment, and which landmarks are one cone."""
 
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import scipy  # which imports its modules when they are used
@@ -17,33 +17,27 @@ from pathspace_graph.settings.online import GrowthSettings
 
 from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother, LandmarkState, two_rows
 
-ROUGH: Final = 5.0  # a landmark farther from every detection of a cycle than this (m) is not tested at all
+ROUGH_GATE: Final = 5.0  # a landmark farther from all detections of a cycle (m) is not tested
 HELD_MARGIN: Final = 1e-9  # of a held pair below the match gate, where round-off would decide
 
 
-class Gates(NamedTuple):
-    """Gates on squared Mahalanobis distances, chi-square quantiles with two degrees of freedom."""
-
-    match: float  # below it, a detection may be associated with a landmark
-    create: float  # above it for every compatible landmark, a detection may create one
-
-
 MATCH: Final = 0.95  # probability of the gate inside which a detection may be of a landmark
-CREATE: Final = 0.99  # probability of the gates of all landmarks outside of which a detection may be new
-GATES: Final = Gates(chi2_quantile(MATCH, POINT), chi2_quantile(CREATE, POINT))
+CREATE: Final = 0.99  # of the gates of all landmarks outside of which a detection may be new
+MATCH_GATE: Final = chi2_quantile(MATCH, POINT)  # on squared Mahalanobis distances, as is the next one
+CREATE_GATE: Final = chi2_quantile(CREATE, POINT)
 
 
-def associate(cost: Array, gates: Gates = GATES) -> tuple[IntArray, BoolArray]:
+def associate(cost: Array) -> tuple[IntArray, BoolArray]:
     """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
     cost (m, n) are squared Mahalanobis distances of detections to landmarks, infinite for other labels.
     Return the column (m,) of each landmark, or UNASSOCIATED, and which detections (m,) may create one.
     """
     landmark = np.full(len(cost), UNASSOCIATED, np.intp)
-    rows, columns = scipy.optimize.linear_sum_assignment(np.minimum(cost, gates.match))
-    chosen = cost[rows, columns] < gates.match
+    rows, columns = scipy.optimize.linear_sum_assignment(np.minimum(cost, MATCH_GATE))
+    chosen = cost[rows, columns] < MATCH_GATE
     landmark[rows[chosen]] = columns[chosen]
-    return landmark, np.asarray((cost > gates.create).all(axis=1))
+    return landmark, np.asarray((cost > CREATE_GATE).all(axis=1))
 
 
 def squared_mahalanobis(innovations: Array, covariances: Array) -> Array:
@@ -62,10 +56,10 @@ def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_co
     return squared_mahalanobis(innovations, predicted_covariances[None] + covariances[:, None])
 
 
-def hysteresis_costs(cost: Array, held: BoolArray, gates: Gates = GATES) -> Array:
+def hysteresis_costs(cost: Array, held: BoolArray) -> Array:
     """Return the costs, where `held` pairs stay in the match gate up to the create gate, lest they flip."""
-    inside = (1.0 - HELD_MARGIN) * gates.match
-    return np.where(held & (cost < gates.create), np.minimum(cost, inside), cost)
+    inside = (1.0 - HELD_MARGIN) * MATCH_GATE
+    return np.where(held & (cost < CREATE_GATE), np.minimum(cost, inside), cost)
 
 
 def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
@@ -82,7 +76,7 @@ def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray
     detections, state = smoother.map.detections, smoother.map.state
     rows = np.arange(new.start, new.stop)
     points = detections.points_map(rows, smoother.variables)
-    near = nearest_within(state.landmarks, points, ROUGH)[1]
+    near = nearest_within(state.landmarks, points, ROUGH_GATE)[1]
     landmarks = np.flatnonzero(near & eligible)
     numbers = state.numbers[landmarks]
     predicted = predict(smoother, landmarks)
@@ -91,7 +85,7 @@ def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray
     landmark, is_new = associate(np.where(same_label, any_label, np.inf))
     matched = landmark != UNASSOCIATED
     detections.take(rows[matched], numbers[landmark[matched]])
-    explained = (any_label < GATES.match).any(axis=1)
+    explained = (any_label < MATCH_GATE).any(axis=1)
     detections.landmark[rows[~matched & (~is_new | explained)]] = AMBIGUOUS
     if explained.any():
         state.vote(detections.label[rows[explained]], numbers[any_label[explained].argmin(axis=1)])
@@ -167,7 +161,7 @@ def compatible_pairs(newer: IntArray, older: IntArray, offset: Array, covariance
     distance = squared_mahalanobis(offset, covariances)
     taken: set[int] = set()
     chosen = []
-    for row in np.argsort(distance)[: int((distance < GATES.match).sum())].tolist():
+    for row in np.argsort(distance)[: int((distance < MATCH_GATE).sum())].tolist():
         pair = {int(newer[row]), int(older[row])}
         if taken.isdisjoint(pair):
             taken |= pair

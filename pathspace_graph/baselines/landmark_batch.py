@@ -32,15 +32,15 @@ from pathspace_graph.scale import solved
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 from . import landmark_association as association
-from .landmark_association import GATES, find_duplicates
+from .landmark_association import MATCH_GATE, find_duplicates
 from .landmark_fixed_lag import LandmarkFixedLag
 from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
 
-NAME: Final = "landmark-batch"  # the estimator's name on the command line
+LANDMARK_BATCH: Final = "landmark-batch"  # the estimator's name on the command line
 MAX_ROUNDS: Final = 10  # most rounds of associating all detections anew
-SETTLED: Final = 1e-3  # largest share of detections that change their landmark in the last round
+SETTLED_SHARE: Final = 1e-3  # largest share of detections that change their landmark in the last round
 MAX_STEPS: Final = 80  # most steps of a round's optimization
-TOLERANCE: Final = 1e-6  # largest relative gain of the last step
+GAIN_TOLERANCE: Final = 1e-6  # largest relative gain of the last step
 
 
 class LandmarkBatch:
@@ -61,7 +61,7 @@ class LandmarkBatch:
         system, state = start_online(log, LandmarkSystem.of_log(log, self.settings, noise), noise)
         system.optimize(state)
         for _ in range(MAX_ROUNDS):
-            converged = self._refresh(system, state) <= SETTLED * len(system.detections)
+            converged = self._refresh(system, state) <= SETTLED_SHARE * len(system.detections)
             system.optimize(state)
             if converged:
                 break
@@ -83,7 +83,7 @@ class LandmarkBatch:
         for pose in poses:
             laps.update(pose)
         return BatchRun(
-            estimator=NAME,
+            estimator=LANDMARK_BATCH,
             settings=settings_dict(replace(self.settings, scale=scale)),
             map=point_map(state.landmarks, state.labels, problem.joint(state.keys), laps.completed > 0),
             trajectory_t=system.chain.stamps,
@@ -140,7 +140,7 @@ class LandmarkSystem:
             else:
                 cost -= gain
                 damping.lower()
-            if damping.exhausted or 0.0 <= gain <= TOLERANCE * cost:
+            if damping.exhausted or 0.0 <= gain <= GAIN_TOLERANCE * cost:
                 break
         self.detections.correct(variables.sensor)
 
@@ -185,14 +185,14 @@ class Reassociation:
         cost = self._costs(rows, landmarks)
         held = detections.landmark[rows] == self.state.numbers[landmarks]
         cost = association.hysteresis_costs(cost, held)
-        relabel(self.state, detections.label, rows, landmarks, cost, GATES.match)
+        relabel(self.state, detections.label, rows, landmarks, cost, MATCH_GATE)
         detections.landmark[:] = UNASSOCIATED
         free = np.ones(len(detections), bool)
         starts = np.searchsorted(detections.cycle[rows], np.arange(len(self.stamps) + 1))
         for begin, end in pairwise(starts.tolist()):
             self._assign_cycle(rows[begin:end], landmarks[begin:end], cost[begin:end], free)
         # a landmark with another label explains it, or one that a new landmark would be merged with
-        known = (cost < GATES.match) | (distances < self.settings.growth.merge_radius)
+        known = (cost < MATCH_GATE) | (distances < self.settings.growth.merge_radius)
         free[rows[known]] = False
         self._create(np.flatnonzero(free & ~detections.used))
 
@@ -210,7 +210,7 @@ class Reassociation:
     def _nearby_pairs(self) -> tuple[IntArray, IntArray, Array]:
         """Return the detections (k,), ascending, landmarks and distances (m) of pairs in the rough gate."""
         points, tree = KDTree(self.points_map), KDTree(self.state.landmarks)
-        pairs = points.sparse_distance_matrix(tree, association.ROUGH, output_type="coo_matrix")
+        pairs = points.sparse_distance_matrix(tree, association.ROUGH_GATE, output_type="coo_matrix")
         order = np.argsort(pairs.row, kind="stable")
         return pairs.row[order].astype(np.intp), pairs.col[order].astype(np.intp), pairs.data[order]
 

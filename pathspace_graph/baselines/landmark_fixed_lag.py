@@ -4,19 +4,17 @@ The loop closes where enough of the landmarks seen now are those of the beginnin
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import chi2_quantile
-from pathspace_graph.front_end.front_end import FrontEnd
+from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import POINT
-from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import RunNoise, VehicleState
+from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.lengths import POSE, scaled, times
 from pathspace_graph.mapping import motion as motions
@@ -25,31 +23,25 @@ from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
-from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 from . import landmark_association as association
-from .landmark_association import CREATE, GATES, difference_covariances, find_duplicates, squared_mahalanobis
+from .landmark_association import CREATE, MATCH_GATE, difference_covariances
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
+from .online import OnlineBaseline
 
-UNSEEN: Final = 40.0  # path (m) without a detection after which a landmark is not associated near the start
+UNSEEN_PATH: Final = 40.0  # path (m) without a detection: a landmark is not associated near the start
 MIN_PAIRS: Final = 4  # recognized landmarks that close the loop, a third of them of each colour
 MIN_LEAD: Final = 2.0  # over any other set of pairs, where each landmark counts as one gate
 
 
-class LandmarkFixedLag:
+class LandmarkFixedLag(OnlineBaseline):
     """Maps cones as points: predict, associate, create, update, close, marginalize.
 
     Window, odometry and robust weights are those of `FixedLagMapper`, but each detection has one landmark in
-    place of a curve. `odometry_sigma` (3,) is the standard deviation of a twist reading (m/s, m/s, rad/s).
+    place of a curve.
     """
 
-    def __init__(
-        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
-    ) -> None:
-        self.settings = known_settings(settings)
-        self.scale = self.settings.scale or 1.0
-        noise = motions.known_noise(odometry_sigma, self.scale)
-        self.front_end = FrontEnd(self.settings, noise, self.scale)
+    def _begin(self) -> None:
         self.smoother = FixedLagSmoother(motions.smoother_settings(self.settings), LandmarkMap(self.settings))
         self.smoother.window.exact = True
         self.path = DrivenPath()
@@ -59,10 +51,13 @@ class LandmarkFixedLag:
         self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
         self._last_check = 0.0
 
-    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        watch = Stopwatch()
-        cycle = self.front_end.admit(odometry, detections)
-        reading = self.front_end.update(cycle.odometry, cycle.detections)
+    def copy(self) -> Self:
+        other = super().copy()
+        other.smoother, other.path = self.smoother.copy(), self.path.copy()
+        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
+        return other
+
+    def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         motion, detections = reading.motion, reading.detections
         predict(self.smoother, self.path, motion, detections.t)
         watch.lap("predict")
@@ -77,7 +72,7 @@ class LandmarkFixedLag:
         watch.lap("close")
         self.smoother.marginalize()
         watch.lap("marginalize")
-        return cycle.counted(self._result(detections.t, watch.laps))
+        return self._result(detections.t, watch.laps)
 
     def _use(self, new: slice, t: float, watch: Stopwatch) -> None:
         eligible = np.ones(len(self.smoother.map.state), bool)
@@ -121,7 +116,7 @@ class LandmarkFixedLag:
 
     def _old(self) -> BoolArray:
         last_detected = self._last_detected[self.smoother.map.state.numbers]
-        return np.asarray(last_detected < self.path.length - UNSEEN)
+        return np.asarray(last_detected < self.path.length - UNSEEN_PATH)
 
     def _close(self) -> None:
         """Close the loop or, once it has closed, merge duplicates; this is tried every few metres."""
@@ -134,7 +129,9 @@ class LandmarkFixedLag:
             return
         self._last_check = length
         if self.closed:
-            self._merge(*find_duplicates(state, len(state), self.smoother.last_covariance, self.settings))
+            self._merge(
+                *association.find_duplicates(state, len(state), self.smoother.last_covariance, self.settings)
+            )
         elif self._near_start():
             reach = self.settings.closing.radius_after(length)
             recent, old = state.positions(detected), np.flatnonzero(self._old())
@@ -155,16 +152,12 @@ class LandmarkFixedLag:
         used = int((detections.used & (detections.cycle == self.smoother.next_cycle - 1)).sum())
         return CycleResult(t, self.smoother.variables.poses[-1].copy(), sizes, used, self.closed, stages)
 
-    def map(self) -> Map:
+    def _map(self, with_covariance: bool) -> Map:
         state = self.smoother.map.state
-        if len(state) == 0:
-            return Map(self.closed, {})
-        joint = self.smoother.last_covariance(state.keys)
-        return scaled(point_map(state.landmarks, state.labels, joint, self.closed), self.scale)
-
-    def outline(self) -> Map:
-        state = self.smoother.map.state
-        return scaled(point_map(state.landmarks, state.labels, None, self.closed), self.scale)
+        if with_covariance and len(state):
+            joint = self.smoother.last_covariance(state.keys)
+            return point_map(state.landmarks, state.labels, joint, self.closed)
+        return point_map(state.landmarks, state.labels, None, self.closed)
 
     def window_poses(self) -> Array:
         poses: Array = times(self.smoother.variables.poses.copy(), POSE, self.scale)
@@ -178,9 +171,6 @@ class LandmarkFixedLag:
         feet = np.full(points.shape, np.nan)
         feet[used] = state.landmarks[state.positions(table.landmark[rows[used]])]
         return scaled(Readings(points, table.label[rows], used, feet), self.scale)
-
-    def noise_used(self) -> RunNoise:
-        return scaled(self.front_end.noise_used, self.scale)
 
     def vehicle_state(self) -> VehicleState:
         return scaled(vehicle_state(self.smoother), self.scale)
@@ -201,7 +191,8 @@ class JointCompatibility:
         """Return the squared Mahalanobis distances (k, n) of all pairs; other labels give infinity."""
         k = len(self.recent)
         spread = difference_covariances(covariance, np.arange(k)[:, None], np.arange(k, len(mean)))
-        return np.where(self.same_label, squared_mahalanobis(mean[:k, None] - mean[None, k:], spread), np.inf)
+        squared = association.squared_mahalanobis(mean[:k, None] - mean[None, k:], spread)
+        return np.where(self.same_label, squared, np.inf)
 
     def conditioned(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
         """Return the Gaussian given that recent landmark i is old landmark j: one Kalman update."""
@@ -240,7 +231,7 @@ def detect_loop(
     old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
         return None
-    gate = GATES.match
+    gate = MATCH_GATE
     test = JointCompatibility(smoother, recent, old, settings.closing.prior_scale)
     seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
     if len(seeds) == 0:

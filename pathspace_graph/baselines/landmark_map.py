@@ -1,10 +1,11 @@
 """The landmark map: landmarks with their variables, detections with associations, and two rows for each."""
 
-from dataclasses import dataclass, field
-from typing import Final, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import Final, Self, TypeAlias
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights, whiteners
 from pathspace_graph.factors.residuals import landmark_residuals
@@ -41,6 +42,12 @@ class LandmarkState:
         self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)  # (n, 2) detections by label
         self.next_number = 0
+
+    def copy(self) -> Self:
+        other = shallow(self)
+        other.variables = self.variables.copy()
+        other.votes = self.votes.copy()
+        return other
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -86,6 +93,9 @@ class LandmarkDetections(DetectionColumns):
 
     landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # or UNASSOCIATED or AMBIGUOUS
 
+    def copy(self) -> Self:
+        return replace(self, landmark=self.landmark.copy(), changed=self.changed.copy())
+
     @property
     def used(self) -> BoolArray:
         return self.landmark >= 0
@@ -114,6 +124,14 @@ class LandmarkMap:
         self.twist: Array = np.zeros(POSE)  # (3,) at the newest detections (m/s, m/s, rad/s)
         self.loop_pairs: IntArray = NO_PAIRS  # (k, 2) numbers, held together while the loop closes
         self.merged_into: dict[int, int] = {}  # number that was kept by the one that was merged
+
+    def copy(self) -> Self:
+        other = shallow(self)
+        other.state = self.state.copy()
+        other.variables = other.state.variables
+        other.detections = self.detections.copy()
+        other.merged_into = self.merged_into.copy()
+        return other
 
     def add(self, detections: Detections, cycle: int, twist: Array) -> slice:
         """Add the corrected detections of the newest cycle, made at a twist (3,); return their rows."""

@@ -30,8 +30,8 @@ from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE as POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import known_noise, size_of_vehicle, with_inflated_priors, with_size
+from pathspace_graph.mapping.orange import OrangeCones, Sighting
 from pathspace_graph.mapping.state import State
-from pathspace_graph.mapping.tentative import OrangeCones, Sighting
 from pathspace_graph.run import Stopwatch, settings_dict
 from pathspace_graph.scale import solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings

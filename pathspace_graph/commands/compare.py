@@ -8,7 +8,7 @@ from joblib import Parallel, delayed
 from tyro.conf import Positional, arg
 
 from pathspace_graph.console import note, output, progress, say
-from pathspace_graph.estimators import DEFAULT, make_online
+from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import Comparison, compare, side_by_side
@@ -116,7 +116,7 @@ def map_with_both(log: Log, settings: MapperSettings) -> tuple[RunResult, RunRes
     """Return the spline graph's result and the landmark graph's, which runs in another process."""
     with workers(2, None):  # with one job it would be run here, and first
         rival = Parallel(return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
-        result = map_online(log, make_online(DEFAULT, settings, log))
+        result = map_online(log, make_online(DEFAULT_ONLINE, settings, log))
         with progress(RIVAL):
             (landmarks,) = rival  # to the end, or joblib warns of tasks that were cancelled
         return result, landmarks

@@ -16,7 +16,7 @@ from pathspace_graph import estimators
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
-from pathspace_graph.estimators import DEFAULT, DEFAULT_BATCH
+from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.reference import gap
@@ -51,7 +51,7 @@ class Online:
     """Folder of the log."""
     out: Path
     """Folder for the map; an earlier map there is kept as a numbered backup."""
-    estimator: str = DEFAULT
+    estimator: str = DEFAULT_ONLINE
     """Name of the online estimator."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
@@ -99,8 +99,10 @@ class Online:
     def _check_snapshots(self) -> None:
         """Raise a SettingsError where a snapshot is asked for that cannot be, before anything is mapped."""
         for name in ("save", "resume"):
-            if getattr(self, name) is not None and self.estimator != DEFAULT:
-                raise SettingsError(f"--{name}: expected --estimator {DEFAULT}, found {self.estimator}")
+            if getattr(self, name) is not None and self.estimator != DEFAULT_ONLINE:
+                raise SettingsError(
+                    f"--{name}: expected --estimator {DEFAULT_ONLINE}, found {self.estimator}"
+                )
         if self.resume is not None and self.settings != MapperSettings():
             expected = "expected no settings, since the saved mapper has its own"
             raise SettingsError(f"--resume: {expected}, found some")
@@ -112,7 +114,7 @@ class Online:
         if self.resume is None:
             return log, estimators.make_online(self.estimator, self.settings, log)
         mapper = FixedLagMapper.restore(self.resume)
-        times = mapper.smoother.times
+        times = mapper.road.smoother.times
         cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])
         if not cycles:
             expected = f"expected cycles after {times[-1]:g} s, where {self.resume} ends"
@@ -208,7 +210,7 @@ def tell(hints: Sequence[Hint], of: str = "") -> None:
 
 
 def map_online(
-    log: Log, estimator: OnlineEstimator, name: str = DEFAULT, observers: Sequence[Observer] = ()
+    log: Log, estimator: OnlineEstimator, name: str = DEFAULT_ONLINE, observers: Sequence[Observer] = ()
 ) -> RunResult:
     """Map a log with progress; the map at the end of each true lap is kept where there is truth."""
     times = summary.lap_times(log)

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.estimators import DEFAULT, ONLINE, check_online
+from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online
 from pathspace_graph.eval.benchmark import scaling as timing
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import measure_scaling
@@ -95,7 +95,7 @@ class FaultSuite(StudyCommand):
     with the same seed.
     """
 
-    estimator: str = DEFAULT
+    estimator: str = DEFAULT_ONLINE
     """Name of the estimator, an online or a batch one."""
     only: tuple[str, ...] = ()
     """Names of the faults to run, as in the table."""

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
@@ -45,6 +46,7 @@ class Reading:
     seen_again: BoolArray  # (m,) whether each of them lies where the cycles just before had one
     orange: Detections  # detections of orange cones, which bound no road
     stated: tuple[Detections, Detections]  # those of both kinds as they came, before any noise was measured
+    noise: NoiseLearner  # noise as it is known now
     sensor_doubted: bool = False  # whether readings contradict the prior of the sensor's yaw or latency
     measured: MapperSettings | None = None  # with priors of calibrations that were measured in this cycle
     notice: str = ""  # what the labels mean from now on, where that has changed
@@ -61,6 +63,13 @@ class FrontEnd:
         self._settings = settings
         self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently, and shares what nothing changes."""
+        other = shallow(self)
+        other.noise, other.gate = self.noise.copy(), self.gate.copy()
+        other._motion, other._sides = self._motion.copy(), self._sides.copy()
+        return other
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
         """Return a usable cycle, or raise a ReadingError."""
@@ -94,7 +103,7 @@ class FrontEnd:
             settings, self._begun = noise.calibrated(self._settings), True
         measured = None if settings is self._settings else settings
         seen, notice = check.seen_again, "; ".join(notices)
-        return Reading(motion, judged, seen, orange, stated, self._sensor_doubted, measured, notice)
+        return Reading(motion, judged, seen, orange, stated, noise, self._sensor_doubted, measured, notice)
 
     @property
     def noise_used(self) -> RunNoise:

@@ -8,14 +8,15 @@ A cycle comes in metres of its scene and leaves the gate at scale 1; its result 
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.errors import InputError, ReadingError
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.io.log import (
     DETECTIONS_FILE,
     MIN_INTERVAL,
@@ -83,6 +84,10 @@ class Gate:
         self.refused = 0  # number of cycles that were refused since the last one that was used
         self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
         self._dropping = False
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def admit(self, odometry: Odometry, detections: Detections, newest: Newest) -> Admitted:
         """Return a cycle as an estimator may use it; otherwise raise a ReadingError and count it as refused.
@@ -219,7 +224,7 @@ def possible_detections(
     if count > MAX_DETECTIONS:
         raise ReadingError("detections.points_vehicle", f"at most {MAX_DETECTIONS} rows", count)
     ranges, sigmas = (MIN_RANGE * scale, limits.range_max), (MIN_SIGMA * scale, MAX_SIGMA * scale)
-    near, definite = _usable(points, covariances, (*ranges, MAX_ASYMMETRY, MIN_DETERMINANT, *sigmas))
+    near, definite = kernels.usable(points, covariances, (*ranges, MAX_ASYMMETRY, MIN_DETERMINANT, *sigmas))
     good = near & definite
     if good.all():
         return Detections(t, points, covariances, labels), ""
@@ -234,25 +239,6 @@ def possible_detections(
     dropped = f"{count - int(good.sum())} of {count} detections dropped"
     notice = f"{dropped}: expected {expected}, found {found} in row {row}"
     return Detections(t, points[good], covariances[good], labels[good]), notice
-
-
-@compiled
-def _usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tuple[BoolArray, BoolArray]:
-    """Return which points (m, 2) are where a sensor sees, and which covariances (m, 2, 2) are possible.
-
-    The limits are those of the range, MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA and MAX_SIGMA.
-    """
-    min_range, max_range, asymmetry, determinant, min_sigma, max_sigma = limits
-    distance = np.hypot(points[:, 0], points[:, 1])
-    near = (distance >= min_range) & (distance <= max_range)
-    xx, xy, yx, yy = covariances.reshape(-1, 4).T
-    with np.errstate(over="ignore", invalid="ignore"):
-        det = xx * yy - xy * yx
-        largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
-        good = (xx > 0.0) & (yy > 0.0) & (np.abs(xy - yx) <= asymmetry * largest)
-        good &= (det > determinant * xx * yy) & (det >= min_sigma**2 * largest)
-        good &= largest <= max_sigma**2
-    return np.asarray(near), np.asarray(good)
 
 
 def _labels(values: Any, count: int) -> IntArray:

@@ -11,11 +11,12 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, ray_axes
-from pathspace_graph.factors.se2 import in_vehicle, left_of, rotations, to_map
-from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE, by_bend, by_sensor
+from pathspace_graph.factors.se2 import in_vehicle, rotations, to_map
+from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE
 
 from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, ConeTracker, SeenCycle, Sightings, TwistRecord
 
@@ -27,8 +28,7 @@ less than 0.05 m/s is lost in the noise of its detections."""
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02, 0.02])
 """Weak priors of the sensor's errors (rad, m, s, -, m), of the bend of its ranges (1/m) and of the yaw rate's
 bias (rad/s), one sigma. Without the bend, yaw, lateral offset and scale would take it up."""
-CONSTANTS: Final = len(PRIOR)
-BEND: Final = SENSOR_SIZE  # place of the bend among them
+BEND: Final = SENSOR_SIZE  # place of the bend among the constants
 FIRST_ALONG: Final = (0.1, 0.04)
 FIRST_ACROSS: Final = (0.05, 0.016)  # noise that the iteration begins with: m and m/m, then m and rad
 PASSES: Final = 4  # times that cones are followed
@@ -109,7 +109,7 @@ def _cones(sightings: Sightings) -> _Cones | None:
 
 
 def _columns(table: Sightings, first: IntArray, seen: Array) -> Array:
-    return _by_constants(seen, table.twist, table.pose, table.by_bias, first, BENDS_FROM)
+    return kernels.by_constants(seen, table.twist, table.pose, table.by_bias, first, BENDS_FROM)
 
 
 def _runs(groups: IntArray) -> tuple[IntArray, IntArray]:
@@ -118,54 +118,16 @@ def _runs(groups: IntArray) -> tuple[IntArray, IntArray]:
     return begins, np.diff(np.append(begins, len(groups)))
 
 
-@compiled
-def _by_constants(
-    seen: Array, twists: Array, poses: Array, by_bias: Array, first: IntArray, bends_from: float
-) -> Array:
-    """Return the derivatives (n, 2, 7) of sightings at points (n, 2), vehicle frame, in the map frame.
-
-    They are by the constants (`PRIOR`). The bias of the yaw rate counts from each cone's first sighting, at
-    rows (n,): before, it turns all of the cone's alike.
-    """
-    then, moved = by_bias[first], poses[:, :2] - poses[first, :2]
-    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    (x, y), (ahead, left) = by_sensor(seen, twists).transpose(1, 0, 2), np.hsplit(seen, 2)
-    columns, turned = np.empty((len(seen), 2, CONSTANTS)), by_bias - then
-    columns[:, 0, :SENSOR_SIZE], columns[:, 1, :SENSOR_SIZE] = c * x - s * y, s * x + c * y
-    in_map = np.concatenate([c * ahead - s * left, s * ahead + c * left], axis=1)
-    columns[:, :, BEND] = -by_bend(seen)[:, None] * in_map
-    columns[:, :, -1] = turned[:, :2] - then[:, 2:] * left_of(moved) + turned[:, 2:] * left_of(in_map)
-    return columns
-
-
 def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
     """Return constants b (7,), both covariances of them, and what is left (n, 2) of the sightings.
 
     The cones' places, weighted means of `p + A b`, are eliminated. One covariance is `_clustered`.
     """
-    columns, points, own, vectors = _centred(cones.begins, information, cones.columns, cones.points)
+    columns, points, own, vectors = kernels.centred(cones.begins, information, cones.columns, cones.points)
     covariance = np.asarray(np.linalg.inv(own.sum(axis=0) + np.diag(PRIOR**-2)), np.float64)
     errors = -covariance @ vectors.sum(axis=0)
     scores = vectors + own @ errors
     return errors, covariance, _clustered(cones, scores, covariance), points + columns @ errors
-
-
-@compiled
-def _centred(
-    begins: IntArray, information: Array, columns: Array, points: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return columns A (n, 2, 7) and points p (n, 2) less each cone's weighted mean, and its sums.
-
-    Those are `A' W A` (c, 7, 7) and `A' W p` (c, 7), with information W (n, 2, 2) of the sightings of cones
-    that begin at rows (c,).
-    """
-    counts = np.diff(np.append(begins, len(points)))
-    both = np.concatenate([columns, points[:, :, None]], axis=2)
-    total = np.linalg.inv(np.add.reduceat(information, begins))
-    both -= np.repeat(total @ np.add.reduceat(information @ both, begins), counts, axis=0)
-    columns, points = both[:, :, :-1], both[:, :, -1]
-    sums = np.add.reduceat(columns.transpose(0, 2, 1) @ information @ both, begins)
-    return columns, points, sums[:, :, :-1], sums[:, :, -1]
 
 
 def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
@@ -190,35 +152,15 @@ def _residuals(cones: _Cones, errors: Array, noise: Rays, odometry: Array) -> tu
     """
     points, sigmas = cones.points + cones.columns @ errors, cones.sigmas(noise)
     weight = 1.0 / (sigmas**2).mean(axis=0)
-    values, sought = np.column_stack([points, *sigmas]), (NEAR, NEAR_TIME)
-    rows, counts, means = _references(cones.table.cone, cones.table.t, cones.ranges, weight, values, sought)
+    values, table = np.column_stack([points, *sigmas]), cones.table
+    sought = NEAR, NEAR_TIME
+    rows, counts, means = kernels.references(table.cone, table.t, cones.ranges, weight, values, sought)
     offsets, lag = cones.on_axes(points[rows] - means[:, 1:3], rows), means[:, 0]
     across = odometry[1] ** 2 + (odometry[2] * cones.ranges[rows]) ** 2
     known = np.array([odometry[0] ** 2 * lag, across * lag])
     for axis, one in enumerate(noise):
         known[axis] += means[:, 3 + axis] ** 2 * np.maximum(1.0 / counts, one.share)
     return rows, offsets, known
-
-
-@compiled
-def _references(
-    cone: IntArray, t: Array, ranges: Array, weight: Array, values: Array, sought: tuple[float, float]
-) -> tuple[IntArray, IntArray, Array]:
-    """Return the rows (k,) of sightings with two references or more, their counts, and means (k, 1 + q).
-
-    References of a sighting (n,) are those of its cone within a share of its range and a time of it (s). The
-    weighted means over them are of the time to them and of values (n, q).
-    """
-    share, time = sought
-    i, j = pairs(cone)
-    chosen = (np.abs(t[j] - t[i]) < time) & (ranges[j] < share * ranges[i])
-    i, j = i[chosen], j[chosen]
-    begins, counts = _runs(i)
-    rows = i[begins]
-    both, total = np.column_stack([np.abs(t[j] - t[i]), values[j]]), np.add.reduceat(weight[j], begins)
-    means = np.add.reduceat(weight[j, None] * both, begins) / total[:, None]
-    enough = counts >= 2
-    return rows[enough], counts[enough], means[enough]
 
 
 def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
@@ -309,9 +251,15 @@ class Measurement:
         found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
         return cls(cycles, replace(found, odometry=sigma, interval=interval))
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other._tracker = self._tracker.copy()
+        return other
+
     def _begin(self, found: MeasuredNoise) -> None:
         self._found, self._tracker, self._followed = found, ConeTracker(found), 0
-        self._sightings: list[Sightings] = []
+        self._sightings: tuple[Sightings, ...] = ()
         self._cones: _Cones | None = None
 
     def advance(self) -> MeasuredNoise | None:
@@ -319,11 +267,11 @@ class Measurement:
         if self._cones is not None:
             return self._round(self._cones)
         cycles = self._cycles[self._followed : self._followed + FOLLOWED]
-        self._sightings.append(self._tracker.follow(cycles))
+        self._sightings = (*self._sightings, self._tracker.follow(cycles))
         self._followed += FOLLOWED
         if self._followed < len(self._cycles):
             return None
-        self._sightings = [Sightings.stacked(self._sightings)]
+        self._sightings = (Sightings.stacked(self._sightings),)
         self._cones = _cones(self._sightings[0])
         if self._cones is None:
             return self._passed(self._found)

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
@@ -66,6 +68,13 @@ class MotionCheck:
         self._rest = Rest(sigma)
         self._standstill = Standstill()
         self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other.errors, other._recent = self.errors.copy(), self._recent.copy()
+        other._rest, other._standstill = self._rest.copy(), self._standstill.copy()
+        return other
 
     def set_noise(self, sigma: Array) -> None:
         """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten."""
@@ -216,7 +225,7 @@ class MotionCheck:
         """Return how far the detections are from the predicted pose (3,), in the vehicle's frame."""
         known = matched.pose, matched.information, self._excess, predicted, odometry.covariance
         way = rotation(predicted[2]).T @ (predicted[:2] - self._recent.seen_from)
-        return Difference(*scans.off_prediction(*known), self.errors.shifts(way, odometry.twist))
+        return Difference(*kernels.off_prediction(*known), self.errors.shifts(way, odometry.twist))
 
     @property
     def _excess(self) -> float:
@@ -256,6 +265,10 @@ class Rest:
     def __init__(self, sigma: Array) -> None:
         self.sigma = sigma
         self.end()
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def end(self) -> None:
         self._since: float | None = None

@@ -1,13 +1,13 @@
 """Noise that is used in a drive: what the log states, or what the drive itself has shown so far."""
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
@@ -39,11 +39,18 @@ class NoiseLearner:
         """Whether the noise of odometry and detections is the measured one."""
         self.of_sensor = use != "stated"  # its constant errors: stated noise says nothing of them
         self.measured = known.measured  # what was measured so far, or by an earlier look at the whole drive
-        self._cycles: deque[SeenCycle] = deque(maxlen=MOST_CYCLES)
+        self._cycles: tuple[SeenCycle, ...] = ()  # the newest ones
         self._twists = TwistRecord()
         self._measurement: Measurement | None = None
         self._driven, self._due = 0.0, FIRST
         self._t: float | None = None
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other._twists = self._twists.copy()
+        other._measurement = self._measurement and self._measurement.copy()
+        return other
 
     @property
     def is_learning(self) -> bool:
@@ -66,13 +73,14 @@ class NoiseLearner:
         if not self.is_learning:
             return False
         self._twists.add(odometry)
-        self._cycles.append(SeenCycle(detections, pose.copy(), motion.odometry.twist))
+        seen = SeenCycle(detections, pose.copy(), motion.odometry.twist)
+        self._cycles = (*self._cycles[1 - MOST_CYCLES :], seen)
         if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > MIN_SPEED:
             self._driven += min(detections.t - self._t, 1.0)
         self._t = detections.t
         if self._measurement is None and self._driven >= self._due:
             self._due = AGAIN * self._driven
-            self._measurement = Measurement.of(list(self._cycles), self._twists, self.measured)
+            self._measurement = Measurement.of(self._cycles, self._twists, self.measured)
         found = None if self._measurement is None else self._measurement.advance()
         if found is None:
             return False

@@ -9,13 +9,13 @@ by -psi. Detections that are late by tau lie too far ahead by `tau v`, which cha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
@@ -51,6 +51,10 @@ class RecentDetections:
         # a row is [stamp | point as measured | place of the vehicle | derivatives of x | derivatives of y]
         self._table: Array = np.zeros((0, 5 + 2 * len(ERRORS)))
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
+
     def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
         """Add detections (m, 2) at t (s) from a pose (3,), and their derivatives (m, 2, e) by errors."""
         new = np.empty((len(measured), self._table.shape[1]))
@@ -76,7 +80,7 @@ class RecentDetections:
 
     def has(self, points: Array) -> BoolArray:
         """Return whether each point (m, 2) lies where an earlier detection does."""
-        return np.asarray(_weighted_means(points, self.points, REACH_LAST, FARTHEST)[1] > MIN_WEIGHT)
+        return np.asarray(kernels.weighted_means(points, self.points, REACH_LAST, FARTHEST)[1] > MIN_WEIGHT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,62 +113,20 @@ def match(
     SIGMA_CONE^2` with n_i the sum of the weights. The variances (m,) are those of one coordinate (m^2).
     """
     limits = (FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE, MIN_MATCHED, LEAST_SHARE)
-    pose, information, matched, cost = _matched(
+    pose, information, matched, cost = kernels.matched(
         recent.points, points_vehicle, variances, start, reaches, limits
     )
     return Match(pose, information, matched, cost / max(int(matched.sum()), 1))
 
 
-@compiled
-def _matched(
-    recent: Array,
-    points_vehicle: Array,
-    variances: Array,
-    start: Array,
-    reaches: Sequence[float],
-    limits: tuple[float, ...],
-) -> tuple[Array, Array, BoolArray, float]:
-    """Return the pose (3,) of `match`, and information (3, 3), matches (m,) and cost of its last step."""
-    pose, (farthest, min_weight, huber, sigma_cone, min_matched, least_share) = start.copy(), limits
-    for reach in reaches:
-        points = to_map(points_vehicle, pose[None])
-        means, weights = _weighted_means(points, recent, reach, farthest)
-        matched = weights > min_weight
-        off, arm = (points - means)[matched], (points - pose[:2])[matched]
-        precision = 1.0 / (variances[matched] * (1.0 + 1.0 / weights[matched]) + sigma_cone**2)
-        square = (off * off).sum(axis=1)
-        precision *= huber_weights(np.sqrt(square * precision), huber)
-        (ax, ay), (ex, ey) = arm.T, off.T
-        w, wx, wy = precision.sum(), -(precision @ ay), precision @ ax
-        turning = precision @ (ax * ax + ay * ay)
-        information = np.array([[w, 0.0, wx], [0.0, w, wy], [wx, wy, turning]])
-        gradient = np.array([precision @ ex, precision @ ey, precision @ (ax * ey - ay * ex)])
-        if matched.sum() < min_matched:
-            break
-        regular = information + np.diag(least_share * information.diagonal())
-        pose = pose - np.linalg.solve(regular, gradient)
-    return pose, information, matched, float(square @ precision)
-
-
 def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:
     """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given."""
     points = to_map(points_vehicle, pose[None])
-    means, weights = _weighted_means(points, recent.points, REACH_LAST, FARTHEST)
+    means, weights = kernels.weighted_means(points, recent.points, REACH_LAST, FARTHEST)
     matched = weights > MIN_WEIGHT
     variance = variances * (1.0 + 1.0 / np.where(matched, weights, 1.0)) + SIGMA_CONE**2
     square = np.where(matched, ((points - means) ** 2).sum(axis=1) / variance, MOST_MISFIT)
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
-
-
-@compiled
-def _weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
-    """Return means (m, 2) of recent points by `exp(-d^2 / 2 reach^2)`, and the sums of weights."""
-    dx = points[:, 0, None] - recent[:, 0]
-    dy = points[:, 1, None] - recent[:, 1]
-    square = (dx * dx + dy * dy) / reach**2
-    weights = np.where(square < farthest**2, np.exp(-0.5 * square), 0.0)
-    total = weights.sum(axis=1)
-    return (weights @ recent) / np.maximum(total, _TINY)[:, None], total
 
 
 # --- errors of the sensor --------------------------------------------------------------------------------
@@ -202,6 +164,10 @@ class SensorErrors:
         self._velocity: Array = np.zeros(3)
         self._possible: Array = 0.5 * MEMORY * np.array(settings.accelerations)
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
+
     def contradict(self, settings: CalibrationSettings) -> bool:
         """Return whether the errors contradict the sensor's prior, by `settings.doubt` sigmas."""
         if not settings.sensor:
@@ -229,7 +195,7 @@ class SensorErrors:
         return np.asarray(difference.covariance + shifts @ self.covariance @ shifts.T)
 
     def square_of(self, difference: Difference) -> float:
-        return _squared(difference.off, difference.covariance, difference.shifts, self.covariance)
+        return kernels.squared(difference.off, difference.covariance, difference.shifts, self.covariance)
 
     def shifts(self, way: Array, velocity: Array) -> Array:
         """Return the derivatives (3, 2) of how far a match is off the odometry, by the errors.
@@ -243,30 +209,4 @@ class SensorErrors:
     def update(self, difference: Difference, dt: float) -> None:
         """Learn from a match that agrees, dt (s) after the last; it counts by its share of memory."""
         measured = difference.off, difference.covariance, difference.shifts, min(dt / MEMORY, 1.0)
-        self.mean, self.covariance = _learned(self.mean, self.covariance, dt * self._drift, *measured)
-
-
-@compiled
-def off_prediction(
-    pose: Array, information: Array, excess: float, predicted: Array, covariance: Array
-) -> tuple[Array, Array]:
-    """Return how far a match, of variance times `excess`, is off a prediction, and its covariance."""
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(predicted[2]).T
-    return turn @ (pose - predicted), turn @ (excess * np.linalg.inv(information)) @ turn.T + covariance
-
-
-@compiled
-def _squared(off: Array, covariance: Array, shifts: Array, errors: Array) -> float:
-    """Return `d' (K + S P S')^-1 d` of an offset d (3,) with K (3, 3), S (3, 2) and P (2, 2)."""
-    return float(off @ np.linalg.solve(covariance + shifts @ errors @ shifts.T, off))
-
-
-@compiled
-def _learned(
-    mean: Array, errors: Array, drift: Array, off: Array, covariance: Array, shifts: Array, share: float
-) -> tuple[Array, Array]:
-    """Return mean (2,) and covariance (2, 2) of the errors after a measurement that counts by a share."""
-    weighted = share * np.linalg.solve(covariance, shifts).T
-    known = np.asarray(np.linalg.inv(np.linalg.inv(errors + drift) + weighted @ shifts))
-    return mean + known @ weighted @ off, known
+        self.mean, self.covariance = kernels.learned(self.mean, self.covariance, dt * self._drift, *measured)

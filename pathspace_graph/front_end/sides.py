@@ -5,17 +5,18 @@ path decide together what colours mean. Where most have none, two rows of cones 
 vehicle ahead, each cone to the row that it fits better.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import to_map, wrap_angle
+from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.path import SIDES, DrivenPath, PathAhead, in_front_row
+from pathspace_graph.mapping.rows import ConeRow, deal_out
 from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.online import SidesSettings
 
@@ -36,11 +37,6 @@ SURE: Final = 3.0  # length ahead of it up to which the path tells sides, m; bey
 BESIDE: Final = 2.0  # distance along the path within which cones stand beside each other, m
 LATERAL_GAP: Final = 0.8  # distance from a nearer cone beside it beyond which a cone is of another stretch, m
 HALF_WIDTH: Final = 1.5  # distance beside the vehicle at which a row without any cone begins, m
-GAP: Final = 8.0  # largest distance of neighbouring cones of a row, m
-TURN: Final = 1.3  # largest turn of a row from one cone to the next, rad
-TURN_COST: Final = 2.0  # the next cone of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)
-CLEAR: Final = 1.3  # least cost of the next cone of a row in the other row, by its own cost
-MIN_WIDTH: Final = 1.8  # least distance of a cone of one row from each cone of the other row, m
 
 
 class SideJudge:
@@ -54,6 +50,12 @@ class SideJudge:
         self._cones = NearCones()
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
         self._known = self._unknown = 0.0  # newest detections with and without a colour
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other._path, other._cones = self._path and shallow(self._path), self._cones.copy()
+        return other
 
     def update(
         self, pose: Array, twists: Array, detections: Detections, *, in_lane: bool = False
@@ -94,7 +96,7 @@ class SideJudge:
         stations, lateral = path.locate(near.points[fresh])
         beside = (np.abs(lateral) > MIN_LATERAL) & (np.abs(lateral) < MAX_LATERAL)
         beside &= (stations > path.driven) & (stations < path.driven + REACH)
-        near.judged[fresh[beside]] = True
+        near.judge(fresh[beside])
         is_left = near.votes[fresh, LEFT] > near.votes[fresh, RIGHT]
         agree = (lateral > 0.0) == is_left
         self._agreeing += int((agree & beside).sum())
@@ -118,79 +120,31 @@ class SideJudge:
         if len(seen) == 0:
             return sides
         stations, lateral = path.locate(near.points[seen])
-        rows = {label: self._beginning(label, pose, path, seen, stations, lateral) for label in BOUNDARIES}
-        taken = [cone for row in rows.values() for cone in row.cones]
-        ahead = seen[stations > path.driven]
-        votes = near.votes[:, ::-1] if self.swapped else near.votes
-        follow_rows(rows, near.points, votes, np.setdiff1d(ahead, taken))
-        for label, row in rows.items():
-            sides[row.cones] = label
+        rows = [self._beginning(label, pose, path, seen, stations, lateral) for label in BOUNDARIES]
+        free = np.setdiff1d(seen[stations > path.driven], [*rows[0].chosen, *rows[1].chosen])
+        votes = near.votes[free, ::-1] if self.swapped else near.votes[free]
+        deal_out(rows, free, votes.T[::-1] <= votes.T + 1)  # one wrong colour excludes no cone
+        for label, row in zip(BOUNDARIES, rows, strict=True):
+            sides[row.chosen] = label
         return sides
 
     def _beginning(
         self, label: int, pose: Array, path: PathAhead, seen: IntArray, stations: Array, lateral: Array
-    ) -> "ConeRow":
+    ) -> ConeRow:
+        """Return the row of a boundary up to the vehicle, through the cones (k,) that were seen."""
         side = SIDES[label] * lateral
         beside = (side > MIN_LATERAL) & (side < MAX_LATERAL)
         beside &= (stations > path.driven - BEHIND) & (stations < path.driven + SURE)
         order = np.flatnonzero(beside)[np.argsort(stations[beside])]
-        cones = seen[order[in_front_row(stations[order], side[order], BESIDE, LATERAL_GAP)]].tolist()
-        left = np.array([-np.sin(pose[2]), np.cos(pose[2])])
-        points = self._cones.points[cones[-2:]]
-        row = ConeRow(cones, pose[:2] + SIDES[label] * HALF_WIDTH * left, float(pose[2]))
-        if cones:
-            row.end = points[-1]
+        cones = seen[order[in_front_row(stations[order], side[order], BESIDE, LATERAL_GAP)]]
+        candidates, ahead = self._cones.points, np.array([np.cos(pose[2]), np.sin(pose[2])])
+        line = candidates[cones]
+        if len(cones) == 0:
+            line = pose[None, :2] + SIDES[label] * HALF_WIDTH * np.array([[-ahead[1], ahead[0]]])
         if len(cones) > 1:
-            row.heading = float(np.arctan2(*(points[1] - points[0])[::-1]))
-        return row
-
-
-@dataclass
-class ConeRow:
-    """A row of cones, the nearest first."""
-
-    cones: list[int]
-    end: Array  # (2,) point at which the row ends, m
-    heading: float  # direction in which it leads there, rad
-
-    def lead_to(self, cone: int, point: Array) -> None:
-        dx, dy = point - self.end
-        self.cones.append(cone)
-        self.end, self.heading = point, float(np.arctan2(dy, dx))
-
-
-def follow_rows(rows: Mapping[int, ConeRow], points: Array, votes: IntArray, free: IntArray) -> None:
-    """Lead both rows on through free cones (k,), as long as it is clear which cone comes next.
-
-    All cones have points (n, 2) in m, and votes (n, 2) for left and right. The next one has the least
-    `distance (1 + TURN_COST turn^2)` from the end of its row, and is far dearer for the other row.
-    """
-    left = free.tolist()
-    while left:
-        candidates = np.array(left)
-        to_lead = [_costs(rows, label, points, votes, candidates) for label in (LEFT, RIGHT)]
-        costs = np.array([cost for cost, _ in to_lead])
-        within = np.where([distance < GAP for _, distance in to_lead], costs, np.inf)
-        label, best = divmod(int(within.argmin()), len(left))
-        if np.isinf(within[label, best]) or costs[1 - label, best] < CLEAR * within[label, best]:
-            return
-        rows[label].lead_to(left[best], points[left[best]])
-        del left[best]
-
-
-def _costs(
-    rows: Mapping[int, ConeRow], label: int, points: Array, votes: IntArray, cones: IntArray
-) -> tuple[Array, Array]:
-    """Return what it costs a row to lead on to cones (k,), and how far they are from its end (m)."""
-    row, other = rows[label], rows[LEFT + RIGHT - label]
-    dx, dy = (points[cones] - row.end).T
-    distance, turn = np.hypot(dx, dy), wrap_angle(np.arctan2(dy, dx) - row.heading)
-    allowed = np.abs(turn) < TURN
-    allowed &= votes[cones, LEFT + RIGHT - label] <= votes[cones, label] + 1
-    if other.cones:
-        off = points[cones][:, None] - points[other.cones][None]
-        allowed &= np.hypot(off[..., 0], off[..., 1]).min(axis=1) > MIN_WIDTH
-    return np.where(allowed, distance * (1.0 + TURN_COST * turn**2), np.inf), distance
+            step = line[-1] - line[-2]
+            ahead = step / np.hypot(*step)
+        return ConeRow(SIDES[label], line, ahead, candidates, cones.tolist())
 
 
 class NearCones:
@@ -202,6 +156,10 @@ class NearCones:
         self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)  # (n, 2) detections by label
         self.judged: BoolArray = np.zeros(0, bool)  # (n,) whether its colour was compared with its side
         self._last: Array = np.zeros(0)
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: arrays that are written into are new in each call."""
+        return shallow(self)
 
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:
         """Add detections at points (m, 2) with labels (m,), seen at t (s); return the cone (m,) of each."""
@@ -219,3 +177,8 @@ class NearCones:
         np.add.at(self.points, cones, (points - self.points[cones]) / self.counts[cones, None])
         self._last[cones] = t
         return cones
+
+    def judge(self, cones: IntArray) -> None:
+        """Note that the colours of cones (k,) were compared with their sides."""
+        self.judged = self.judged.copy()
+        self.judged[cones] = True

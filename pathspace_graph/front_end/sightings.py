@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from math import comb
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import left_of, to_map
 from pathspace_graph.io.log import Detections, Odometry
@@ -49,7 +50,7 @@ class Sightings:
         return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     @classmethod
-    def stacked(cls, tables: "list[Sightings]") -> "Sightings":
+    def stacked(cls, tables: "Sequence[Sightings]") -> "Sightings":
         return cls(*(np.concatenate([getattr(one, column.name) for one in tables]) for column in fields(cls)))
 
 
@@ -72,6 +73,10 @@ class ConeTracker:
         self._count = 0
         self._from: tuple[float, Array, Array] | None = None  # stamp, pose and `by_bias` of the latest cycle
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
+
     def follow(self, cycles: Sequence[SeenCycle]) -> Sightings:
         """Return the sightings of the next cycles as measured, in order of time, the nearest first."""
         if not cycles:
@@ -88,7 +93,7 @@ class ConeTracker:
         points = to_map(self._known.corrected(measured, twists[cycle]), poses[cycle])
         begins, gates = cycle.searchsorted(np.arange(len(cycles) + 1)), self._gates(ranges)
         cycles_seen = begins, t, poses[:, :2].copy(), points, labels[order], ranges, *gates
-        cones, self._cones, self._count = _followed(
+        cones, self._cones, self._count = kernels.followed(
             *cycles_seen, self._cones, self._count, (MAX_AGE, *FOLLOWING)
         )
         of_cone, by_bias = cones >= 0, self._by_bias(t, poses)
@@ -116,106 +121,20 @@ class ConeTracker:
         return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
 
 
-@compiled
-def _followed(
-    begins: IntArray,
-    stamps: Array,
-    places: Array,
-    points: Array,
-    labels: IntArray,
-    ranges: Array,
-    along: Array,
-    across: Array,
-    cones: Cones,
-    count: int,
-    limits: tuple[float, float, float],
-) -> tuple[IntArray, Cones, int]:
-    """Return the number (m,) of the cone of each detection, or -1, the cones then, and their count so far.
-
-    Detections at points (m, 2) have gates along and across their rays (m,), and begin at `begins` (c + 1,) in
-    cycles at times (c,) and places (c, 2). The limits are `MAX_AGE` and `FOLLOWING`.
-    """
-    numbers, (max_age, *weights) = np.full(len(points), -1), limits
-    for k, t in enumerate(stamps.tolist()):
-        known, kinds, nearest, last, own = (column[cones[3] > t - max_age] for column in cones)
-        rows, size = slice(begins[k], begins[k + 1]), len(own)
-        gates = along[rows], across[rows]
-        index, known, nearest = _assigned(
-            points[rows], labels[rows], ranges[rows], places[k], *gates, known, kinds, nearest, weights
-        )
-        new, first = np.unique(index[index >= size], return_index=True)
-        first = np.flatnonzero(index >= size)[first]
-        last[index[(index >= 0) & (index < size)]] = t
-        added = points[rows][first], labels[rows][first], ranges[rows][first], np.full(len(new), t)
-        columns = (known, kinds, nearest, last, own), (*added, count + np.arange(len(new)))
-        known, kinds, nearest, last, own = map(np.concatenate, zip(*columns, strict=True))
-        cones, count = (known, kinds, nearest, last, own), count + len(new)
-        numbers[rows] = np.append(own, -1)[index]
-    return numbers, cones, count
-
-
-def _assigned(
-    points: Array,
-    labels: IntArray,
-    ranges: Array,
-    place: Array,
-    along: Array,
-    across: Array,
-    known: Array,
-    known_labels: IntArray,
-    nearest: Array,
-    weights: Sequence[float],
-) -> tuple[IntArray, Array, Array]:
-    """Return the cone of each detection at points (m, 2), and places and least ranges of the known cones.
-
-    A detection with gates along and across its ray (m,) from a place (2,) is of the nearest known cone (n,)
-    of its label in its gate. The others are new cones from n on, each of the first of those beside it, or -1
-    where that one is not a cone of its own. A cone goes to its detections by the weights (`FOLLOWING`).
-    """
-    index, least, moved = np.full(len(points), -1), nearest.copy(), known.copy()
-    if len(known):
-        square = _gated_squares(points, known, place, along, across)
-        square[labels[:, None] != known_labels] = np.inf
-        best = square.argmin(axis=1)
-        near = square[np.arange(len(points)), best] < 1.0
-        index[near] = best[near]
-    rows = np.flatnonzero(index >= 0)
-    own, inverse, counts = np.unique(index[rows], return_inverse=True, return_counts=True)
-    mean, closest = np.zeros((len(own), 2)), np.full(len(own), np.inf)
-    np.add.at(mean, inverse, points[rows] / counts[inverse, None])
-    np.minimum.at(closest, inverse, ranges[rows])
-    moved[own] += np.where(closest <= nearest[own], *weights)[:, None] * (mean - moved[own])
-    least[own] = np.minimum(nearest[own], closest)
-    new = np.flatnonzero(index < 0)
-    if len(new):
-        same = _gated_squares(points[new], points[new], place, along[new], across[new]) < 1.0
-        first = (same & (labels[new][:, None] == labels[new])).argmax(axis=1)
-        is_first = first == np.arange(len(new))
-        number = np.where(is_first, len(known) + np.cumsum(is_first) - 1, -1)
-        index[new] = number[first]
-    return index, moved, least
-
-
-def _gated_squares(points: Array, others: Array, place: Array, along: Array, across: Array) -> Array:
-    """Return `(a_ij / along_i)^2 + (c_ij / across_i)^2` (m, n) on the rays from a place (2,)."""
-    ray = points - place
-    ray = ray / np.maximum(np.hypot(ray[:, 0], ray[:, 1]), np.finfo(float).tiny)[:, None]
-    off = others - points[:, None]
-    a = off[:, :, 0] * ray[:, :1] + off[:, :, 1] * ray[:, 1:]
-    c = off[:, :, 1] * ray[:, :1] - off[:, :, 0] * ray[:, 1:]
-    return np.asarray((a / along[:, None]) ** 2 + (c / across[:, None]) ** 2)
-
-
 class TwistRecord:
     """Newest twists that were measured while the vehicle drove."""
 
     def __init__(self) -> None:
-        self._parts: list[Odometry] = []
+        self._parts: tuple[Odometry, ...] = ()
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def add(self, odometry: Odometry) -> None:
-        self._parts.append(odometry)
+        self._parts = (*self._parts, odometry)
         if len(self._parts) > MOST_PARTS:
-            self._parts = [Odometry(*self._newest)]
+            self._parts = (Odometry(*self._newest),)
 
     @property
     def _newest(self) -> tuple[Array, Array]:

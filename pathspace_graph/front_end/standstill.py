@@ -5,12 +5,13 @@ cycles of the last second are laid on each other, as if the vehicle stood and as
 nothing is seen of the motion, as between walls, both fit alike, and the odometry is believed.
 """
 
-from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, move_points, relative
 
@@ -38,24 +39,28 @@ class Standstill:
     """Judge of whether the vehicle stands by the cones of the last second."""
 
     def __init__(self) -> None:
-        self._cycles: deque[_Cycle] = deque()  # the newest first
+        self._cycles: tuple[_Cycle, ...] = ()  # the newest first
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
 
     def add(self, t: float, points: Array, covariances: Array, delta: Array) -> None:
         """Add corrected detections (n, 2), vehicle frame, at t (s) after a motion (3,) by the odometry."""
         cycles = self._cycles
         by_odometry = compose(cycles[0].by_odometry, delta) if cycles else np.zeros(3)
         if cycles and np.hypot(delta[0], delta[1]) > CREEP * (t - cycles[0].t):
-            cycles.clear()
-        while cycles and cycles[-1].t < t - WINDOW:
-            cycles.pop()
-        gains = self._gains(points, covariances, by_odometry) if cycles else np.zeros((len(SHARES) + 1, 0))
+            cycles = ()
+        cycles = tuple(one for one in cycles if one.t >= t - WINDOW)
+        gains = _gains(cycles, points, covariances, by_odometry)
         farthest = np.sqrt((points**2).sum(axis=1).max(initial=0.0))
         points = np.concatenate([points, NOWHERE])
-        cycles.appendleft(_Cycle(t, points, farthest, by_odometry, by_odometry, gains.cumsum(axis=1)))
+        newest = _Cycle(t, points, farthest, by_odometry, by_odometry, gains.cumsum(axis=1))
+        self._cycles = (newest, *cycles)
 
     def believe(self, pose: Array) -> None:
         """Note the pose (3,) of the newest cycle that is believed."""
-        self._cycles[0] = replace(self._cycles[0], pose=pose)
+        self._place(1, pose)
 
     def place(self, limit: float) -> Array | None:
         """Return the pose (3,) at which the vehicle stands, or None where it may be moving.
@@ -77,29 +82,35 @@ class Standstill:
             return None
         first = 1 + int(likelier.argmax())
         pose = self._cycles[first].pose
-        for k in range(first):
-            self._cycles[k] = replace(self._cycles[k], pose=pose)
+        self._place(first, pose)
         return pose
 
-    def _gains(self, points: Array, covariances: Array, by_odometry: Array) -> Array:
-        """Return the gains of the newest cycle with each other one by hypothesis, and squares of rest's.
+    def _place(self, count: int, pose: Array) -> None:
+        """Place the newest cycles at a pose (3,)."""
+        placed = (replace(one, pose=pose) for one in self._cycles[:count])
+        self._cycles = (*placed, *self._cycles[count:])
 
-        The gain of a detection is `max(0, MOST_MISFIT - d^2)`, d being its whitened distance from the nearest
-        one of the other cycle. It has none beyond what the odometry says that the other cycle saw: the view
-        moves with the vehicle, so what is new at its border matches only at rest.
-        """
-        cycles = self._cycles
-        ways = np.array([relative(by_odometry, one.by_odometry) for one in cycles])
-        begins = np.cumsum([0, *(len(one.points) for one in cycles)])[:-1]
-        resting = np.concatenate([one.points for one in cycles])
-        moved = np.concatenate([move_points(way, one.points) for way, one in zip(ways, cycles, strict=True)])
-        view = np.array([one.farthest for one in cycles]) - np.hypot(ways[:, 0], ways[:, 1])
-        seen = np.hypot(points[:, 0], points[:, 1])[:, None] <= view
-        precisions = np.linalg.inv(2.0 * covariances + SIGMA_CONE**2 * np.eye(2))
-        (xx, xy), (_, yy) = precisions.transpose(1, 2, 0)[..., None]
-        gains = []
-        for share in SHARES:
-            x, y = (points[:, None] - resting - share * (moved - resting)).transpose(2, 0, 1)
-            square = np.minimum.reduceat(xx * x * x + 2.0 * xy * x * y + yy * y * y, begins, axis=1)
-            gains.append(seen * np.maximum(MOST_MISFIT - square, 0.0))
-        return np.array([one.sum(axis=0) for one in (*gains, (gains[0] - gains[-1]) ** 2)])
+
+def _gains(cycles: Sequence[_Cycle], points: Array, covariances: Array, by_odometry: Array) -> Array:
+    """Return the gains of the newest cycle with each other one by hypothesis, and squares of rest's.
+
+    The gain of a detection is `max(0, MOST_MISFIT - d^2)`, d being its whitened distance from the nearest
+    one of the other cycle. It has none beyond what the odometry says that the other cycle saw: the view
+    moves with the vehicle, so what is new at its border matches only at rest.
+    """
+    if not cycles:
+        return np.zeros((len(SHARES) + 1, 0))
+    ways = np.array([relative(by_odometry, one.by_odometry) for one in cycles])
+    begins = np.cumsum([0, *(len(one.points) for one in cycles)])[:-1]
+    resting = np.concatenate([one.points for one in cycles])
+    moved = np.concatenate([move_points(way, one.points) for way, one in zip(ways, cycles, strict=True)])
+    view = np.array([one.farthest for one in cycles]) - np.hypot(ways[:, 0], ways[:, 1])
+    seen = np.hypot(points[:, 0], points[:, 1])[:, None] <= view
+    precisions = np.linalg.inv(2.0 * covariances + SIGMA_CONE**2 * np.eye(2))
+    (xx, xy), (_, yy) = precisions.transpose(1, 2, 0)[..., None]
+    gains = []
+    for share in SHARES:
+        x, y = (points[:, None] - resting - share * (moved - resting)).transpose(2, 0, 1)
+        square = np.minimum.reduceat(xx * x * x + 2.0 * xy * x * y + yy * y * y, begins, axis=1)
+        gains.append(seen * np.maximum(MOST_MISFIT - square, 0.0))
+    return np.array([one.sum(axis=0) for one in (*gains, (gains[0] - gains[-1]) ** 2)])

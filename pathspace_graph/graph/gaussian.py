@@ -13,10 +13,11 @@ import numpy as np
 from scipy.linalg import lapack
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.linear import linear_factor
 
-from .variables import POINT, Layout, Variables, names, sizes, spread
+from .variables import POINT, Layout, Variables, names, sizes
 
 GraphPart = (
     gtsam.GaussianFactor | gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet | gtsam.GaussianBayesTree
@@ -261,7 +262,7 @@ def substitute_points(
     keys = np.concatenate([old, np.setdiff1d(held.keys, old), new])
     widths, (count, added) = sizes(keys), E.shape
     known = held.positions(keys) >= 0
-    at, own = spread((widths.cumsum() - widths)[known], widths[known]), held.entries(keys[known])
+    at, own = kernels.spread((widths.cumsum() - widths)[known], widths[known]), held.entries(keys[known])
     H, g = np.zeros((widths.sum(), widths.sum())), np.zeros(widths.sum())
     H[np.ix_(at, at)], g[at] = information[np.ix_(own, own)], vector[own]
     H[:count, :count] += weight * np.eye(count)

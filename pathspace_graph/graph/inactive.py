@@ -16,15 +16,16 @@ by its conditional in the frame of its own anchor: however far the chain swings,
 oldest link holds the origin of the map frame. To bring it back to (0, 0, 0), the whole map is moved rigidly.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final, Protocol, Self
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.se2 import compose, inverse
 
@@ -37,7 +38,7 @@ from .gaussian import (
     square_root_form,
 )
 from .relative import RelativeFactor, by_frame_of, from_frame, relative_factor, rotations, to_frame
-from .variables import NO_KEYS, ORIGIN_KEY, POSE, Layout, Variables, are_poses, pose_key, sizes, spread
+from .variables import NO_KEYS, ORIGIN_KEY, POSE, Layout, Variables, are_poses, pose_key, sizes
 
 
 class InactiveMap:
@@ -52,6 +53,13 @@ class InactiveMap:
         self._shared: list[gtsam.GaussianFactor] = []
         self._active: tuple[Layout, Layout, IntArray] | None = None
         """Layout of all variables, that of the active ones, and their columns in the former."""
+
+    def copy(self) -> Self:
+        """Return a map to which conditionals can be added independently."""
+        other = shallow(self)
+        other.net = gtsam.GaussianBayesNet()
+        other.net.push_back(self.net)
+        return other
 
     def __len__(self) -> int:
         return int(self.net.size())
@@ -69,7 +77,7 @@ class InactiveMap:
             active = np.ones(len(layout.keys), bool)
             active[layout.positions(self.keys)] = False
             part = Layout(layout.keys[active])
-            self._active = layout, part, spread(layout.starts[active], part.widths)
+            self._active = layout, part, kernels.spread(layout.starts[active], part.widths)
         return self._active[1:]
 
     def push(
@@ -94,7 +102,7 @@ class InactiveMap:
         self._given = np.setdiff1d(
             np.union1d(self._given, separator), np.append(self.keys, self._old_anchors)
         )
-        self._shared += shared
+        self._shared = [*self._shared, *shared]
         self._active = None
         return remaining
 
@@ -151,6 +159,13 @@ class InactiveChain(InactiveMap):
         self._pose_keys: IntArray = NO_KEYS  # (a,) keys of the origin and of past anchors, ascending
         self.poses: dict[int, Array] = {}  # (3,) of the origin and of past anchors by key, as of `refresh`
 
+    def copy(self) -> Self:
+        """Return a chain that can grow independently."""
+        other = super().copy()
+        other.links = self.links.copy()
+        other.poses = self.poses.copy()
+        return other
+
     def __len__(self) -> int:
         return len(self.links)
 
@@ -205,7 +220,7 @@ class InactiveChain(InactiveMap):
         if not self.links:
             return
         known = self._with_poses(variables)
-        known.values = _link_means(known.values, self.links, *self._columns(known.layout))
+        known.values = kernels.link_means(known.values, self.links, *self._columns(known.layout))
         variables.values[:] = known.of(variables.keys)
         poses = read_only(known.of(self._pose_keys).reshape(-1, POSE))
         self.poses = dict(zip(self._pose_keys.tolist(), poses, strict=True))
@@ -267,7 +282,7 @@ class InactiveChain(InactiveMap):
         """
         known, (active, entries) = self._with_poses(variables), self.active(variables.layout)
         columns = self._columns(known.layout)
-        by_all, covariance = _origin_by_active(
+        by_all, covariance = kernels.origin_by_active(
             known.values, self.links, *columns, int(known.layout.columns(np.array([ORIGIN_KEY]))[0])
         )
         root = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -323,56 +338,6 @@ def new_link(
     offset += solved[:, -1]
     noise = np.asarray(np.linalg.inv(root[:, keys.entries(own.keys)]), float)
     return Link(factor, weak, own, others, gain, offset, noise)
-
-
-@compiled
-def _link_means(
-    values: Array, links: Sequence[Link], frames: IntArray, leaving: IntArray, others: IntArray
-) -> Array:
-    """Return all values (n,), with the inactive variables at their conditional means, newest link first.
-
-    The columns are those of `InactiveChain._columns`.
-    """
-    values = values.copy()
-    for link, frame, y, z in reversed([*_by_link(links, frames, leaving, others)]):
-        pose = values[frame : frame + POSE]
-        mean = link.gain @ to_frame(values[z], pose, link.others) + link.offset
-        values[y] = from_frame(mean, pose, link.leaving)
-    return values
-
-
-@compiled
-def _origin_by_active(
-    values: Array, links: Sequence[Link], frames: IntArray, leaving: IntArray, others: IntArray, origin: int
-) -> tuple[Array, Array]:
-    """Return the derivative (3, n) of the origin's pose by the active variables, and its covariance (3, 3).
-
-    Each link, oldest first, replaces its variables y by `from(G to(z, f) + e + N w, f)` in its frame f, with
-    w of unit covariance. The covariance is given the active variables; `origin` is the column of its pose.
-    """
-    by_all, covariance = np.zeros((POSE, len(values))), np.zeros((POSE, POSE))
-    by_all[:, origin : origin + POSE] = np.eye(POSE)
-    for link, frame, y, z in _by_link(links, frames, leaving, others):
-        pose = values[frame : frame + POSE]
-        by_mean = by_all[:, y] @ rotations(link.leaving, pose[2])
-        by_noise, by_others = by_mean @ link.noise, by_mean @ link.gain
-        by_all[:, y] = 0.0
-        by_all[:, z] += by_others @ rotations(link.others, pose[2]).T
-        by_all[:, frame : frame + POSE] += by_others @ by_frame_of(values[z], pose, link.others)
-        by_all[:, frame : frame + POSE] -= by_mean @ by_frame_of(values[y], pose, link.leaving)
-        covariance += by_noise @ by_noise.T
-    return by_all, covariance
-
-
-def _by_link(
-    links: Sequence[Link], frames: IntArray, leaving: IntArray, others: IntArray
-) -> Iterator[tuple[Link, int, IntArray, IntArray]]:
-    ends = (
-        np.cumsum([of.size for of in all_of])
-        for all_of in zip(*((k.leaving, k.others) for k in links), strict=True)
-    )
-    columns = (np.split(all_of, end[:-1]) for all_of, end in zip((leaving, others), ends, strict=True))
-    return zip(links, frames.tolist(), *columns, strict=True)
 
 
 def pose_and_reference(key: int, variables: Variables) -> tuple[Array, Array]:

@@ -11,12 +11,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice
+from typing import Self
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import compose, relative, wrap_angle
 
 from .gaussian import (
@@ -51,7 +53,7 @@ class RelativeFactor:
         keys = np.append(self.keys.keys, self.frame)
         entries = variables.layout.entries(keys)
         now = variables.values[entries], variables.change(entries)
-        block = _relative_block(self.root, self.right, self.local, *now, self.keys)
+        block = kernels.relative_block(self.root, self.right, self.local, *now, self.keys)
         widths, moves = np.append(self.keys.widths, POSE), keys != ORIGIN_KEY
         if not moves.all():
             block = np.asfortranarray(block[:, np.append(np.repeat(moves, widths), True)])
@@ -88,21 +90,6 @@ def relative_factor(
     root, right = square_root_form(information, vector - information @ variables.change(entries))
     local = to_frame(variables.values[entries], pose, kept)
     return RelativeFactor(frame, kept, root @ rotations(kept, pose[2]), right, local)
-
-
-@compiled
-def _relative_block(
-    root: Array, right: Array, local: Array, values: Array, change: Array, keys: Layout
-) -> Array:
-    """Return `[J | J d - r]` (r, q + 4), by columns, with derivatives J and residuals r of a relative factor.
-
-    The values (q + 3,) and the unknowns d, which are `change` (q + 3,) now, are those of its variables and
-    then of the frame.
-    """
-    now, frame = values[:-POSE], values[-POSE:]
-    by_all = np.hstack([rotations(keys, frame[2]).T, by_frame_of(now, frame, keys)])
-    jacobian, residual = root @ by_all, root @ (to_frame(now, frame, keys) - local) - right
-    return np.asfortranarray(np.column_stack([jacobian, jacobian @ change - residual]))
 
 
 # --- coordinates in the frame of a pose ------------------------------------------------------------------
@@ -159,6 +146,14 @@ class Submaps:
         self._graph: gtsam.GaussianFactorGraph | None = None
         self._keyframe = 0
         self._driven = 0.0
+
+    def copy(self) -> Self:
+        """Return submaps that can go on independently."""
+        other = shallow(self)
+        other.finished = self.finished.copy()
+        other.keyframes = self.keyframes.copy()
+        other._attached = self._attached.copy()
+        return other
 
     def add_pose(self, pose: int, factors: gtsam.GaussianFactorGraph, variables: Variables) -> None:
         """Add the window's oldest pose, by its key, and its factors, without the prior, to the submap.

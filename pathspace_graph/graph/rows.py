@@ -15,11 +15,11 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.linear import keys_of_factor
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, whitened_odometry
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.se2 import compose, rotation
 
 from .gaussian import FactoredSystem, factors_of, half_solve
@@ -29,7 +29,6 @@ from .variables import (
     INDEX_BITS,
     NO_KEYS,
     POSE,
-    UNKNOWN,
     Layout,
     Variables,
     names,
@@ -70,7 +69,7 @@ class Rows:
 
     def columns(self, layout: Layout) -> IntArray:
         """Return the column (m, n) of each derivative, which is UNKNOWN where a key is not in the layout."""
-        return _columns_of(layout, self)
+        return kernels.columns_of(layout, self)
 
 
 @cache
@@ -79,43 +78,15 @@ def _widths(letters: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(sizes(np.array(letters) << INDEX_BITS).tolist())
 
 
-@compiled
-def _columns_of(layout: Layout, rows: Rows) -> IntArray:
-    """Return `Rows.columns`."""
-    key, entry = _pattern(rows.widths)
-    begin = layout.columns(rows.keys)[:, key]
-    return np.where(begin == UNKNOWN, UNKNOWN, begin + entry)
-
-
-def _known_columns(layout: Layout, rows: Rows) -> IntArray:
-    """Return `_columns_of`; ValueError where a key is UNKNOWN."""
-    columns = _columns_of(layout, rows)
-    if (columns == UNKNOWN).any():
-        raise ValueError("expected rows on known variables, found others")
-    return columns
-
-
-@cache
-def _pattern(widths: tuple[int, ...]) -> tuple[IntArray, IntArray]:
-    """Return which of a row's keys each derivative (n,) is by, and which entry of its variable."""
-    return np.repeat(np.arange(len(widths)), widths), np.concatenate([np.arange(width) for width in widths])
-
-
 def at_reference(groups: Sequence[Rows], variables: Variables) -> list[Rows]:
     """Return rows linearized at the variables' values as `J d + r` with d = value - reference."""
     change, layout = variables.values - variables.reference, variables.layout
     moved = []
     for rows in groups:
         if len(rows):
-            residual = _moved_residual(layout, rows, change)
+            residual = kernels.moved_residual(layout, rows, change)
             moved.append(Rows(rows.keys, rows.jacobian, residual, rows.owner))
     return moved
-
-
-@compiled
-def _moved_residual(layout: Layout, rows: Rows, change: Array) -> Array:
-    """Return `r - J c` (m,) with c the change (n,) of a layout's variables; ValueError for rows on others."""
-    return np.asarray(rows.residual - (rows.jacobian * change[_known_columns(layout, rows)]).sum(axis=1))
 
 
 def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.GaussianConditional]:
@@ -134,30 +105,13 @@ def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.
 def _factor(parts: Sequence[Rows], layout: Layout) -> gtsam.GaussianConditional:
     """Return the factor of rows on the variables of a layout."""
     try:
-        held, block = _block_of(layout, parts)
+        held, block = kernels.block_of(layout, parts)
     except ValueError:
         for rows in parts:
             layout.places(rows.keys)  # it says which variable is not known
         raise
     matrix = gtsam.VerticalBlockMatrix([*layout.widths[held].tolist(), 1], block, False)
     return gtsam.GaussianConditional(layout.keys[held].tolist(), 1, matrix)
-
-
-@compiled
-def _block_of(layout: Layout, groups: Sequence[Rows]) -> tuple[IntArray, Array]:
-    """Return the places (h,) of the variables that rows hold, and `[J -r]` (m, n + 1) on them, by columns.
-
-    ValueError where rows hold variables that the layout does not.
-    """
-    sought = np.concatenate([NO_KEYS, *(rows.keys.ravel() for rows in groups)])
-    held = np.flatnonzero(among(layout.keys, np.sort(sought)))
-    part, end = Layout(layout.keys[held]), 0
-    block = np.zeros((sum(map(len, groups)), part.size + 1), order="F")
-    for rows in groups:
-        begin, end = end, end + len(rows)
-        block[np.arange(begin, end)[:, None], _known_columns(part, rows)] = rows.jacobian
-        block[begin:end, -1] = -rows.residual
-    return held, block
 
 
 def stacked_factor(groups: Sequence[Rows], variables: Variables) -> list[gtsam.GaussianConditional]:
@@ -179,7 +133,7 @@ class KeptRows:
 
     def holding(self, keys: IntArray) -> IntArray:
         """Return the owners of rows that hold any of some ascending keys (k,)."""
-        of_groups = (_owners_holding(rows, keys) for rows in self.groups)
+        of_groups = (kernels.owners_holding(rows, keys) for rows in self.groups)
         return np.concatenate([NO_KEYS, *of_groups])
 
     def replace(self, owners: IntArray, groups: Sequence[Rows], variables: Variables) -> None:
@@ -194,14 +148,14 @@ class KeptRows:
         for widths in {**new, **kept}:
             fresh = new[widths] if widths in new else kept[widths].where(slice(0))
             old = kept[widths] if widths in kept else fresh.where(slice(0))
-            rows = Rows(*_replaced(old, gone, fresh, variables.layout, change))
+            rows = Rows(*kernels.replaced(old, gone, fresh, variables.layout, change))
             if len(rows):
                 rows.__dict__["widths"] = widths
                 self.groups.append(rows)
 
     def drop(self, owners: IntArray) -> list[Rows]:
         """Drop the rows of some owners, and return them."""
-        both = [_parted(rows, np.sort(owners)) for rows in (self.groups if len(owners) else ())]
+        both = [kernels.parted(rows, np.sort(owners)) for rows in (self.groups if len(owners) else ())]
         if both:
             self.groups = [Rows(*kept) for kept, _ in both if len(kept[0])]
         return [Rows(*dropped) for _, dropped in both if len(dropped[0])]
@@ -218,30 +172,6 @@ def among(keys: IntArray, ascending: IntArray) -> BoolArray:
     return np.asarray(ascending.take(ascending.searchsorted(keys), mode="clip") == keys)
 
 
-@compiled
-def _owners_holding(rows: Rows, ascending: IntArray) -> IntArray:
-    """Return the owners of rows that hold any of some ascending keys."""
-    return np.asarray(rows.owner[among(rows.keys, ascending).any(axis=1)])
-
-
-@compiled
-def _parted(rows: Rows, gone: IntArray) -> tuple[Parts, Parts]:
-    """Return the parts of rows without those of some ascending owners, and the parts of the latter."""
-    own = among(rows.owner, gone)
-    return rows.where(~own).parts, rows.where(own).parts
-
-
-@compiled
-def _replaced(rows: Rows, gone: IntArray, fresh: Rows, layout: Layout, change: Array) -> Parts:
-    """Return the parts of rows without those of some ascending owners, and then those of fresh rows.
-
-    The fresh ones are linearized where a layout's unknowns are `change` (n,). ValueError for rows on others.
-    """
-    if len(fresh):
-        fresh = replace(fresh, residual=_moved_residual(layout, fresh, change))
-    return stacked_rows([rows.where(~among(rows.owner, gone)), fresh]).parts
-
-
 def stacked_rows(groups: Sequence[Rows]) -> Rows:
     """Return the rows of groups on variables of the same widths as one group."""
     return Rows(*map(np.concatenate, zip(*(rows.parts for rows in groups), strict=True)))
@@ -256,31 +186,10 @@ def newton_system(
     where nothing holds one of them, and ValueError where something holds another one.
     """
     factors = [(keys_of_factor(factor), factor.augmentedInformation()) for factor in factors_of(graph)]
-    hessian, gradient = _summed(layout, factors, groups, change)
+    hessian, gradient = kernels.summed(layout, factors, groups, change)
     missing = layout.keys[hessian.diagonal()[layout.starts] == 0.0]
     if len(missing):
         raise SingularSystemError(f"expected a factor on every variable, found none on {names(missing)}")
-    return hessian, gradient
-
-
-@compiled
-def _summed(
-    layout: Layout, factors: list[tuple[IntArray, Array]], groups: Sequence[Rows], change: Array
-) -> tuple[Array, Array]:
-    """Return the lower triangle of H (n, n), by columns, and the negative gradient (n,), at `change` (n,).
-
-    They are sums over factors with `[[L, g], [g', f]]` and over rows `J d + r`, on variables of a layout.
-    """
-    hessian, gradient = np.zeros((len(change), len(change)), order="F"), np.zeros(len(change))
-    for keys, matrix in factors:
-        entries = layout.entries(keys)
-        hessian[np.ix_(entries, entries)] += matrix[:-1, :-1]
-        gradient[entries] += matrix[:-1, -1] - matrix[:-1, :-1] @ change[entries]
-    for rows in groups:
-        A = np.zeros((len(rows), len(gradient)))
-        A[np.arange(len(rows))[:, None], _known_columns(layout, rows)] = rows.jacobian
-        hessian += A.T @ A
-        gradient -= (A @ change + rows.residual) @ A
     return hessian, gradient
 
 
@@ -325,7 +234,7 @@ class OdometryChain:
         by [calibration | pose | next pose].
         """
         measured = self.deltas[slots], self.whiteners[slots], self.by_calibration[slots]
-        return whitened_odometry(poses[:-1][slots], poses[1:][slots], *measured, calibration)
+        return kernels.whitened_odometry(poses[:-1][slots], poses[1:][slots], *measured, calibration)
 
     def rows(self, variables: Variables, cycles: IntArray) -> list[Rows]:
         """Return the rows from the poses of some cycles (m,) to the next poses; each cycle owns its rows.

@@ -7,11 +7,12 @@ variable that a marginal touches, which here is the whole map.
 """
 
 from collections.abc import Sequence
-from typing import Final, Generic
+from typing import Final, Generic, Self
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
@@ -62,6 +63,19 @@ class FixedLagSmoother(Generic[M_co]):
         self.variables.insert_calibrations(self.calibration_prior[0])
         self.prior = graph_of(*calibration_factors(self.variables, *self.calibration_prior))
         """Information from everything that has left the window."""
+
+    def copy(self) -> Self:
+        """Return a smoother that can go on independently; `attached` is left to its owner."""
+        other = shallow(self)
+        other.map = self.map.copy()
+        other.variables = other.map.variables
+        other.times = self.times.copy()
+        other.window = self.window.copy()
+        other.window.map, other.window.variables = other.map, other.variables
+        other.user_factors = shallow(self.user_factors)
+        other.inactive = self.inactive.copy()
+        other.submaps = self.submaps and self.submaps.copy()
+        return other
 
     @property
     def first_cycle(self) -> int:
@@ -124,7 +138,7 @@ class FixedLagSmoother(Generic[M_co]):
     def add_pose_prior(self, cycle: int, covariance: Array) -> None:
         """Add a prior to the pose of a cycle at its present value, with a covariance (3, 3), map frame."""
         root = np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T, np.float64)
-        self.prior.push_back(absolute_factor(pose_keys(np.array([cycle])), root, self.variables))
+        self.prior = graph_of(self.prior, absolute_factor(pose_keys(np.array([cycle])), root, self.variables))
 
     def check_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
         check_factors(factors, self.variables, self.next_cycle)

@@ -17,15 +17,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from copy import copy
 from functools import cached_property
 from typing import ClassVar, Final
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.sensor import SENSOR_SIZE
 
 CONTROL_LETTERS: Final = ("l", "r")  # by the label of the boundary (left, right)
@@ -89,22 +89,7 @@ def are_poses(keys: IntArray) -> BoolArray:
 
 def sizes(keys: IntArray) -> IntArray:
     """Return the number of entries of each key's variable, which its letter determines."""
-    return _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES, _LETTER_ENDS)[0]
-
-
-@compiled
-def _laid_out(
-    keys: IntArray, sensor_key: int, first_pose: int, sizes: tuple[int, int, int], bounds: IntArray
-) -> tuple[IntArray, IntArray, int, list[int]]:
-    """Return the widths (k,) and the first columns (k,) of variables, and their number of columns.
-
-    The sizes are those of a point, of the sensor's calibration, and of a pose. The last result has the column
-    from which on the variables have keys of at least each of the bounds.
-    """
-    point, sensor, pose = sizes
-    widths = np.where(keys >= first_pose, pose, np.where(keys == sensor_key, sensor, point))
-    ends = np.append(0, widths.cumsum())
-    return widths, ends[:-1], int(ends[-1]), ends[keys.searchsorted(bounds)].tolist()
+    return kernels.laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES, _LETTER_ENDS)[0]
 
 
 def name(key: int) -> str:
@@ -124,7 +109,7 @@ class Layout:
 
     def __init__(self, keys: IntArray) -> None:
         self.keys = keys
-        laid_out = _laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES, _LETTER_ENDS)
+        laid_out = kernels.laid_out(keys, SENSOR_KEY, FIRST_POSE, _SIZES, _LETTER_ENDS)
         self.widths, self.starts, self.size, self._letter_ends = laid_out
 
     @cached_property
@@ -164,19 +149,11 @@ class Layout:
     def entries(self, keys: IntArray) -> IntArray:
         """Return all columns (n,) of keys (k,), one key after the other; ValueError for an unknown key."""
         places = self.places(keys)
-        return spread(self.starts[places], self.widths[places])
+        return kernels.spread(self.starts[places], self.widths[places])
 
     def block(self, letter: str) -> slice:
         first = 2 * _LETTERS.index(letter)
         return slice(*self._letter_ends[first : first + 2])
-
-
-@compiled
-def spread(starts: IntArray, widths: IntArray) -> IntArray:
-    """Return the columns (n,) of blocks (k,) with these first columns and widths, one after the other."""
-    ends = np.cumsum(widths)
-    total = int(ends[-1]) if len(ends) else 0
-    return np.repeat(starts - (ends - widths), widths) + np.arange(total)
 
 
 def rotation_blocks(size: int, columns: IntArray, angles: Array) -> Array:
@@ -204,7 +181,7 @@ class Variables:
 
     def copy(self) -> Variables:
         """Return variables with the same keys and copies of the values."""
-        other = copy(self)
+        other = shallow(self)
         other.values, other.linearized = self.values.copy(), self.linearized.copy()
         return other
 
@@ -226,7 +203,7 @@ class Variables:
         if (ascending[1:] == ascending[:-1]).any():
             raise ValueError(f"expected new keys, found {name(int(keys[0]))} or a later one of them known")
         starts = np.concatenate([known.starts, added.starts + known.size])
-        entries = spread(starts[order], np.concatenate([known.widths, added.widths])[order])
+        entries = kernels.spread(starts[order], np.concatenate([known.widths, added.widths])[order])
         self.layout, reference = Layout(ascending), values if reference is None else reference
         self.values = np.concatenate([self.values, values])[entries]
         self.reference = np.concatenate([self.reference, reference])[entries]

@@ -6,11 +6,12 @@ frozen.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, Self, TypeVar
 
 import gtsam
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.linear import keys_of_factor
@@ -89,6 +90,9 @@ class MapRows(Protocol):
     def activate_all(self) -> None:
         """Make every map point active."""
 
+    def copy(self) -> Self:
+        """Return a map that can change independently."""
+
     def drop_cycle(self, cycle: int) -> None:
         """Note that the pose of a cycle, the window's oldest, has been marginalized."""
 
@@ -109,6 +113,13 @@ class WindowFactors(Generic[M_co]):
         self.linear_gauge = KeptRows()
         self._tolerances = tolerances
         self._structure: object = None
+
+    def copy(self) -> Self:
+        """Return factors that can be linearized independently; the map is left to the owner of both."""
+        other = shallow(self)
+        other.odometry, other.measured = shallow(self.odometry), shallow(self.measured)
+        other.gauge, other.linear_gauge = shallow(self.gauge), shallow(self.linear_gauge)
+        return other
 
     @property
     def groups(self) -> list[Rows]:
@@ -236,7 +247,7 @@ class UserFactors:
     def deactivate(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
         """Deactivate factors on one of the map points (k,) and on no pose, and return them linearized."""
         inactive = self._taken(keys, with_poses=False)
-        self._inactive += inactive
+        self._inactive = [*self._inactive, *inactive]
         return _linear(inactive, variables)
 
     def reactivate(self) -> None:

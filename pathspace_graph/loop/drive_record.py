@@ -1,12 +1,15 @@
 """The drive as it was measured, and its poses along the curves: what a batch of the lap is made of."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import chain as chain_of
+from typing import Final, Generic, Self, TypeVar
 
 import numpy as np
 
 from pathspace_graph.batch.lap import ClosedMap, OpenLap
 from pathspace_graph.batch.start import unwrap
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
@@ -15,12 +18,13 @@ from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.io.log import Detections
-from pathspace_graph.mapping.constellation import SeenIn, return_to_beginning
+from pathspace_graph.mapping.constellation import SeenIn
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.motion import MeasuredMotion
-from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings
+
+T = TypeVar("T")
 
 
 def bend(poses: Array, known: Mapping[int, Array]) -> Array:
@@ -44,65 +48,105 @@ def bend(poses: Array, known: Mapping[int, Array]) -> Array:
     return np.asarray(moved[0] + weight * change)
 
 
+class CycleList(Generic[T]):
+    """A list that only grows, with one item for each cycle; its copies share all but the newest items."""
+
+    BLOCK: Final = 200  # items of a shared block
+
+    def __init__(self) -> None:
+        self._blocks: tuple[list[T], ...] = ()
+        self._newest: list[T] = []
+
+    def copy(self) -> Self:
+        other = shallow(self)
+        other._newest = self._newest.copy()
+        return other
+
+    def __len__(self) -> int:
+        return self.BLOCK * len(self._blocks) + len(self._newest)
+
+    def __iter__(self) -> Iterator[T]:
+        return chain_of.from_iterable((*self._blocks, self._newest))
+
+    def __getitem__(self, cycle: int) -> T:
+        block, item = divmod(cycle, self.BLOCK)
+        return self._newest[item] if block == len(self._blocks) else self._blocks[block][item]
+
+    def append(self, item: T) -> None:
+        self._newest.append(item)
+        if len(self._newest) == self.BLOCK:
+            self._blocks, self._newest = (*self._blocks, self._newest), []
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredCycle:
+    """What was measured up to a cycle and in it."""
+
+    motion: MeasuredMotion  # that leads to the cycle
+    seen: Detections  # as they came
+    orange: Detections  # those of orange cones
+
+
 class DriveRecord:
     """The odometry, the detections and the poses of every cycle, kept as long as a batch can solve them."""
 
-    def __init__(self, settings: MapperSettings, noise: NoiseLearner) -> None:
+    def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self._noise = noise
         self.unsolvable: str | None = None  # why the drive cannot be solved as a batch; None if it can be
         self.poses: Array = np.zeros((0, 3))  # of each cycle, map frame, as of then or the newest batch
-        self.stamps: list[float] = []  # stamp of each cycle (s)
-        self._motions: list[MeasuredMotion] = []  # that lead to each cycle
-        self._seen: list[Detections] = []  # of each cycle, as they came
-        self._orange: list[Detections] = []  # those of orange cones
+        self.corrected: Array = self.poses  # (k, 3) of the first k cycles, as they were replaced last
+        self.stamps: CycleList[float] = CycleList()  # stamp of each cycle (s)
+        self._measured: CycleList[MeasuredCycle] = CycleList()
+
+    def copy(self) -> Self:
+        """Return a record that can go on independently."""
+        other = shallow(self)
+        other.stamps = self.stamps.copy()
+        other._measured = self._measured.copy()
+        return other
 
     def give_up(self, reason: str) -> None:
         """Drop the measurements; the first reason counts."""
         self.unsolvable = self.unsolvable or reason
-        self._motions, self._seen, self._orange = [], [], []
+        self._measured = CycleList()
 
     def measured(self, reading: Reading) -> None:
         """Add the motion that leads to a pose, and the detections there as they came."""
         self.stamps.append(reading.detections.t)
         if self.unsolvable is not None:
             return
-        seen, orange = reading.stated
-        self._motions.append(reading.motion)
-        self._seen.append(seen)
-        self._orange.append(orange)
+        self._measured.append(MeasuredCycle(reading.motion, *reading.stated))
         if len(self.stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
 
-    def estimated(self, state: State) -> None:
+    def estimated(self, road: Road) -> None:
         """Add the newest pose, unless the loop has closed and no batch needs it."""
-        if not state.closed or self.unsolvable is None:
-            self.poses = read_only(np.concatenate([self.poses, state.poses[-1:]]))
+        if not road.closed or self.unsolvable is None:
+            self.poses = read_only(np.concatenate([self.poses, road.poses[-1:]]))
 
-    def with_window(self, smoother: CurveSmoother) -> Array:
+    def with_window(self, road: Road) -> Array:
         """Return the poses (P, 3) of all cycles: those of the window are as they are now."""
-        return unwrap(np.concatenate([self.poses[: smoother.first_cycle], smoother.variables.poses]))
+        return unwrap(np.concatenate([self.poses[: road.smoother.first_cycle], road.poses]))
 
     def replaced(self, poses: Array) -> None:
         """Replace the poses (P, 3) of all cycles."""
-        self.poses = read_only(unwrap(poses))
+        self.poses = self.corrected = read_only(unwrap(poses))
 
-    def bent(self, keyframes: Mapping[int, Array], smoother: CurveSmoother) -> None:
+    def bent(self, keyframes: Mapping[int, Array], road: Road) -> None:
         """Replace the poses: the window has its own, earlier ones move with the keyframes (3,), by cycle."""
-        first = smoother.first_cycle
-        earlier, window = unwrap(self.poses[: first + 1]), smoother.variables.poses
+        first = road.smoother.first_cycle
+        earlier, window = unwrap(self.poses[: first + 1]), road.poses
         bent = bend(earlier, {0: earlier[0], **keyframes, first: window[0]})
         self.replaced(np.concatenate([bent[:first], window]))
 
-    def seen_in(self, sensor: Array) -> SeenIn:
+    def seen_in(self, sensor: Array, noise: NoiseLearner) -> SeenIn:
         """Return the detections of some cycles, corrected by the calibration (5,) of the sensor, or (0,)."""
 
         def seen_in(cycles: IntArray) -> DetectionColumns:
-            chosen = cycles.tolist()
-            twists = np.array([self._motions[k].odometry.twist for k in chosen]).reshape(-1, POSE)
-            seen = [self._seen[k].with_others(self._orange[k]) for k in chosen]
-            table = DetectionColumns.of(seen, twists=twists)
-            known = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
+            chosen = [self._measured[k] for k in cycles.tolist()]
+            twists = np.array([one.motion.odometry.twist for one in chosen]).reshape(-1, POSE)
+            table = DetectionColumns.of([one.seen.with_others(one.orange) for one in chosen], twists=twists)
+            known = noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
             table = replace(table, measured=known.points_vehicle, covariance=known.covariances)
             table = replace(table, cycle=cycles[table.cycle])
             table.correct(sensor)
@@ -110,14 +154,14 @@ class DriveRecord:
 
         return seen_in
 
-    def return_to_beginning(self, covariance: Array, sensor: Array) -> Revisit | None:
-        """Return the newest pose beside an early one, if the newest cones lie on those of the beginning."""
-        return return_to_beginning(self.seen_in(sensor), unwrap(self.poses), covariance, self.settings)
-
-    def lap(self, first_kept: int, start: ClosedMap | Revisit, settings: MapperSettings) -> OpenLap:
+    def lap(
+        self, first_kept: int, start: ClosedMap | Revisit, settings: MapperSettings, noise: NoiseLearner
+    ) -> OpenLap:
         """Return the lap; the priors of its calibrations are those of the settings, which may be wide."""
-        chain = chained(self.stamps, self._noise.motions_of_lap(self._motions), settings.odometry)
-        table = DetectionTable.of(self._seen, twists=chain.twists)
-        seen = self._noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
+        cycles = [*self._measured]
+        motions = noise.motions_of_lap([one.motion for one in cycles])
+        chain = chained([*self.stamps], motions, settings.odometry)
+        table = DetectionTable.of([one.seen for one in cycles], twists=chain.twists)
+        seen = noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
         table = replace(table, measured=seen.points_vehicle, covariance=seen.covariances)
         return OpenLap(settings, chain, table, first_kept, start)

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from math import ceil
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.batch.lap import LapMarginal, OpenLap
+from pathspace_graph.copies import shallow
 from pathspace_graph.settings.mapper import MapperSettings
 
 from . import worker
@@ -25,8 +26,12 @@ class LapSolver:
         self._settings = settings.open_lap
         self._max_poses = settings.max_poses
         self._batch: LapBatch | None = None
-        self._ends: list[int] = []
+        self._ends: tuple[int, ...] = ()
         self._prepared = False
+
+    def copy(self) -> Self:
+        """Return a solver that can go on independently; a batch that is under way is of both."""
+        return shallow(self)
 
     @property
     def is_busy(self) -> bool:
@@ -40,17 +45,10 @@ class LapSolver:
 
     def ends(self, next_cycle: int) -> tuple[int, ...]:
         """Return the cycles in which results of batches were taken, or they were or will be given up."""
-        batch, ends = self._batch, tuple(self._ends)
+        batch, ends = self._batch, self._ends
         if batch is None or next_cycle <= batch.due <= batch.last:
             return ends
         return (*ends, batch.last + 1)
-
-    def got(self, next_cycle: int) -> tuple[int, int]:
-        """Return how many batches have ended, and the next cycle where one is under way, else -1.
-
-        What has been got from the process is the same while this is.
-        """
-        return len(self._ends), next_cycle if self.is_busy else -1
 
     # --- the process -------------------------------------------------------------------------------------
 
@@ -85,7 +83,7 @@ class LapSolver:
         if self._batch is not None:
             self._batch.give_up()
             self._batch = None
-            self._ends.append(next_cycle)
+            self._ends = (*self._ends, next_cycle)
 
     # --- results -----------------------------------------------------------------------------------------
 
@@ -116,7 +114,7 @@ class LapSolver:
             given = times[batch.due - first_cycle] - batch.t
             self.late_cycles = max(self.late_cycles, ceil((outcome.seconds - given) / period))
         self._batch = None
-        self._ends.append(cycle)
+        self._ends = (*self._ends, cycle)
         return outcome
 
     def last_outcome(self, cycle: int) -> Outcome | None:
@@ -128,5 +126,5 @@ class LapSolver:
             return None
         self._batch.wait()
         outcome, self._batch = self._batch.marginal(0.0), None
-        self._ends.append(cycle)
+        self._ends = (*self._ends, cycle)
         return outcome

@@ -6,7 +6,7 @@ begins at these poses, with curves through the cones that were seen.
 """
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.simplification import fit_through
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT
@@ -27,7 +28,7 @@ from pathspace_graph.settings.online import GrowthSettings
 from pathspace_graph.spline.boundary import sampled
 from pathspace_graph.spline.bspline import BSpline
 
-from .relocalization import KnownLoop, Loop
+from .known_loop import KnownLoop, Loop
 
 REPAIRED: Final = "the map was repaired"  # beginning of the notice of the cycle in which it was
 SIGHTINGS: Final = 6  # detections of a cone that contradicts the map; clutter has one, a cone passed twenty
@@ -58,14 +59,20 @@ class Contradictions:
         merging = replace(settings, sightings=SIGHTINGS, forget_after=MEMORY)
         self._tracks = {label: TentativeTracks(merging) for label in BOUNDARIES}
 
-    def observe(self, track: CurveMap, known: KnownLoop, new: slice, t: float) -> None:
+    def copy(self) -> Self:
+        """Return tracks that can go on independently."""
+        other = shallow(self)
+        other._tracks = {label: tracks.copy() for label, tracks in self._tracks.items()}
+        return other
+
+    def observe(self, track: CurveMap, loop: Loop, new: slice, t: float) -> None:
         """Add the new coloured detections, seen at t (s), that are not in use, or are used beside a gap."""
         detections, rows = track.detections, np.arange(new.start, new.stop)
         unexplained = ~detections.used[new]
-        for label in known.with_gaps():
+        for label in loop.with_gaps():
             on = np.flatnonzero(detections.used[new] & (detections.boundary[new] == label))
             if len(on):
-                unexplained[on] = ~known.is_mapped(label, detections.u[rows[on]])
+                unexplained[on] = ~loop.is_mapped(label, detections.u[rows[on]])
         rows = rows[unexplained]
         if len(rows):
             covariances = detections.covariances_map(rows, track.variables)
@@ -120,38 +127,38 @@ def in_rows(points: Array, apart: float) -> list[IntArray]:
 class MapRepair:
     """Whether a closed map is contradicted, and the batch that repairs it."""
 
-    def __init__(self, smoother: CurveSmoother) -> None:
-        self.contradictions = Contradictions(smoother.map.settings.growth)
-        self._smoother = smoother
+    def __init__(self, settings: MapperSettings) -> None:
+        self.contradictions = Contradictions(settings.growth)
         self._stretches: list[ContradictedStretch] = []
         self._lap: Array = np.zeros((0, 3))  # the poses of the newest lap as the attempt began
         self._asked = -np.inf
         self._wait_until = 0.0
         self._attempts = 0
 
-    def is_due(self, known: KnownLoop, driven: float) -> bool:
-        """Return whether the closed map is contradicted, after a path of this length (m)."""
-        t = self._smoother.times[-1]
+    def copy(self) -> Self:
+        """Return a repair that can go on independently."""
+        other = shallow(self)
+        other.contradictions = self.contradictions.copy()
+        return other
+
+    def is_due(self, known: KnownLoop, smoother: CurveSmoother, t: float, driven: float) -> bool:
+        """Return whether the closed map is contradicted at t (s), after a path of this length (m)."""
         if t < self._asked + INTERVAL or driven < self._wait_until or self._attempts >= ATTEMPTS:
             return False
-        loop, self._asked = known.get(), t
+        loop, self._asked = known.of(smoother), t
         self._stretches = self.contradictions.stretches(loop, t)
         if self._stretches:
             self._attempts, self._wait_until = self._attempts + 1, driven + loop.length
         return bool(self._stretches)
 
-    def begin(self, poses: Array) -> ClosedMap:
+    def begin(self, smoother: CurveSmoother, poses: Array) -> ClosedMap:
         """Return the map that the batch of the drive begins with, with the poses (P, 3) of all cycles."""
-        self._smoother.refresh()
-        track, state = self._smoother.map, self._smoother.map.state
+        smoother.refresh()
+        track, state = smoother.map, smoother.map.state
         longest = max(boundary.length for boundary in state.boundaries.values())
         self._lap = poses[lap_begin(poses, longest) :]
         splines = {label: led_through(track, label, self._stretches, poses) for label in state.boundaries}
         return ClosedMap(splines, poses, state.variables.calibrations.copy())
-
-    def is_tried(self) -> bool:
-        """Return whether the batch that is under way repairs a map, rather than closing it."""
-        return bool(self._stretches)
 
     def end(self, marginal: LapMarginal | None) -> str:
         """End an attempt; return the notice of a map that explains the contradictions, or an empty one."""

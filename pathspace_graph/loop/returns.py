@@ -1,14 +1,16 @@
 """The return to the beginning of a drive, by the newest curves or cones, or by the shape of the road."""
 
 from math import inf
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.batch.start import unwrap
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.mapping.constellation import relative_pose
-from pathspace_graph.mapping.path import DrivenPath
+from pathspace_graph.mapping.constellation import relative_pose, return_to_beginning
 from pathspace_graph.mapping.registration import (
     BEGINNING,
     HEADING,
@@ -19,7 +21,8 @@ from pathspace_graph.mapping.registration import (
     passes_start,
     register,
 )
-from pathspace_graph.mapping.smoother import CurveSmoother
+from pathspace_graph.mapping.road import Road
+from pathspace_graph.settings.online import ClosingSettings
 
 from .drive_record import DriveRecord
 from .revisit import recognize
@@ -34,53 +37,61 @@ LONG_PATH: Final = 1000.0
 class ReturnFinder:
     """The search for a return of an open road, in three ways, each some metres after its last attempt."""
 
-    def __init__(self, smoother: CurveSmoother, path: DrivenPath, record: DriveRecord) -> None:
-        self._smoother, self._path, self._record = smoother, path, record
-        self._settings = smoother.map.settings.closing
+    def __init__(self, settings: ClosingSettings) -> None:
+        self._settings = settings
         self._tried: dict[str, tuple[float, int]] = {}  # path (m) and cycle of the last attempt in each way
         self._rests_until = 0.0  # path (m)
         self._placed_until = 0.0  # path (m) up to which the vehicle is not lost (`is_lost`)
 
-    def rest(self, length: float) -> None:
-        """Look for no return for a length (m) from here on; zero ends a rest."""
-        self._rests_until = self._path.length + length if length else 0.0
+    def copy(self) -> Self:
+        """Return a search that can go on independently."""
+        other = shallow(self)
+        other._tried = self._tried.copy()
+        return other
 
-    def by_curves(self) -> RefinedMotion | None:
+    def rest(self, road: Road, length: float) -> None:
+        """Look for no return for a length (m) from here on; zero ends a rest."""
+        self._rests_until = road.path.length + length if length else 0.0
+
+    def by_curves(self, road: Road) -> RefinedMotion | None:
         """Return the motion that lays the newest detections on the beginning of the curves."""
-        if not self._is_near_start() or not self._is_due("curves", self._settings.check_interval):
+        if not self._is_near_start(road) or not self._is_due(road, "curves", self._settings.check_interval):
             return None
-        smoother, settings = self._smoother, self._settings
+        smoother, path, settings = road.smoother, road.path, self._settings
         smoother.transform_to_origin()
         track, times = smoother.map, smoother.times
-        if self._path.length < self._placed_until and not is_within_reach(track, times, settings):
+        if path.length < self._placed_until and not is_within_reach(track, times, settings):
             return None  # the covariance would be costly
         covariance = smoother.newest_covariance()
         if not is_lost(covariance, settings):
-            self._placed_until = self._path.length + PLACED
-        found = register(track, times, covariance, self._path.beginning, settings)
-        return found if found is not None and passes_start(track.state, self._path, found.motion) else None
+            self._placed_until = path.length + PLACED
+        found = register(track, times, covariance, path.beginning, settings)
+        return found if found is not None and passes_start(track.state, path, found.motion) else None
 
-    def by_cones(self) -> Revisit | None:
+    def by_cones(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
         """Return the newest pose beside an early one, if the newest cones lie on those of the beginning."""
-        if (
-            not self._is_due("cones", self._settings.check_interval, RETURN_CYCLES)
-            or not self._is_near_start()
-        ):
+        is_due = self._is_due(road, "cones", self._settings.check_interval, RETURN_CYCLES)
+        if not is_due or not self._is_near_start(road):
             return None
-        covariance = self._smoother.newest_covariance()
-        return self._record.return_to_beginning(covariance, self._smoother.variables.sensor)
+        covariance = road.smoother.newest_covariance()
+        seen_in = record.seen_in(road.smoother.variables.sensor, noise)
+        return return_to_beginning(seen_in, unwrap(record.poses), covariance, road.settings)
 
-    def by_shape(self) -> Revisit | None:
+    def by_shape(self, road: Road, record: DriveRecord) -> Revisit | None:
         """Return the newest pose beside an earlier one, if the newest curves match one earlier stretch."""
-        length = self._path.length
-        if not self._is_due("shape", RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)):
+        length = road.path.length
+        if not self._is_due(road, "shape", RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)):
             return None
-        found = recognize(self._smoother)
-        return None if found is None else self.revisit_of(found, length - self._settings.min_path)
+        found = recognize(road.smoother)
+        return (
+            None if found is None else self.revisit_of(road, record, found, length - self._settings.min_path)
+        )
 
-    def revisit_of(self, found: RefinedMotion, within: float = BEGINNING) -> Revisit:
+    def revisit_of(
+        self, road: Road, record: DriveRecord, found: RefinedMotion, within: float = BEGINNING
+    ) -> Revisit:
         """Return the newest pose, once moved, beside the nearest one `within` the first metres."""
-        poses = self._record.with_window(self._smoother)
+        poses = record.with_window(road)
         newest = poses[-1:].copy()
         found.motion.move(newest)
         beside = (path_lengths(poses) < within) & (np.cos(poses[:, 2] - newest[0, 2]) > np.cos(HEADING))
@@ -89,12 +100,12 @@ class ReturnFinder:
         ends = (earlier, poses[earlier]), (len(poses) - 1, newest[0])
         return relative_pose(*ends, newest[0], information)
 
-    def _is_near_start(self) -> bool:
-        return near_start(self._path, self._smoother.variables.poses[-1], self._settings)
+    def _is_near_start(self, road: Road) -> bool:
+        return near_start(road.path, road.poses[-1], self._settings)
 
-    def _is_due(self, way: str, interval: float, cycles: float = inf) -> bool:
+    def _is_due(self, road: Road, way: str, interval: float, cycles: float = inf) -> bool:
         """Return whether to look for a return in a way again, some metres or cycles after the last time."""
-        length, cycle = self._path.length, self._smoother.next_cycle
+        length, cycle = road.path.length, road.next_cycle
         tried, tried_cycle = self._tried.get(way, (-inf, 0))
         if length < self._rests_until or (length < tried + interval and cycle < tried_cycle + cycles):
             return False

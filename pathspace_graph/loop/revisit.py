@@ -26,11 +26,11 @@ from pathspace_graph.factors.se2 import (
     to_vehicle,
     wrap_angle,
 )
+from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.constellation import NEARBY, lay_newest, revisit_of
+from pathspace_graph.mapping.constellation import NEARBY, SeenIn, lay_newest, revisit_of
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import (
     BEGINNING_SHARE,
     HEADING,
@@ -44,8 +44,10 @@ from pathspace_graph.mapping.registration import (
     is_lost,
     sigma_of_information,
 )
+from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import ClosingSettings
 
 from .closing import SIGMA_STEP
@@ -60,47 +62,47 @@ WAY, WAY_STEP = 100.0, 4.0  # length of the ways that are compared, and the step
 
 
 class Revisits:
-    """The revisits of an open drive."""
+    """The search for road of an open drive that is met again."""
 
-    def __init__(self, smoother: CurveSmoother, path: DrivenPath, record: DriveRecord) -> None:
-        self.found: list[Revisit] = []
-        self._smoother, self._path, self._record = smoother, path, record
-        self._next = RETURN
+    def __init__(self, settings: MapperSettings) -> None:
+        self.settings = settings
+        self._next = RETURN  # path (m) from which on the next one is looked for
 
-    def use(self) -> Array | None:
-        """Look for a revisit, optimize the open map with it, and return the jump (3,) of the newest pose."""
-        smoother, record, length = self._smoother, self._record, self._path.length
+    def find(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
+        """Return a new revisit, if it is time to look for one, and the window's oldest pose has one."""
+        smoother, length = road.smoother, road.path.length
         if length < self._next or record.unsolvable is not None:
             return None
         if smoother.submaps is None or not smoother.submaps.keyframes:
             return None
         self._next = length + ATTEMPTS
-        poses = record.with_window(smoother)
+        poses = record.with_window(road)
         place = earlier_pass(poses)
-        revisit = None if place is None else self._measured(poses, place)
-        if revisit is None:
-            return None
-        self._next = length + INTERVAL
-        self.found.append(revisit)
-        before = smoother.variables.poses[-1].copy()
-        keyframes = smoother.revisit(revisit.factor(), smoother.map.settings.closing.iterations, SIGMA_STEP)
-        after = smoother.variables.poses[-1].copy()
-        for one in smoother.attached:
-            one.move(compose(after, inverse(before)))
-        record.bent(keyframes, smoother)
-        return np.asarray(after - before)
+        seen_in = record.seen_in(smoother.variables.sensor, noise)
+        revisit = None if place is None else self._measured(smoother, seen_in, poses, place)
+        if revisit is not None:
+            self._next = length + INTERVAL
+        return revisit
 
-    def _measured(self, poses: Array, place: int) -> Revisit | None:
+    def _measured(self, smoother: CurveSmoother, seen_in: SeenIn, poses: Array, place: int) -> Revisit | None:
         """Return the oldest pose of the window, as seen from the keyframe next to an earlier place."""
-        smoother = self._smoother
-        seen_in = self._record.seen_in(smoother.variables.sensor)
-        laid = lay_newest(seen_in, poses, place, NEARBY, smoother.map.settings.growth)
+        laid = lay_newest(seen_in, poses, place, NEARBY, self.settings.growth)
         if laid is None or not laid.is_sure:
             return None
         keyframes = np.array(smoother.keyframe_cycles)
-        return revisit_of(
-            laid, poses, int(keyframes[np.abs(keyframes - place).argmin()]), smoother.first_cycle
-        )
+        earlier = int(keyframes[np.abs(keyframes - place).argmin()])
+        return revisit_of(laid, poses, earlier, smoother.first_cycle)
+
+
+def lay_on(road: Road, record: DriveRecord, revisit: Revisit) -> Array:
+    """Optimize an open map with a revisit, and return the jump (3,) of the newest pose."""
+    before = road.poses[-1].copy()
+    iterations = road.settings.closing.iterations
+    keyframes = road.smoother.revisit(revisit.factor(), iterations, SIGMA_STEP)
+    after = road.poses[-1].copy()
+    road.move(compose(after, inverse(before)))
+    record.bent(keyframes, road)
+    return np.asarray(after - before)
 
 
 def earlier_pass(poses: Array) -> int | None:

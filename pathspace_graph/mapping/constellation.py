@@ -15,18 +15,16 @@ from typing import Final, Self
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.kernels import compiled
+from pathspace_graph.factors import _kernels as kernels
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import (
     compose,
-    left_of,
     path_lengths,
     relative,
     rotated,
     rotation,
     to_map,
     to_vehicle,
-    wrap_angle,
 )
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.labels import UNKNOWN
@@ -39,8 +37,6 @@ from .tentative import merged_in_turn
 
 SIGMA: Final = 0.25  # of a cone's place besides its covariance: errors of the sensor that change slowly (m)
 GATE: Final = 9.0  # cap of a cone's square (sigmas^2); beyond it, the cone lies on no other
-GATES: Final = (4.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # factors of the cap in the steps of the refinement
-REGULAR: Final = (1e-2, 1e-2, 1.0)  # information added in a step, so that few cones still give one
 CELL: Final = 0.5  # of the votes (m)
 TURN: Final = 0.05  # step of the headings that are tried (rad)
 APART: Final = 1.0  # least distance of two different places (m)
@@ -66,9 +62,6 @@ LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES), UNSEEN, FAILED)
 
 Cones = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
-Places = tuple[Array, Array, Array, Array, Array]
-"""Poses (m, 3), the information (m, 3, 3) about each from the cones that lie on others, the sum (m,) of the
-capped squares of the cones in view, their number (m,), and the square (m,) of the way from the mean."""
 NO_CONES: Final[Cones] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
 EVERYWHERE: Final[Array] = np.array([[0.0, 0.0, 0.0, inf, inf]])
 """The view of a constellation that lacks no cone."""
@@ -138,12 +131,12 @@ def lay(
     """
     if min(len(seen.labels), len(known.labels)) < MIN_CONES:
         return None
-    places = _laid(seen.cones, known.cones, known.views, mean, information, reach, LIMITS)
+    places = kernels.laid(seen.cones, known.cones, known.views, mean, information, reach, LIMITS)
     return _best(*places, len(seen.labels))
 
 
 def _best(poses: Array, informations: Array, squares: Array, counts: Array, away: Array, total: int) -> Laid:
-    """Return the best of the places of `_laid`, for a total number of cones.
+    """Return the best of the places of `_kernels:laid`, for a total number of cones.
 
     A cone where nothing was in view costs as much as one in the next best place of those where enough were in
     view: rows at regular distances, which fit in many places, say little.
@@ -162,113 +155,6 @@ def _best_and_next(values: Array, poses: Array, limit: float) -> tuple[int, floa
     best = int(values.argmin())
     others = np.hypot(*(poses[:, :2] - poses[best, :2]).T) > APART
     return best, float(values[others].min(initial=limit))
-
-
-@compiled
-def _laid(
-    seen: Cones,
-    known: Cones,
-    views: Array,
-    mean: Array,
-    prior: Array,
-    reach: tuple[float, float],
-    limits: tuple[float, ...],
-) -> Places:
-    """Return the places where seen cones may lie, as `lay` compares them."""
-    apart, places = limits[4], int(limits[5])
-    tried, found = list[Array](), []
-    for start in _starts(seen, known, mean, prior, reach, limits):
-        off = [(np.hypot(*(start - other)[:2]), abs(start[2] - other[2])) for other in tried]
-        if any(distance < apart and turn < 1.5 * limits[3] for distance, turn in off):
-            continue
-        tried.append(start)
-        found.append(_refined(seen, known, views, start, mean, prior, limits))
-        if len(tried) == 3 * places:
-            break
-    poses, information, squares, counts, away = (np.array(column) for column in zip(*found, strict=True))
-    return poses, information, squares, counts, away
-
-
-def _starts(
-    seen: Cones,
-    known: Cones,
-    mean: Array,
-    prior: Array,
-    reach: tuple[float, float],
-    limits: tuple[float, ...],
-) -> list[Array]:
-    """Return poses (3,): the mean, as few cones may have been met again, and those that may cost least.
-
-    Each pair of cones votes for a cell and the eight around it, against the distance from the mean.
-    """
-    size, step, places, gain, failed = limits[2], limits[3], int(limits[5]), limits[6], limits[7]
-    i, j = np.nonzero(seen[2][:, None] == known[2])
-    half, turns = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step))
-    starts = list[tuple[float, Array]]()
-    for turn in range(-turns, turns + 1):
-        heading = mean[2] + turn * step
-        c, s = np.cos(heading), np.sin(heading)
-        x, y = seen[0][i].T
-        move = np.column_stack([c * x - s * y, s * x + c * y])
-        cell = np.floor((known[0][j] - move - mean[:2]) / size + 0.5).astype(np.intp) + half
-        cell = cell[((cell > 0) & (cell < 2 * half)).all(axis=1)]
-        votes = np.zeros((2 * half + 1, 2 * half + 1), np.intp)
-        for a in (-1, 0, 1):
-            for b in (-1, 0, 1):
-                np.add.at(votes, (cell[:, 0] + a, cell[:, 1] + b), 1)
-        at = np.argwhere(votes)
-        off = np.column_stack([(at - half) * size, np.full(len(at), turn * step)])
-        score = gain * votes[at[:, 0], at[:, 1]] - np.minimum(
-            np.einsum("ka,ab,kb->k", off, prior, off), failed
-        )
-        best = np.argsort(-score, kind="stable")[:places]
-        starts += zip(score[best].tolist(), mean + off[best], strict=True)
-    return [mean, *(start for _, start in sorted(starts, key=lambda one: -one[0]))]
-
-
-def _refined(
-    seen: Cones,
-    known: Cones,
-    views: Array,
-    start: Array,
-    mean: Array,
-    prior: Array,
-    limits: tuple[float, ...],
-) -> tuple[Array, Array, float, float, float]:
-    """Return a row of `Places` after Gauss-Newton steps from a pose (3,)."""
-    sigma, gate, pose = limits[0], limits[1], start
-    for factor in (*GATES, None):
-        turn, limit = rotation(pose[2]), gate * (factor or 1.0)
-        arm = seen[0] @ turn.T
-        off = (arm + pose[:2])[:, None] - known[0]
-        weight = np.linalg.inv((turn @ seen[1] @ turn.T)[:, None] + known[1] + sigma**2 * np.eye(2))
-        square = np.einsum("mni,mnij,mnj->mn", off, weight, off)
-        square[seen[2][:, None] != known[2]] = np.inf
-        rows, j = np.arange(len(arm)), square.argmin(axis=1)
-        square, on = square[rows, j], square[rows, j] < limit
-        weight, off = weight[rows, j][on], off[rows, j][on]
-        by = np.zeros((on.sum(), 2, 3))
-        by[:, 0, 0] = by[:, 1, 1] = 1.0
-        by[:, :, 2] = left_of(arm[on])
-        if factor is None:
-            break
-        weight = weight * ((1.0 - square[on] / limit) ** 2)[:, None, None]
-        hessian = np.einsum("mia,mij,mjb->ab", by, weight, by) + np.diag(REGULAR)
-        pose = pose - np.linalg.solve(hessian, np.einsum("mia,mij,mj->a", by, weight, off))
-    away = pose - mean
-    away[2] = wrap_angle(away[2])
-    asked = on | _in_view(arm + pose[:2], views)
-    information = np.einsum("mia,mij,mjb->ab", by, weight, by)
-    square = np.minimum(square[asked], gate)
-    return pose, information, float(square.sum()), float(len(square)), float(away @ prior @ away)
-
-
-def _in_view(points: Array, views: Array) -> BoolArray:
-    """Return which of the points (m, 2) one of the views (k, 5) has within its range and bearing."""
-    off = points[:, None] - views[:, :2]
-    bearing = np.abs(wrap_angle(np.arctan2(off[:, :, 1], off[:, :, 0]) - views[:, 2]))
-    in_view = (np.hypot(off[:, :, 0], off[:, :, 1]) < views[:, 3]) & (bearing < views[:, 4])
-    return np.asarray(in_view.any(axis=1))
 
 
 def _views(poses: Array, points: Array) -> Array:

@@ -1,18 +1,16 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
-from typing import Any, Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.bspline import Spans
-from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, TOLERANCES, refine_joint_foot_points
-from pathspace_graph.factors.kernels import compiled
+from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, TOLERANCES
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.residuals import detection_rows, pair_residuals, sigma_across
-from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.factors.sensor import corrected
-from pathspace_graph.graph.rows import Parts, Rows, among, stacked_rows
+from pathspace_graph.factors.residuals import pair_residuals, sigma_across
+from pathspace_graph.graph.rows import Rows, stacked_rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -38,6 +36,14 @@ class CurveMap:
         self.reached_inactive = False  # whether the latest `rows` reach inactive control points
         self._refined: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
+    def copy(self) -> Self:
+        """Return a map that can change independently."""
+        other = shallow(self)
+        other.state = self.state.copy()
+        other.variables = other.state.variables
+        other.detections = self.detections.copy()
+        return other
+
     # --- detections --------------------------------------------------------------------------------------
 
     def changed(self) -> IntArray:
@@ -54,7 +60,7 @@ class CurveMap:
         if not state.boundaries or len(cycles) == 0:
             return []
         curves, variables, s = state.curves, self.variables, self.settings.spline
-        rows, u, self.reached_inactive, parts = _curve_rows(
+        rows, u, self.reached_inactive, parts = kernels.curve_rows(
             curves.spans,
             (state.map_points, curves.labels, curves.keys, curves.trusted, curves.active_from),
             detections.associated,
@@ -147,7 +153,7 @@ class CurveMap:
     @property
     def structure(self) -> object:
         """Return an object that is replaced when the weak priors hold other control points than before."""
-        return self.state.curves if self.state.boundaries else None
+        return self.state.curves.keys if self.state.boundaries else None
 
     def gauge(self, whole: bool) -> list[Rows]:
         """Return `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`, on all points if `whole`."""
@@ -181,42 +187,6 @@ class CurveMap:
         repeated = np.repeat(points, len(residual) // max(len(points), 1), axis=0)
         keys = control_keys(label, self.state.boundaries[label].first + repeated)
         return Rows(keys, jacobian, residual, factor_numbers(repeated[:, 0], label))
-
-
-@compiled
-def _curve_rows(
-    spans: Spans,
-    curves: tuple[Array, IntArray, IntArray, Array, Array],
-    table: tuple[Any, ...],
-    cycles: IntArray,
-    poses: Array,
-    first_cycle: int,
-    sensor: Array,
-    limits: tuple[float, int, int, float, float],
-    names: tuple[int, int],
-    tolerances: tuple[float, ...],
-) -> tuple[IntArray, Array, bool, Parts]:
-    """Return detections by row, their refined parameters (m,), and the parts of `CurveMap.rows`.
-
-    The third result says whether one has slid to where a curve is inactive. Curves have control points
-    (n, 2), labels (k,), keys (n,), and parameters (k,) up to which and from which on they may be used. The
-    table has the columns of `DetectionTable.associated`.
-    """
-    control_points, labels, control_keys, trusted, active_from = curves
-    room, iterations, _, sigma_model, huber = limits
-    rows = np.flatnonzero(table[2] & among(table[0], cycles))
-    cycle, boundary, _, u, measured, twist, covariance = (column[rows] for column in table)
-    curve, own = labels.searchsorted(boundary), poses[cycle - first_cycle]
-    points = to_map(corrected(measured, twist, sensor), own)
-    stretch = u, u - room, np.minimum(u + room, trusted[curve])
-    foot = refine_joint_foot_points(spans, control_points, points, curve, *stretch, iterations)
-    known = points, covariance, own, foot.normal_unit, foot.distance, foot.basis
-    residual, sigma, jacobian = detection_rows(*known, measured, twist, sensor, sigma_model)
-    weight = np.sqrt(huber_weights(residual / sigma, huber)) * (foot.interior / sigma)
-    measuring = np.array(names) + np.outer(cycle, [1, 0])
-    keys = np.concatenate([measuring[:, : 2 if len(sensor) else 1], control_keys[foot.columns]], axis=1)
-    reached = not spans.periodic and bool((foot.u <= active_from[curve]).any())
-    return rows, foot.u, reached, (keys, jacobian * weight[:, None], residual * weight, cycle)
 
 
 def _by_axis(coefficients: Array) -> Array:

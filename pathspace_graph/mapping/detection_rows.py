@@ -5,9 +5,9 @@ from typing import Final
 
 import numpy as np
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.residuals import detection_rows
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, Variables
 
@@ -55,10 +55,10 @@ def rows_across(
 ) -> DetectionRows:
     """Return `n . (R z + t - S(u))` of detections (m,) at points (m, 2), map frame.
 
-    The foot points are on `State.curves`, and the terms those of `residuals:detection_rows`.
+    The foot points are on `State.curves`, and the terms those of `factors._kernels:detection_rows`.
     """
     cycle, variables = detections.cycle[rows], state.variables
-    residual, sigma, jacobian = detection_rows(
+    residual, sigma, jacobian = kernels.detection_rows(
         points,
         detections.covariance[rows],
         variables.poses_at(cycle),

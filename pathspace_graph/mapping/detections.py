@@ -7,9 +7,10 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.factors.se2 import rotated, to_map
+from pathspace_graph.factors.se2 import rotated
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Detections
@@ -105,7 +106,7 @@ class DetectionColumns:
         if isinstance(rows, slice) or rows.dtype == np.bool_:
             rows = np.arange(len(self))[rows]
         poses = variables.poses, variables.first_cycle
-        return _placed(
+        return kernels.placed(
             rows.astype(np.intp, copy=False), self.cycle, self.measured, self.twist, *poses, variables.sensor
         )
 
@@ -169,6 +170,13 @@ class DetectionTable(DetectionColumns):
         """Store the refreshed foot points' parameters (m,); the associations do not change."""
         self.u[rows] = u
 
+    def copy(self) -> Self:
+        """Return a table whose associations can change independently; other columns are only replaced."""
+        other = shallow(self)
+        for column in ("boundary", "u", "used", "station", "changed"):
+            vars(other)[column] = vars(self)[column].copy()
+        return other
+
     @property
     def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array]:
         """Return the columns that say what is in use, where, and as what it was measured."""
@@ -189,32 +197,4 @@ class DetectionTable(DetectionColumns):
         These are the rows out of use, and those of unknown colour that the other boundary uses: if both
         boundaries accept one, it is ambiguous.
         """
-        return _open_rows(labels, since, self.label, self.boundary, self.used, UNKNOWN)
-
-
-@compiled
-def _placed(
-    rows: IntArray,
-    cycles: IntArray,
-    measured: Array,
-    twists: Array,
-    poses: Array,
-    first_cycle: int,
-    sensor: Array,
-) -> Array:
-    """Return `DetectionColumns.points_map` of some rows, by the poses (P, 3) from `first_cycle` on."""
-    points = corrected(measured[rows], twists[rows], sensor)
-    return to_map(points, poses[cycles[rows] - first_cycle])
-
-
-@compiled
-def _open_rows(
-    labels: IntArray, since: IntArray, label: IntArray, boundary: IntArray, used: BoolArray, unknown: int
-) -> tuple[IntArray, IntArray]:
-    """Return `DetectionTable.open_to` for a table with these columns."""
-    colourless, rows = label == unknown, []
-    for own, first in zip(labels, since, strict=True):
-        is_open = np.where(used, colourless & (boundary != own), colourless | (label == own))
-        rows.append(first + np.flatnonzero(is_open[first:]))
-    curve = np.repeat(np.arange(len(rows)), [len(of_label) for of_label in rows])
-    return np.concatenate([np.zeros(0, np.intp), *rows]), curve
+        return kernels.open_rows(labels, since, self.label, self.boundary, self.used, UNKNOWN)

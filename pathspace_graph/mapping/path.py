@@ -5,8 +5,9 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.kernels import compiled
 from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.labels import LEFT, RIGHT
 
@@ -54,6 +55,10 @@ class DrivenPath:
         self.length = 0.0  # length of the driven path: the station of the vehicle (m)
         self.curvature = 0.0  # smoothed curvature of the present turn (1/m), left positive
         self._last: Array = np.zeros(2)
+
+    def copy(self) -> Self:
+        """Return a path that can grow independently; its arrays are only replaced."""
+        return shallow(self)
 
     def update(self, pose: Array) -> None:
         """Extend the path to `pose` (3,), map frame."""
@@ -110,27 +115,8 @@ class DrivenPath:
         return PathAhead(points, np.concatenate([self.stations[behind], self.length + s]), self.length)
 
 
-@compiled
-def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array, Array]:
-    """Return the station (m,) and signed distance (m,), left positive, of points (m, 2) beside a polyline.
-
-    The polyline has at least two positions (n, 2) with stations (n,). Beyond the last position the station
-    continues along the last segment.
-    """
-    (x, y), (ex, ey) = path[:-1].T, np.diff(path, axis=0).T
-    length2 = np.maximum(ex**2 + ey**2, np.finfo(float).tiny)
-    dx, dy = points[:, :1] - x, points[:, 1:] - y
-    share = np.clip((dx * ex + dy * ey) / length2, 0.0, 1.0)
-    distance2 = (dx - share * ex) ** 2 + (dy - share * ey) ** 2
-    best = distance2.argmin(axis=1)
-    rows = np.arange(len(points))
-    ex, ey, dx, dy = ex[best], ey[best], dx[rows, best], dy[rows, best]
-    overshoot = np.where(best == len(length2) - 1, (dx * ex + dy * ey) / length2[best] - 1.0, 0.0)
-    along = np.where(overshoot > 0.0, 1.0 + overshoot, share[rows, best])
-    cross = ex * dy - ey * dx
-    nearest = np.sign(cross) * np.sqrt(distance2[rows, best])
-    lateral = np.where(overshoot > 0.0, cross / np.sqrt(length2[best]), nearest)
-    return stations[best] + along * (stations[best + 1] - stations[best]), lateral
+along_and_across: Final = kernels.along_and_across
+"""The stations (m,) and signed distances (m,), left positive, of points (m, 2) beside a polyline."""
 
 
 def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:

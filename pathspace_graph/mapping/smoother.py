@@ -1,15 +1,13 @@
 """The fixed-lag engine on both boundaries' curves: association, and the active part of the map."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.bspline import Spans
-from pathspace_graph.factors.footpoint import TOLERANCES, FootPoints, joint_foot_points
-from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.factors.residuals import project, sigma_across
+from pathspace_graph.factors.footpoint import TOLERANCES, FootPoints
+from pathspace_graph.factors.residuals import project
 from pathspace_graph.factors.sensor import sensor_rows
 from pathspace_graph.graph.inactive import Attached
 from pathspace_graph.graph.rows import Rows
@@ -99,7 +97,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         limits = (sigma_model, gate.sigma_floor, gate.rough, gate.chi, gate.chi_unknown, UNKNOWN)
         columns = detections.cycle, detections.label, detections.covariance
         poses, at = (self.variables.poses, self.first_cycle), (foot.normal_unit, foot.distance, foot.interior)
-        variance, accepted, doubtful = _gated(rows, *columns, *poses, at, limits)
+        variance, accepted, doubtful = kernels.gated(rows, *columns, *poses, at, limits)
         if doubtful.any():  # the joint uncertainty is costly, and only these need it
             variance[doubtful] += self.joint_variance(rows[doubtful], points[doubtful], foot.where(doubtful))
             accepted[doubtful] = foot.distance[doubtful] ** 2 < gate.chi**2 * variance[doubtful]
@@ -144,7 +142,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         curves, room = state.curves, (gate.station_behind, gate.station_ahead)
         if float(np.hypot(*(state.poses[-1, :2] - state.poses[-2, :2]))) < gate.station_step:
             room = s.refine_room, s.refine_room
-        foot, beside = _in_view(
+        foot, beside = kernels.in_view(
             curves.spans,
             state.map_points,
             curves.trusted,
@@ -224,66 +222,6 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         if last - first >= boundary.size - 1:
             return boundary.everything
         return np.arange(first, last + 1) % boundary.size
-
-
-@compiled
-def _in_view(
-    spans: Spans,
-    control_points: Array,
-    trusted: Array,
-    points: Array,
-    curve: IntArray,
-    slot: IntArray,
-    pose_u: list[Array],
-    pose: Array,
-    rooms: tuple[float, float, float, float],
-    step: float,
-    iterations: int,
-    tolerances: tuple[float, ...],
-) -> tuple[tuple[Any, ...], list[tuple[float, float, float]]]:
-    """Return the foot points of detections at points (m, 2), each on its curve (m,) beside its pose (m,).
-
-    The poses have parameters (P,) on each of the curves. The second result has, for each curve, the parameter
-    of the newest pose (3,), the cosine of its angle with the curve, and its distance; it is near the pose
-    before it. The rooms are those behind and ahead of a detection's pose, and of the newest one.
-    """
-    known = np.array(pose_u)
-    known = np.concatenate([known, known[:, -1:]], axis=1)
-    numbers = np.append(curve, np.arange(len(known)))
-    seen_from = np.append(known[curve, slot], known[:, -1])
-    behind, ahead = (np.repeat(room, [len(points), len(known)]) for room in (rooms[::2], rooms[1::2]))
-    stretch = seen_from - behind, np.minimum(seen_from + ahead, trusted[numbers])
-    both = np.concatenate([points, np.tile(pose[:2], (len(known), 1))])
-    foot = joint_foot_points(spans, control_points, both, numbers, *stretch, step, iterations)
-    beside = foot.where(slice(len(points), None))
-    along = beside.tangent_unit @ np.array([np.cos(pose[2]), np.sin(pose[2])])
-    newest = zip(beside.u.tolist(), along.tolist(), beside.distance.tolist(), strict=True)
-    of_rows = foot.where(slice(len(points)))
-    return tuple(vars(of_rows).values()), list(newest)
-
-
-@compiled
-def _gated(
-    rows: IntArray,
-    cycle: IntArray,
-    label: IntArray,
-    covariances: Array,
-    poses: Array,
-    first_cycle: int,
-    foot: tuple[Array, Array, BoolArray],
-    limits: tuple[float, float, float, float, float, int],
-) -> tuple[Array, BoolArray, BoolArray]:
-    """Return the variance (m,) of each detection by row, whether its curve accepts it, or else may do so.
-
-    The foot points have normals (m, 2), distances (m,) and whether they are interior (m,). The limits are
-    the sigma of the model, the least sigma, the largest distance, both gates in sigmas, and `UNKNOWN`.
-    """
-    (normals, distance, interior), own = foot, poses[cycle[rows] - first_cycle]
-    sigma_model, floor, rough, chi, chi_unknown, unknown = limits
-    variance = sigma_across(normals, covariances[rows], own, sigma_model) ** 2 + floor**2
-    near, colourless = interior & (np.abs(distance) < rough), label[rows] == unknown
-    accepted = near & (distance**2 < np.where(colourless, chi_unknown, chi) ** 2 * variance)
-    return variance, accepted, near & ~accepted & ~colourless
 
 
 def _holds(active: IntArray, needed: IntArray, size: int) -> bool:

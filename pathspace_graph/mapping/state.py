@@ -1,13 +1,14 @@
 """The state of the spline estimators: curves, and the variables of their control points and poses."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import is_
 from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials, Spans, lay_out
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points
@@ -57,6 +58,10 @@ class Curves:
         known = *self.tables, *self.active
         return len(tables) == len(self.tables) and all(map(is_, (*tables, *stretches), known))
 
+    def on(self, boundaries: Mapping[int, Boundary]) -> Self:
+        """Return the same curves laid out, of copies of their boundaries."""
+        return replace(self, boundaries=tuple(boundaries.values()))
+
     @cached_property
     def pairs(self) -> tuple[IntArray, Array, IntArray, IntArray]:
         """Return the pairs of neighbouring active control points, by rows (r, 2) of `State.map_points`.
@@ -102,8 +107,13 @@ class State:
 
     def copy(self) -> Self:
         """Return a state whose boundaries, values and pose parameters can change independently."""
-        other = type(self)(self.variables.copy())
-        other.boundaries, other.pose_u = dict(self.boundaries), dict(self.pose_u)
+        other = shallow(self)
+        other.variables = self.variables.copy()
+        other.boundaries = {label: shallow(boundary) for label, boundary in self.boundaries.items()}
+        other.pose_u = self.pose_u.copy()
+        other.active_stretch = self.active_stretch.copy()
+        other._curves = self._curves and self._curves.on(other.boundaries)
+        other._whole_curves = self._whole_curves and self._whole_curves.on(other.boundaries)
         return other
 
     def keys(self, label: int) -> IntArray:

@@ -11,8 +11,8 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.residuals import station_rows
 
 from .detection_rows import DetectionRows, measuring_keys
 from .detections import NO_STATION, DetectionTable
@@ -97,11 +97,11 @@ class Stations:
     ) -> DetectionRows:
         """Return `t . (R z + t - S(u))` of detections (m,) at stations (m,), whose sigmas (m,) are in m.
 
-        The terms are those of `residuals:station_rows`.
+        The terms are those of `factors._kernels:station_rows`.
         """
         cycle, variables, columns = detections.cycle[rows], state.variables, self.columns[station]
         keys = np.concatenate([measuring_keys(cycle, variables), state.map_keys[columns]], axis=1)
-        terms = station_rows(
+        terms = kernels.station_rows(
             detections.points_map(rows, variables),
             detections.covariance[rows],
             variables.poses_at(cycle),

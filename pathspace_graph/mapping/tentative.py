@@ -1,20 +1,14 @@
-"""Cones that no curve explains: tentative tracks, which one may explain later, and orange cones."""
+"""Tentative tracks: cones that no curve explains yet, which one may explain later."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, combinations
-from math import inf
-from typing import Final
+from collections.abc import Mapping
+from typing import Final, Self
 
 import numpy as np
-from scipy.linalg import block_diag
 
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.kernels import compiled
-from pathspace_graph.factors.se2 import compose, move_points, rotated, to_map
-from pathspace_graph.factors.sensor import corrected
-from pathspace_graph.io.log import Detections
-from pathspace_graph.io.map import PointBoundary
+from pathspace_graph.factors.se2 import move_points, rotated
 from pathspace_graph.settings.online import GrowthSettings
 
 MERGE_CHI: Final = 2.5  # gate of a smeared detection about a track, in sigmas of both together
@@ -33,6 +27,10 @@ class TentativeTracks:
         self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
         self.last_t: Array = np.zeros(0)  # (n,) stamp of the newest detection (s)
 
+    def copy(self) -> Self:
+        """Return a copy that goes on independently: no attribute is changed in place."""
+        return shallow(self)
+
     def add(self, points: Array, covariances: Array, t: float) -> None:
         """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
 
@@ -43,7 +41,7 @@ class TentativeTracks:
         if len(points) == 0:
             return
         gate = (self.settings.merge_radius, MERGE_MOST, MERGE_CHI)
-        tracks = _merged(
+        tracks = kernels.merged(
             (self.points, self.information, self.counts, self.last_t), points, covariances, t, gate
         )
         self.points, self.information, self.counts, self.last_t = tracks
@@ -89,53 +87,6 @@ class TentativeTracks:
             self.counts, self.last_t = self.counts[keep], self.last_t[keep]
 
 
-Tracks = tuple[Array, Array, IntArray, Array]
-
-
-@compiled
-def _merged(
-    known: Tracks, points: Array, covariances: Array, t: float, gate: tuple[float, float, float]
-) -> Tracks:
-    """Return the columns of tracks with detections added as `TentativeTracks.add` does.
-
-    The gate is a radius (m), its multiple within which smeared detections are tested, and their sigmas.
-    """
-    radius, most, chi = gate
-    places, inform, counts, last_t = known[0].copy(), known[1].copy(), known[2].copy(), known[3].copy()
-    information = np.linalg.inv(covariances)
-    nearest, near = nearest_within(points, places, radius)
-    offset = points[:, None] - places
-    i, j = np.nonzero(~near[:, None] & ((offset**2).sum(axis=2) < (most * radius) ** 2))
-    if len(i):
-        square, off = np.full(offset.shape[:2], np.inf), offset[i, j]
-        joint = covariances[i] + np.linalg.inv(inform[j])
-        square[i, j] = (off * np.linalg.solve(joint, off[:, :, None])[:, :, 0]).sum(axis=1)
-        smeared = square.min(axis=1) < chi**2
-        nearest[smeared], near[smeared] = square.argmin(axis=1)[smeared], True
-    for row in np.flatnonzero(near):
-        track, weight = nearest[row], information[row]
-        inform[track] += weight
-        places[track] += np.linalg.solve(inform[track], weight @ (points[row] - places[track]))
-        counts[track] += 1
-        last_t[track] = max(last_t[track], t)  # a late detection makes no track older
-    new = int((~near).sum())
-    return (
-        np.concatenate([places, points[~near]]),
-        np.concatenate([inform, information[~near]]),
-        np.concatenate([counts, np.ones(new, np.intp)]),
-        np.concatenate([last_t, np.full(new, t)]),
-    )
-
-
-@compiled
-def _merged_in_turn(points: Array, covariances: Array, gate: tuple[float, float, float]) -> Tracks:
-    """Return the columns of tracks to which detections (m, 2) are added one after another."""
-    tracks: Tracks = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp), np.zeros(0))
-    for k in range(len(points)):
-        tracks = _merged(tracks, points[k : k + 1], covariances[k : k + 1], 0.0, gate)
-    return tracks
-
-
 def merged_in_turn(
     points: Array, covariances: Array, settings: GrowthSettings
 ) -> tuple[Array, Array, IntArray]:
@@ -145,7 +96,7 @@ def merged_in_turn(
     `TentativeTracks.add` does.
     """
     gate = (settings.merge_radius, MERGE_MOST, MERGE_CHI)
-    places, information, counts, _ = _merged_in_turn(points, covariances, gate)
+    places, information, counts, _ = kernels.merged_in_turn(points, covariances, gate)
     return places, information, counts
 
 
@@ -174,166 +125,3 @@ def nearest_within(points: Array, known: Array, radius: float) -> tuple[IntArray
     distance = np.hypot(offset[:, :, 0], offset[:, :, 1])
     nearest = distance.argmin(axis=1)
     return nearest, distance[np.arange(len(points)), nearest] < radius
-
-
-# --- orange cones ----------------------------------------------------------------------------------------
-
-
-PASS_RADIUS: Final = 0.4  # radius of the tracks of a pass by the merge radius: a gate has pairs
-STAYING: Final = 0.05  # share of a detection's variance that stays with a cone, however often it is seen
-SAME_CHI: Final = 2.5  # distance up to which two tracks of a pass are one cone, in sigmas of both together
-SELDOM: Final = 0.4  # share of the cycles with one of two tracks, below which they were met alone
-PLACE: Final = 3.0  # distance from a cone within which only its own pass tells where others stand (m)
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """Orange cones as they were detected in one cycle."""
-
-    cycle: int
-    pose: Array  # (3,) pose of the vehicle, map frame
-    twist: Array  # (3,) twist of the vehicle (m/s, m/s, rad/s)
-    detections: Detections  # detections of orange cones only
-
-
-class OrangeCones:
-    """Orange cones as points of the map; they bound no road, and do not hold the vehicle.
-
-    Each pass has tracks of its own, since the vehicle's place drifts from one to the next. Tracks of one cone
-    are merged after the pass; at each place, the pass with most detections says which cones stand there.
-    """
-
-    MOST: Final = 500  # newest cycles that are remembered, to be placed again when poses are corrected
-
-    def __init__(self, settings: GrowthSettings, sigma: float) -> None:
-        """Keep how detections are merged, and a standard deviation (m) that none of them averages out."""
-        self._settings, self._sigma = settings, sigma
-        self._sightings: list[Sighting] = []
-        self._passes: dict[int, list[_Pass]] = {}  # by label, in order
-
-    def add(self, sighting: Sighting, sensor: Array) -> None:
-        """Add the detections of a cycle; `sensor` is the calibration (5,) of the sensor, or (0,)."""
-        if len(sighting.detections.labels):
-            self._sightings = [*self._sightings[1 - self.MOST :], sighting]
-            self._place(sighting, sensor)
-
-    def place_again(self, sensor: Array, *known: tuple[int, Array]) -> None:
-        """Place all detections anew by poses (P, 3), each from a first cycle on; later arguments win."""
-        self._passes = {}
-        for k, one in enumerate(self._sightings):
-            for first, poses in known:
-                if first <= one.cycle < first + len(poses):
-                    self._sightings[k] = replace(one, pose=poses[one.cycle - first].copy())
-            self._place(self._sightings[k], sensor)
-
-    def move(self, motion: Array) -> None:
-        """Move all cones by a rigid motion (3,) of the map frame."""
-        self._sightings = [replace(one, pose=compose(motion, one.pose)) for one in self._sightings]
-        for one in chain.from_iterable(self._passes.values()):
-            one.tracks.move(motion)
-
-    def points(self) -> dict[int, PointBoundary]:
-        """Return the cones that were detected often enough, by label."""
-        found = {}
-        for label, passes in sorted(self._passes.items()):
-            cones = _best([one.cones() for one in passes], self._settings.sigma)
-            if cones:
-                blocks = [cone.covariance + self._sigma**2 * np.eye(2) for cone in cones]
-                found[label] = PointBoundary(np.array([cone.place for cone in cones]), block_diag(*blocks))
-        return found
-
-    def _place(self, sighting: Sighting, sensor: Array) -> None:
-        seen, pose, count = sighting.detections, sighting.pose, len(sighting.detections.labels)
-        points = corrected(seen.points_vehicle, np.tile(sighting.twist, (count, 1)), sensor)
-        covariances = rotated(seen.covariances, np.full(count, pose[2]))
-        places = to_map(points, pose[None])
-        for label in np.unique(seen.labels).tolist():
-            own = seen.labels == label
-            self._pass(label, seen.t).add(places[own], covariances[own], seen.t)
-
-    def _pass(self, label: int, t: float) -> "_Pass":
-        """Return the present pass, which begins where no cone was seen for a while."""
-        passes, settings = self._passes.setdefault(label, []), self._settings
-        if not passes or t - passes[-1].tracks.last_t.max() > settings.forget_after:
-            radius = PASS_RADIUS * settings.merge_radius
-            passes.append(_Pass(TentativeTracks(replace(settings, forget_after=inf, merge_radius=radius))))
-        return passes[-1]
-
-
-class _Pass:
-    """Tracks of one label in one pass, and in how many cycles each two of them were detected together."""
-
-    def __init__(self, tracks: TentativeTracks) -> None:
-        self.tracks = tracks
-        self.together: IntArray = np.zeros((0, 0), np.intp)
-
-    def add(self, points: Array, covariances: Array, t: float) -> None:
-        self.tracks.add(points, covariances, t)
-        new = len(self.tracks.last_t) - len(self.together)
-        seen = self.tracks.last_t == t
-        self.together = np.pad(self.together, ((0, new), (0, new))) + np.outer(seen, seen)
-
-    def cones(self) -> list["_Cone"]:
-        """Return the confirmed tracks, merged while two of them may be one cone."""
-        tracks, known = self.tracks, self.tracks.confirmed()
-        rows = zip(
-            tracks.points[known], tracks.information[known], tracks.counts[known].tolist(), strict=True
-        )
-        cones, together = [_Cone(*row) for row in rows], self.together[np.ix_(known, known)]
-        while len(cones) > 1:
-            pairs = list(combinations(range(len(cones)), 2))
-            apart = [cones[a].apart(cones[b], _alone(together, a, b)) for a, b in pairs]
-            if min(apart) > SAME_CHI**2:
-                break
-            a, b = pairs[int(np.argmin(apart))]
-            cones[a] = cones[a].merged(cones.pop(b))
-            for axis in (0, 1):
-                np.moveaxis(together, axis, 0)[a] += np.moveaxis(together, axis, 0)[b]
-                together = np.delete(together, b, axis)
-        return cones
-
-
-def _alone(together: IntArray, a: int, b: int) -> bool:
-    """Return whether two tracks were hardly ever detected in one cycle, as two cones would be."""
-    return bool(together[a, b] < SELDOM * min(together[a, a], together[b, b]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Cone:
-    place: Array  # (2,) in m, map frame
-    information: Array  # (2, 2) sum of the inverse covariances of its detections (1/m^2)
-    count: int  # number of detections
-
-    @property
-    def single(self) -> Array:
-        """Return the covariance (2, 2) of one detection (m^2)."""
-        return np.asarray(self.count * np.linalg.inv(self.information), np.float64)
-
-    @property
-    def covariance(self) -> Array:
-        """Return the covariance (2, 2) of the place (m^2); a part of each detection's error stays in it."""
-        return (1.0 / self.count + STAYING) * self.single
-
-    def apart(self, other: "_Cone", alone: bool) -> float:
-        """Return the squared distance of two tracks in sigmas: of one detection where they were met alone."""
-        off = self.place - other.place
-        joint = self.single + other.single if alone else self.covariance + other.covariance
-        return float(off @ np.linalg.solve(joint, off))
-
-    def merged(self, other: "_Cone") -> "_Cone":
-        information = self.information + other.information
-        vector = self.information @ self.place + other.information @ other.place
-        place = np.asarray(np.linalg.solve(information, vector), np.float64)
-        return _Cone(place, information, self.count + other.count)
-
-
-def _best(passes: Sequence[Sequence[_Cone]], sigma: float) -> list[_Cone]:
-    """Return the cones that are known to `sigma` (m), at each place those of the best pass."""
-    found: list[_Cone] = []
-    for cones in sorted(passes, key=lambda cones: -sum(cone.count for cone in cones)):
-        before = np.array([cone.place for cone in found]).reshape(-1, 2)
-        for cone in cones:
-            is_new = (np.hypot(*(before - cone.place).T) > PLACE).all()
-            if is_new and np.linalg.eigvalsh(cone.covariance)[-1] < sigma**2:
-                found.append(cone)
-    return found

@@ -4,36 +4,29 @@ The tentative stretch is no part of the graph: it is fitted anew whenever the ma
 """
 
 from collections.abc import Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.path import SIDES, DrivenPath, along_and_across, crosses
+from pathspace_graph.mapping.growth import newest, undisputed
+from pathspace_graph.mapping.path import SIDES, DrivenPath
+from pathspace_graph.mapping.rows import ConeRow, extend_rows
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
 
-from .growth import newest, undisputed
-
-REACH: Final = 12.5  # farthest track from the vehicle that the stretch leads through (m)
-MEMORY: Final = 0.35  # time for which an unconfirmed track counts (s): a detection of nothing is not repeated
-GAP: Final = 11.0  # largest distance of neighbours in a row (m): two regular gaps, as one may be missed
-TURN: Final = 2.0  # largest turn of a row from one track to the next where both coincide (rad)
-TURN_RATE: Final = 0.1  # decrease of `TURN` with the distance to the next track (rad/m)
-TURN_COST: Final = 1.0  # the next track of a row has the least `distance (1 + TURN_COST turn^2)` (rad^-2)
-MIN_WIDTH: Final = 1.5  # least distance of a row from the other boundary (m)
-WIDTH_RATIO: Final = 1.8  # largest ratio of successive tracks' distances from the other boundary
-WIDTH_SLACK: Final = 1.0  # further growth allowed of that distance (m)
+TENTATIVE_REACH: Final = 12.5  # farthest track from the vehicle that the stretch leads through (m)
+UNCONFIRMED_MEMORY: Final = 0.35
+"""Time for which an unconfirmed track counts (s): a detection of nothing is not repeated."""
 TAIL: Final = 20.0  # length of the confirmed curves that tells where the track leads and how wide it is (m)
 TAIL_STEP: Final = 1.0  # step of the points along that length (m)
 BEGIN_LATERAL: Final = 1.5  # distance beside the vehicle at which a row without a curve is searched (m)
@@ -42,87 +35,6 @@ SIGMA_BEND: Final = 1.0
 """Standard deviation of the second difference of control points about that of a straight line (m). It widens
 the band between tracks that are far apart, and beyond the last one."""
 MIN_TRACKS: Final = 2  # least number of tracks for a tentative curve of a boundary that has not begun
-
-
-@dataclass(eq=False)
-class TentativeRow:
-    """One boundary as far as it is known, and the tracks that may continue it."""
-
-    side: float  # sign of the signed distance from the other row (left positive)
-    line: Array  # (n, 2) at least two points of the row in driving order (m, map frame)
-    direction: Array  # (2,) unit vector in which the row leads on from its last point
-    candidates: Array  # (k, 2) tracks that may continue the row (m, map frame)
-    chosen: list[int] = field(default_factory=list)  # candidates taken, in order
-    ended: bool = False  # whether no candidate continues the row, wherever the other one leads
-
-    @property
-    def end(self) -> Array:
-        return np.asarray(self.line[-1])
-
-    @property
-    def tracks(self) -> Array:
-        """Return the candidates (c, 2) that the row continues through."""
-        return self.candidates[self.chosen]
-
-    @property
-    def lengths(self) -> Array:
-        """Return the lengths (c,) in m along the row from the known end to the tracks that continue it."""
-        return path_lengths(self.line[-len(self.chosen) - 1 :])[1:]
-
-    def choose(self, index: int) -> None:
-        """Continue the row through a candidate."""
-        step = self.candidates[index] - self.end
-        self.direction = step / np.hypot(*step)
-        self.line = np.concatenate([self.line, self.candidates[index, None]])
-        self.chosen.append(index)
-
-
-def extend_rows(left: TentativeRow, right: TentativeRow, driven: Array, threshold: float) -> None:
-    """Continue both rows through their candidates, each time the one that lags behind.
-
-    A row stays on its side of the other, at about the width of the track, and does not cross the driven path
-    (n, 2). A track nearer to a row's end than `threshold` (m) is passed over.
-    """
-    waiting = [left, right]
-    while waiting:
-        ahead = left.direction + right.direction
-        row = min(waiting, key=lambda row: float(row.end @ ahead))
-        index = _next(row, right if row is left else left, driven, threshold)
-        if index is None:
-            waiting = [other for other in waiting if other is not row]
-        else:
-            row.choose(index)
-            waiting = [other for other in (left, right) if not other.ended]
-
-
-def _next(row: TentativeRow, other: TentativeRow, driven: Array, threshold: float) -> int | None:
-    """Return the index of the candidate that continues a row, or None."""
-    step = row.candidates - row.end
-    distance = np.hypot(step[:, 0], step[:, 1])
-    near = (distance > threshold) & (distance < GAP)
-    near[row.chosen] = False
-    indices = np.flatnonzero(near)
-    (cos, sin), step, distance = row.direction, step[indices], distance[indices]
-    turn = np.abs(np.arctan2(cos * step[:, 1] - sin * step[:, 0], step @ row.direction))
-    allowed = turn < TURN - TURN_RATE * distance
-    cost = distance * (1.0 + TURN_COST * turn**2)
-    indices = indices[allowed][np.argsort(cost[allowed])]
-    if len(indices) == 0:
-        row.ended = True
-        return None
-    points = row.candidates[indices]
-    possible = _has_width(row, other, points)
-    possible &= ~crosses(row.end, points, driven) & ~crosses(row.end, points, other.line)
-    return int(indices[possible.argmax()]) if possible.any() else None
-
-
-def _has_width(row: TentativeRow, other: TentativeRow, points: Array) -> BoolArray:
-    """Return whether points (k, 2) are about as far from the other row as the end of their own row."""
-    stations = path_lengths(other.line)
-    station, width = along_and_across(np.concatenate([row.end[None], points]), other.line, stations)
-    width, beyond = row.side * width, station[1:] > stations[-1]
-    widest = WIDTH_RATIO * abs(width[0]) + WIDTH_SLACK
-    return np.asarray((width[1:] > MIN_WIDTH) & (beyond | (width[1:] < widest)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +112,7 @@ def curves_ahead(
             boundary = state.boundaries[label]
             points, beside = state.control_points(label), float(state.pose_u[label][-1])
             end = boundary.confirmed_end
-            curves[label] = CurveAhead(boundary.tables, points, beside, end, row.tracks)
+            curves[label] = CurveAhead(boundary.tables, points, beside, end, row.cones)
         elif len(chosen) >= MIN_TRACKS:
             outlook = _begun(track.settings, row, tentative[label].variances(chosen))
             tables, points = outlook.boundary.tables, outlook.control_points
@@ -216,10 +128,10 @@ def look_ahead(
     for label, (row, chosen) in extended_rows(track, tentative, path, t).items():
         variances = tentative[label].variances(chosen) + SIGMA_CONE**2
         if label in state.boundaries:
-            known, longer = state.control_points(label), copy(state.boundaries[label])
+            known, longer = state.control_points(label), shallow(state.boundaries[label])
             end = longer.confirmed_end
             placement = longer.extend(len(known), end + row.lengths) if len(chosen) else None
-            outlooks[label] = Outlook(longer, known, end, row.tracks, variances, placement)
+            outlooks[label] = Outlook(longer, known, end, row.cones, variances, placement)
         elif len(chosen) >= MIN_TRACKS:
             outlooks[label] = _begun(track.settings, row, variances)
     return outlooks
@@ -236,7 +148,7 @@ def confirmed(track: CurveMap) -> dict[int, Outlook]:
 
 def extended_rows(
     track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
-) -> dict[int, tuple[TentativeRow, IntArray]]:
+) -> dict[int, tuple[ConeRow, IntArray]]:
     """Return the row of each boundary, extended through its tentative tracks, and the indices of these."""
     tracks = {label: _tracks(track, label, tentative[label], t) for label in BOUNDARIES}
     rows = {label: _row(track, label, tentative[label].points[tracks[label]]) for label in BOUNDARIES}
@@ -251,8 +163,8 @@ def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> I
     Tracks at the curve are left out: across an infield the sensor sees an earlier stretch again.
     """
     settings, state = track.settings.growth, track.state
-    near = np.hypot(*(tracks.points - state.poses[-1, :2]).T) < REACH
-    believed = (tracks.counts >= settings.sightings) | (tracks.last_t > t - MEMORY)
+    near = np.hypot(*(tracks.points - state.poses[-1, :2]).T) < TENTATIVE_REACH
+    believed = (tracks.counts >= settings.sightings) | (tracks.last_t > t - UNCONFIRMED_MEMORY)
     indices = np.flatnonzero(near & believed)
     if label in state.boundaries:
         boundary, radius = state.boundaries[label], settings.merge_radius
@@ -263,24 +175,24 @@ def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> I
     return indices[undisputed(track, label, tracks.points[indices], settings.merge_radius)]
 
 
-def _row(track: CurveMap, label: int, candidates: Array) -> TentativeRow:
+def _row(track: CurveMap, label: int, candidates: Array) -> ConeRow:
     """Return a boundary's row with its candidates; it begins beside the vehicle if there is no curve yet."""
     state, side = track.state, SIDES[label]
     if label not in state.boundaries:
         x, y, theta = state.poses[-1]
         ahead = np.array([np.cos(theta), np.sin(theta)])
         beside = np.array([x, y]) + side * BEGIN_LATERAL * np.array([-ahead[1], ahead[0]])
-        return TentativeRow(side, np.array([beside - TAIL * ahead, beside]), ahead, candidates)
+        return ConeRow(side, np.array([beside - TAIL * ahead, beside]), ahead, candidates)
     boundary, known = state.boundaries[label], state.control_points(label)
     end = boundary.confirmed_end
     steps = int(np.ceil(min(TAIL, end) / TAIL_STEP)) + 1
     u = np.linspace(max(end - TAIL, 0.0), end, max(steps, 2))
     direction = boundary.evaluate(known, u[-1:], 1)[0]
-    return TentativeRow(side, boundary.evaluate(known, u), direction / np.hypot(*direction), candidates)
+    return ConeRow(side, boundary.evaluate(known, u), direction / np.hypot(*direction), candidates)
 
 
-def _begun(settings: MapperSettings, row: TentativeRow, variances: Array) -> Outlook:
+def _begun(settings: MapperSettings, row: ConeRow, variances: Array) -> Outlook:
     """Return a curve through the tracks of a row; none of it is confirmed."""
     boundary, u = open_boundary(settings.spline, settings.gauge), row.lengths
     placement = boundary.extend(0, u - u[0])
-    return Outlook(boundary, np.zeros((0, POINT)), 0.0, row.tracks, variances, placement)
+    return Outlook(boundary, np.zeros((0, POINT)), 0.0, row.cones, variances, placement)

@@ -20,7 +20,7 @@ from pathspace_graph.spline.crossing import Crossing, crossed_boundaries
 
 from .hint import Hint, told
 
-LIMIT: Final = 3.0  # prior standard deviations from zero beyond which a calibration is worth a line
+PRIOR_LIMIT: Final = 3.0  # prior standard deviations from zero beyond which a calibration is worth a line
 
 
 class Cause(NamedTuple):
@@ -30,8 +30,11 @@ class Cause(NamedTuple):
     unit: float  # size of a calibration of 1
     signs: tuple[str, str]  # words for a positive and for a negative calibration
 
+    def told(self, value: float) -> str:
+        return self.text.format(self.unit * abs(value), self.signs[0 if value > 0.0 else 1])
 
-CAUSES: Final = {  # by the name of the calibration
+
+CALIBRATION_CAUSES: Final = {  # by the name of the calibration
     "scale": Cause("speeds are {:.1f} % too {}", 100.0, ("high", "low")),
     "bias": Cause("the yaw rate is {:.4f} rad/s too {}", 1.0, ("high", "low")),
     "yaw": Cause("the sensor is turned by {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
@@ -57,9 +60,8 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.
     """Return a line for each calibration that its prior in the settings did not expect, with the cause."""
     lines = []
     for name, ratio in by_prior(state, settings, scale).items():
-        if abs(ratio) > LIMIT:
-            cause, size = CAUSES[name], abs(state.by_name[name][0])
-            text = cause.text.format(cause.unit * size, cause.signs[0 if ratio > 0.0 else 1])
+        if abs(ratio) > PRIOR_LIMIT:
+            text = CALIBRATION_CAUSES[name].told(float(state.by_name[name][0]))
             lines.append(f"{text} ({abs(ratio):.1f} sigmas of its prior)")
     return lines
 
@@ -70,17 +72,12 @@ def crossings_of(result: RunResult) -> list[Crossing]:
     return crossed_boundaries(result.map.splines, path[:, :2])
 
 
-REFERENCE: Final = 10.0  # range at which the noise of detections is told (m, at scale 1)
-CLEAR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is told
+NOISE_RANGE: Final = 10.0  # range at which the noise of detections is told (m, at scale 1)
+CLEAR_ERROR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is told
 # size beyond which it is told (rad, m, s, -, m, at scale 1)
-WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
-LENGTHS: Final = ("lateral", "range_bias")  # errors of the sensor in m
-TOLD: Final = {
-    "latency": ("stamps {:.0f} ms {}", ("late", "early")),
-    "yaw": ("turned {:.1f} degrees to the {}", ("left", "right")),
-    "lateral": ("{:.2f} m too far to the {}", ("left", "right")),
-}
-STAYING: Final = 0.1  # share of the variance from which errors that stay with a cone are told
+ERROR_WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
+IN_METRES: Final = ("lateral", "range_bias")  # errors of the sensor in m
+STAYING_TOLD: Final = 0.1  # share of the variance from which errors that stay with a cone are told
 
 
 def noise_lines(noise: RunNoise | None, scale: float = 1.0) -> list[str]:
@@ -103,10 +100,10 @@ def measured_line(measured: MeasuredNoise, scale: float = 1.0) -> str:
     if measured.along is None or measured.across is None:
         return line
     rays = measured.along, measured.across
-    at = REFERENCE * scale
+    at = NOISE_RANGE * scale
     along, across = (float(ray.sigmas(np.array([at]))[0]) for ray in rays)
     line += f"; detections {along:.2g} m along and {across:.2g} m across the ray at {at:g} m"
-    if max(ray.share for ray in rays) > STAYING:
+    if max(ray.share for ray in rays) > STAYING_TOLD:
         shares = " and ".join(f"{100.0 * ray.share:.0f} %" for ray in rays)
         times = " and ".join(f"{ray.time:g} s" for ray in rays)
         line += f", of which {shares} of the variance stay with a cone for {times}"
@@ -115,20 +112,13 @@ def measured_line(measured: MeasuredNoise, scale: float = 1.0) -> str:
 
 
 def _errors(measured: MeasuredNoise, scale: float) -> list[str]:
-    worth = {name: scale * least if name in LENGTHS else least for name, least in WORTH.items()}
+    worth = {name: scale * least if name in IN_METRES else least for name, least in ERROR_WORTH.items()}
     errors = zip(SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True)
-    clear = {name: value for name, value, sigma in errors if abs(value) > max(CLEAR * sigma, worth[name])}
-    texts = [
-        text.format(CAUSES[name].unit * abs(clear[name]), words[clear[name] < 0.0])
-        for name, (text, words) in TOLD.items()
-        if name in clear
+    return [
+        CALIBRATION_CAUSES[name].told(value)
+        for name, value, sigma in errors
+        if abs(value) > max(CLEAR_ERROR * sigma, worth[name])
     ]
-    ranges = []
-    if "range_scale" in clear:
-        ranges.append(f"{clear['range_scale']:+.1%}".replace("%", " %"))
-    if "range_bias" in clear:
-        ranges.append(f"{'-' if clear['range_bias'] < 0.0 else '+'} {abs(clear['range_bias']):.2f} m")
-    return [*texts, f"ranges {' '.join(ranges)}"] if ranges else texts
 
 
 NOISE_FACTOR: Final = 1.5  # of measured and stated noise of the odometry, from which it is wrong

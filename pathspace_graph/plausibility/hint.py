@@ -1,62 +1,33 @@
 """A hint: what is odd about a log, where it is, its likely cause, and what to do; and the table of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE
+from pathspace_graph.lengths import Text
 
 
 @dataclass(frozen=True)
 class Hint:
-    """A likely mistake in a log, by its row of `TABLE` and the numbers that show it; words are made last."""
+    """A likely mistake in a log, in words whose lengths change with the scale of the scene."""
 
-    LENGTHS: ClassVar = {"figures": 0}
+    LENGTHS: ClassVar = dict.fromkeys(("cause", "file", "columns", "found", "likely", "advice"), 0)
 
-    mistake: str
-    """Key of its row."""
-    figures: Mapping[str, Any]
-    """Numbers and words of the row's texts by their names there; each in m or m/s is a `Length`."""
-
-    @property
-    def cause(self) -> str:
-        """Return the kind of the mistake."""
-        return self._text(0)
-
-    @property
-    def file(self) -> str:
-        return self._text(1)
-
-    @property
-    def columns(self) -> str:
-        """Return the columns of the file, in words."""
-        return self._text(2)
-
-    @property
-    def found(self) -> str:
-        """Return what was found, with its figure."""
-        return str(self.figures.get("found") or self._text(3))
-
-    @property
-    def likely(self) -> str:
-        return self._text(4)
-
-    @property
-    def advice(self) -> str:
-        return self._text(5)
-
-    @property
-    def texts(self) -> dict[str, str]:
-        """Return the texts by name, as in `summary.json`."""
-        names = ("cause", "file", "columns", "found", "likely", "advice")
-        return {name: getattr(self, name) for name in names}
+    cause: str
+    """Kind of the mistake."""
+    file: str
+    columns: str
+    """Columns of the file, in words."""
+    found: str
+    """What was found, with its figure."""
+    likely: str
+    """Likely cause."""
+    advice: str
 
     @property
     def line(self) -> str:
         return f"{self.file}, {self.columns}: {self.found}; likely cause: {self.likely}; {self.advice}"
-
-    def _text(self, column: int) -> str:
-        return TABLE[self.mistake][column].format(**self.figures)
 
 
 def because(hints: Sequence[Hint]) -> str:
@@ -70,7 +41,7 @@ _LABEL = "column label"
 _EXPECTED = (
     "{as_written:.0f} % of the detections lie where the odometry expects them, and {share:.0f} % if it is so"
 )
-_TURNED = "static cones move as they would for a sensor that is turned by {angle}"
+_MOVES_TURNED = "static cones move as they would for a sensor that is turned by {angle}"
 _BY_READINGS = "--noise measured takes what is measured"
 _CUT = "check that the record has all of the detections; convert with"
 _CLASSES = "the classes of the detector were not turned into left and right"
@@ -133,7 +104,7 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
         "column {thin} varies by {least:.2g} m only, the other one by {most:.2g} m",
         "the detections are in the frame of a camera, with z ahead, x to the right and y down",
         "put z into column x and -x into column y"),
-    "turned": ("sensor frame", DETECTIONS_FILE, _XY, _TURNED,
+    "turned": ("sensor frame", DETECTIONS_FILE, _XY, _MOVES_TURNED,
         "the sensor is turned by {angle} in the vehicle{side}",
         "state the sensor's mounting, or turn the detections by that into the vehicle's frame"),
     "place": ("mounting", DETECTIONS_FILE, _XY,
@@ -162,4 +133,5 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
 
 
 def told(mistake: str, **figures: Any) -> Hint:
-    return Hint(mistake, figures)
+    """Return the hint of a row of `TABLE`, filled in; a figure in m or m/s is a `Length`."""
+    return Hint(*(Text(text, **figures) for text in TABLE[mistake]))

@@ -19,15 +19,15 @@ from pathspace_graph.labels import LEFT, UNKNOWN
 
 # --- pairs of cycles -------------------------------------------------------------------------------------
 
-MIN_DETECTIONS: Final = 2  # least number of detections of a cycle that is compared
-MOST_DETECTIONS: Final = 14  # most detections of a cycle that are compared, the nearest ones
+LEAST_COMPARED: Final = 2  # least number of detections of a cycle that is compared
+MOST_COMPARED: Final = 14  # most detections of a cycle that are compared, the nearest ones
 SOME_CYCLES: Final = 200  # approximate number of cycles from which the spacing of the cones is told
-GAPS: Final = (1, 2, 4, 8)  # numbers of cycles between the two that are compared
+PAIR_GAPS: Final = (1, 2, 4, 8)  # numbers of cycles between the two that are compared
 PAIRS_OF_GAP: Final = 60  # approximate number of pairs of cycles that are compared for each of the gaps
-LONGEST: Final = 1.3  # longest time between the cycles of a pair (s), if cycles do not come more rarely
-REACH: Final = 0.2  # distance that counts as the same by `exp(-1/2)`, over the cones' spacing
-SEEN: Final = 0.95  # share of the detections within the range, and between the bearings, that a cycle sees
-ROUND: Final = 0.1  # length of the mean direction to the detections below which a sensor sees all around
+LONGEST_PAIR: Final = 1.3  # longest time between the cycles of a pair (s), if cycles do not come more rarely
+EXPLAINED_REACH: Final = 0.2  # distance that counts as the same by `exp(-1/2)`, over the cones' spacing
+VIEW_QUANTILE: Final = 0.95  # share of the detections in the range, and in the bearings, that a cycle sees
+ROUND_VIEW: Final = 0.1  # length of the mean direction to the detections below which a sensor sees all around
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +76,9 @@ class Pairs:
         """Return the share (P,) of the later detections that the earlier cycle could have seen."""
         seen, again = (points @ [1.0, 1j] for points in (self.before, self.laid(np.eye(2), motion)))
         vector = np.nanmean(np.exp(1j * np.angle(seen)))
-        back = vector.conjugate() if abs(vector) > ROUND else 1.0  # turns the middle of the view ahead
-        farthest = np.nanquantile(np.abs(seen), SEEN)
-        widest = np.nanquantile(np.abs(np.angle(seen * back)), SEEN)
+        back = vector.conjugate() if abs(vector) > ROUND_VIEW else 1.0  # turns the middle of the view ahead
+        farthest = np.nanquantile(np.abs(seen), VIEW_QUANTILE)
+        widest = np.nanquantile(np.abs(np.angle(seen * back)), VIEW_QUANTILE)
         inside = (np.abs(again) < farthest) & (np.abs(np.angle(again * back)) < widest)
         return np.asarray(inside.sum(axis=1) / np.isfinite(again).sum(axis=1))
 
@@ -90,13 +90,13 @@ class Pairs:
 
 def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
     """Return pairs of cycles spread over a log, or None where there are none with detections."""
-    full = [cycle for cycle in cycles if len(cycle.labels) >= MIN_DETECTIONS]
+    full = [cycle for cycle in cycles if len(cycle.labels) >= LEAST_COMPARED]
     spacing = spacing_of(full[:: max(1, len(full) // SOME_CYCLES)])
     if spacing is None or len(full) < 2:
         return None
     stamps, pairs = np.array([cycle.t for cycle in full]), []
-    longest = max(LONGEST, 1.5 * float(np.median(np.diff(stamps))))
-    for gap in GAPS:
+    longest = max(LONGEST_PAIR, 1.5 * float(np.median(np.diff(stamps))))
+    for gap in PAIR_GAPS:
         later = np.arange(gap, len(full))
         later = later[stamps[later] - stamps[later - gap] <= longest]
         chosen = later[:: max(1, len(later) // PAIRS_OF_GAP)]
@@ -107,15 +107,15 @@ def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
     points, variances = _padded(full)
     both = variances[first][:, :, None] + variances[second][:, None]
     begin, end = stamps[first], stamps[second]
-    return Pairs(begin, end, points[first], points[second], both, gaps, REACH * spacing)
+    return Pairs(begin, end, points[first], points[second], both, gaps, EXPLAINED_REACH * spacing)
 
 
 def _padded(cycles: Sequence[Detections]) -> tuple[Array, Array]:
     """Return the nearest detections (C, m, 2) of each cycle, and a coordinate's variances (C, m), or NaN."""
-    variances = np.full((len(cycles), MOST_DETECTIONS), np.nan)
+    variances = np.full((len(cycles), MOST_COMPARED), np.nan)
     points = np.stack([variances, variances], axis=2)
     for k, cycle in enumerate(cycles):
-        nearest = np.argsort(np.hypot(*cycle.points_vehicle.T), kind="stable")[:MOST_DETECTIONS]
+        nearest = np.argsort(np.hypot(*cycle.points_vehicle.T), kind="stable")[:MOST_COMPARED]
         points[k, : len(nearest)] = cycle.points_vehicle[nearest]
         variances[k, : len(nearest)] = 0.5 * np.trace(cycle.covariances[nearest], axis1=1, axis2=2)
     return points, variances
@@ -141,16 +141,16 @@ def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
 # --- what the columns may mean ---------------------------------------------------------------------------
 
 TURN_STEP: Final = 15.0  # step of the angles that the frame of the detections is tried at (degrees)
-EQUAL: Final = 0.02  # difference of explained shares below which hypotheses are equally good
-SIDED: Final = 0.2  # further share of labels on their side by which one of equal hypotheses is better
-TELLING: Final = 0.2  # difference of explained shares from which a pair tells two hypotheses apart
-CHANCE: Final = 1e-8  # probability of winning by chance below which a hypothesis is believed
+EQUAL_SHARES: Final = 0.02  # difference of explained shares below which hypotheses are equally good
+SIDED_BETTER: Final = 0.2  # further share of labels on their side by which one of equal hypotheses is better
+TELLING_PAIR: Final = 0.2  # difference of explained shares from which a pair tells two hypotheses apart
+WON_BY_CHANCE: Final = 1e-8  # probability of winning by chance below which a hypothesis is believed
 FAR_BETTER: Final = 1.8  # least ratio of what it explains to what the log as written does
-LEAST_SHARE: Final = 0.3  # least share of the detections that a believed hypothesis explains
+LEAST_EXPLAINED: Final = 0.3  # least share of the detections that a believed hypothesis explains
 MOUNTING_STEPS: Final = 5  # Gauss-Newton steps that find the mounting of the sensor
 LEAST_MATCHES: Final = 60  # least number of matched detections from which the mounting is found
 WORST_CONDITION: Final = 1e6  # largest condition number at which the mounting is found
-LATEST: Final = 10.0  # largest delay or lead of detections that is tried (s)
+LATEST_STAMPS: Final = 10.0  # largest delay or lead of detections that is tried (s)
 LATE_STEP: Final = 0.25  # step of these (s)
 DEGREE: Final = float(np.pi / 180.0)  # in radians
 Content = Literal["twist", "twist in the map frame", "pose", "nothing"]
@@ -188,7 +188,7 @@ class Hypothesis:
         return np.concatenate([np.zeros((1, 3)), moved])
 
 
-SPEEDS: Final = {  # what a unit of the speeds (m/s) means
+SPEED_UNITS: Final = {  # what a unit of the speeds (m/s) means
     1.0 / 3.6: "are in km/h, not in m/s",
     0.44704: "are in miles per hour, not in m/s",
     0.514444: "are in knots, not in m/s",
@@ -197,7 +197,7 @@ SPEEDS: Final = {  # what a unit of the speeds (m/s) means
     3.6: "were divided by 3.6 although they were in m/s",
     1e3: "were divided by 1000 although they were in m/s",
 }
-RATES: Final = {  # what a unit of the yaw rate (rad/s) means
+RATE_UNITS: Final = {  # what a unit of the yaw rate (rad/s) means
     DEGREE: "is in degrees per second, not in rad/s",
     1.0 / DEGREE: "was turned from degrees to radians although it was in rad/s",
 }
@@ -205,8 +205,8 @@ AS_WRITTEN: Final = Hypothesis()  # the log means what it should
 MEANINGS: Final = (  # of the odometry; of equally good ones the first is told
     AS_WRITTEN,
     Hypothesis("nothing"),
-    *(Hypothesis(rate=rate) for rate in RATES),
-    *(Hypothesis(speed=speed) for speed in SPEEDS),
+    *(Hypothesis(rate=rate) for rate in RATE_UNITS),
+    *(Hypothesis(speed=speed) for speed in SPEED_UNITS),
     *(Hypothesis(speed=speed, rate=DEGREE) for speed in (1.0 / 3.6, 1e-2, 1e-3)),
     Hypothesis("twist in the map frame"),
     Hypothesis("twist in the map frame", rate=DEGREE),
@@ -232,12 +232,12 @@ class Trial:
 def far_better(trial: Trial, reference: Trial) -> dict[str, float] | None:
     """Return the shares (%) that both explain where they differ, None unless the trial is clearly better."""
     gain = trial.explained - reference.explained
-    telling: BoolArray = np.abs(gain) > TELLING
+    telling: BoolArray = np.abs(gain) > TELLING_PAIR
     if not telling.any():
         return None
     share, as_written = (float(one.explained[telling].mean()) for one in (trial, reference))
     chance = float(scipy.special.bdtrc(int((gain[telling] > 0.0).sum()) - 1, int(telling.sum()), 0.5))
-    clear = chance < CHANCE and share > FAR_BETTER * as_written and share > LEAST_SHARE
+    clear = chance < WON_BY_CHANCE and share > FAR_BETTER * as_written and share > LEAST_EXPLAINED
     return {"as_written": 100.0 * as_written, "share": 100.0 * share} if clear else None
 
 
@@ -267,8 +267,8 @@ class Trials:
         """Return the hypothesis that explains most; labels on their sides decide between equal ones."""
         trials = [self.as_written, *(self.trial(one) for one in self._others())]
         most = max(trial.share for trial in trials)
-        near = [trial for trial in trials if trial.share > most - EQUAL]
-        return max(near, key=lambda trial: trial.sided > max(one.sided for one in near) - SIDED)
+        near = [trial for trial in trials if trial.share > most - EQUAL_SHARES]
+        return max(near, key=lambda trial: trial.sided > max(one.sided for one in near) - SIDED_BETTER)
 
     def _others(self) -> Iterator[Hypothesis]:
         """Yield frames in fine steps for a right odometry, and in quarter turns for any other."""
@@ -358,6 +358,6 @@ def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array,
 
 def best_lateness(trials: Trials, best: Trial) -> Trial:
     """Return the trial of the lateness of the detections under which a hypothesis explains most."""
-    steps = np.arange(-LATEST, LATEST + LATE_STEP, LATE_STEP)
+    steps = np.arange(-LATEST_STAMPS, LATEST_STAMPS + LATE_STEP, LATE_STEP)
     others = (trials.trial(replace(best.hypothesis, late=late)) for late in steps[steps != 0.0].tolist())
     return max([best, *others], key=lambda trial: trial.share)

@@ -25,32 +25,32 @@ from .hint import Hint, because, told
 from .hypotheses import AS_WRITTEN, DEGREE, Hypothesis, Mounting, Pairs, Trial, Trials, far_better
 
 LEAST_TWISTS: Final = 20  # least number of twists of a log of which anything is said
-OVERLAP: Final = 0.5  # share of its detections that another cycle sees, from which they are compared
+PAIR_OVERLAP: Final = 0.5  # share of its detections that another cycle sees, from which they are compared
 SHORTEST_STEP: Final = 2e-4  # shortest usual time between rows (s)
 LONGEST_STEP: Final = 5.0  # longest usual time between rows (s)
 WITHOUT_DETECTIONS: Final = 10.0  # time of driving before the first detection or after the last one (s)
 DRIVING: Final = 0.1  # share of the largest speed from which a vehicle drives
-FARTHEST: Final = 120.0  # usual greatest range of a detector of cones (m)
-FAR: Final = 20.0  # range within which cones decide between two units that both give possible positions (m)
-NEAREST: Final = 0.05  # usual least range of cones (m)
+FARTHEST_RANGE: Final = 120.0  # usual greatest range of a detector of cones (m)
+DECISIVE_RANGE: Final = 20.0  # range in which cones decide between two units that are both possible (m)
+NEAREST_RANGE: Final = 0.05  # usual least range of cones (m)
 FASTEST: Final = 100.0  # speed that no vehicle exceeds in a tenth of its time (m/s)
 FASTEST_TURN: Final = 8.0  # yaw rate that no vehicle exceeds in a tenth of its time (rad/s)
-TURNED: Final = 5.0  # turn of the sensor beyond which it is told (degrees)
-TURNED_SIGMA: Final = 1.0  # largest standard deviation of the turn at which it is told (degrees)
-ARM: Final = 1.0  # distance of sensor and odometry's point beyond which it is told (m)
+TURN_TOLD: Final = 5.0  # turn of the sensor beyond which it is told (degrees)
+TURN_SIGMA: Final = 1.0  # largest standard deviation of the turn at which it is told (degrees)
+ARM_TOLD: Final = 1.0  # distance of sensor and odometry's point beyond which it is told (m)
 ARM_SIGMA: Final = 0.2  # largest sigma of its place at which it is told, by the distance
 CLAIMED_LESS: Final = 10.0  # one cone's scatter by the claimed one: covariances too small
 CLAIMED_MORE: Final = 30.0  # ratio of the claimed scatter to one cone's from which covariances are too large
 LEAST_SCATTER: Final = 0.02  # scatter that detections which scatter less count as (m)
 BOTH_SIDES: Final = 0.15  # distance from a half of the share of a label on its side: it is on both
-NEAR: Final = 0.25  # move by the usual range, and turn (rad), below which cycles see the same cones
-MANY: Final = 6  # least number of detections that such cycles have together
-LEAST_NEAR: Final = 30  # least number of such pairs of cycles that are counted
+SAME_CONES: Final = 0.25  # move by the usual range, and turn (rad), below which cycles see the same cones
+SAME_CONES_SEEN: Final = 6  # least number of detections that such cycles have together
+SAME_CONES_PAIRS: Final = 30  # least number of such pairs of cycles that are counted
 UNEXPLAINED: Final = 0.15  # share of the detections that the best motion must explain, or else none does
 LINE_RATIO: Final = 0.1  # ratio of the variations of two coordinates below which detections lie on a line
-TIMES: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size in s
-LENGTHS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # units of positions by their size in m
-FRAMES: Final = {  # what a turn of the sensor (degrees), mirrored or not, means
+TIME_UNITS: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size in s
+LENGTH_UNITS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # units of positions by their size in m
+FRAME_MEANINGS: Final = {  # what a turn of the sensor (degrees), mirrored or not, means
     (180.0, False): "the sensor's frame has x to the rear and y to the right",
     (-90.0, False): "the sensor's frame has x to the right and y ahead",
     (90.0, False): "the sensor's frame has x to the left and y to the rear",
@@ -58,7 +58,7 @@ FRAMES: Final = {  # what a turn of the sensor (degrees), mirrored or not, means
     (180.0, True): "the sensor's frame has x to the rear",
     (-90.0, True): "the sensor's frame has x to the right and y to the rear",
 }
-MOST: Final = 1e20  # largest number of a log of which anything is said
+LARGEST: Final = 1e20  # largest number of a log of which anything is said
 MIRRORED: Final = 0.0, True  # frame in which y points to the right and x ahead
 
 
@@ -74,7 +74,7 @@ def hints(log: Log) -> list[Hint]:
 def _has_numbers(log: Log) -> bool:
     arrays = ((cycle.points_vehicle, cycle.covariances) for cycle in log.cycles)
     parts = (*_stamps(log).values(), log.odometry.twist, *chain.from_iterable(arrays))
-    return all((np.abs(part) <= MOST).all() for part in parts)
+    return all((np.abs(part) <= LARGEST).all() for part in parts)
 
 
 def _hints(log: Log) -> list[Hint]:
@@ -103,7 +103,7 @@ def whole_stamps(log: Log) -> list[Hint]:
     found = []
     for file, t in _stamps(log).items():
         falls = np.flatnonzero(np.diff(t) < 0.0)
-        if len(falls) >= 2 and np.ptp(t) <= max(1.0, 1.0 / min(TIMES)):
+        if len(falls) >= 2 and np.ptp(t) <= max(1.0, 1.0 / min(TIME_UNITS)):
             found.append(told("fraction of seconds", file=file, falls=len(falls), low=t.min(), high=t.max()))
         elif len(t) > 2 and (np.diff(t) == 0.0).mean() > 0.5 and (t == np.floor(t)).all():
             found.append(told("whole seconds", file=file, rows=len(t) / len(np.unique(t))))
@@ -115,10 +115,10 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
     found, factors = [], {}
     for file, t in _stamps(log).items():
         step = _median(np.abs(np.diff(t)))
-        fitting = [one for one in TIMES if SHORTEST_STEP <= step * one <= LONGEST_STEP]
+        fitting = [one for one in TIME_UNITS if SHORTEST_STEP <= step * one <= LONGEST_STEP]
         if step > LONGEST_STEP and fitting:
             unit = factors[file] = fitting[0]
-            found.append(told("unit of stamps", file=file, step=step, unit=TIMES[unit], factor=unit))
+            found.append(told("unit of stamps", file=file, step=step, unit=TIME_UNITS[unit], factor=unit))
     of_odometry, of_cycles = (factors.get(file, 1.0) for file in (ODOMETRY_FILE, DETECTIONS_FILE))
     odometry = replace(log.odometry, t=log.odometry.t * of_odometry)
     cycles = tuple(replace(cycle, t=cycle.t * of_cycles) for cycle in log.cycles)
@@ -151,10 +151,10 @@ def ends_apart(log: Log) -> list[Hint]:
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
     typical = _median(np.concatenate([np.zeros(0), *(np.hypot(*c.points_vehicle.T) for c in log.cycles)]))
-    if typical > FARTHEST:
-        unit = next((unit for unit in LENGTHS if typical * unit <= FAR), min(LENGTHS))
-        what = f"are in {LENGTHS[unit]}, not in metres"
-    elif 0.0 < typical < NEAREST:
+    if typical > FARTHEST_RANGE:
+        unit = next((unit for unit in LENGTH_UNITS if typical * unit <= DECISIVE_RANGE), min(LENGTH_UNITS))
+        what = f"are in {LENGTH_UNITS[unit]}, not in metres"
+    elif 0.0 < typical < NEAREST_RANGE:
         unit, what = 1e3, "were divided by 1000 although they were in metres"
     else:
         return log, []
@@ -187,9 +187,9 @@ def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
     Others would agree best with a vehicle that does not move, as one stretch looks like the next.
     """
     if beyond_any_vehicle(log.odometry):
-        return pairs.chosen(pairs.gap <= hypotheses.GAPS[1])
+        return pairs.chosen(pairs.gap <= hypotheses.PAIR_GAPS[1])
     motion = hypotheses.motions(log.odometry.t, AS_WRITTEN.poses(log.odometry), pairs.begin, pairs.end)
-    return pairs.chosen(pairs.overlap(motion) >= OVERLAP)
+    return pairs.chosen(pairs.overlap(motion) >= PAIR_OVERLAP)
 
 
 def _by_motion(trials: Trials) -> list[Hint]:
@@ -199,7 +199,7 @@ def _by_motion(trials: Trials) -> list[Hint]:
     if best.hypothesis.content == "nothing" or (found and camera(trials.pairs)):
         return found
     late, of_clocks = _late(trials, best)
-    if best.share < hypotheses.LEAST_SHARE and late is best:
+    if best.share < hypotheses.LEAST_EXPLAINED and late is best:
         return found + (_unexplained(trials, best) if not found else [])
     mounting = hypotheses.mounting_of(trials, late.hypothesis)
     found += of_clocks
@@ -237,7 +237,7 @@ def _of_frame(best: Trial, trials: Trials, figures: dict[str, float]) -> list[Hi
     else:
         mistake = "frame"
     side = "with y to the right, and " if frame.mirrored else ""
-    what = FRAMES.get(frame.stands, f"the sensor's frame is {side}turned by {_angle(frame.turn)}")
+    what = FRAME_MEANINGS.get(frame.stands, f"the sensor's frame is {side}turned by {_angle(frame.turn)}")
     return [told(mistake, what=what, how=_remedy(frame), **figures)]
 
 
@@ -259,10 +259,12 @@ def _of_odometry(meaning: Hypothesis, figures: dict[str, float]) -> list[Hint]:
     if (meaning.speed, meaning.rate) == (1e-3, 1e-3):
         return [told("milliseconds", **figures)]
     found = [] if meaning.content == "twist" else [told(meaning.content, **figures)]
-    units = ("speeds", meaning.speed, hypotheses.SPEEDS), ("yaw rate", meaning.rate, hypotheses.RATES)
-    for column, unit, meant in units:
-        if unit != 1.0:
-            found.append(told(f"unit of {column}", what=meant[unit], factor=unit, **figures))
+    if meaning.speed != 1.0:
+        what = hypotheses.SPEED_UNITS[meaning.speed]
+        found.append(told("unit of speeds", what=what, factor=meaning.speed, **figures))
+    if meaning.rate != 1.0:
+        what = hypotheses.RATE_UNITS[meaning.rate]
+        found.append(told("unit of yaw rate", what=what, factor=meaning.rate, **figures))
     return found
 
 
@@ -277,17 +279,18 @@ def _late(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
 def _turned(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
     yaw, sigma = mounting.values[0] / DEGREE, mounting.sigmas[0] / DEGREE
     frame = best.hypothesis
-    if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURNED or sigma > TURNED_SIGMA):
+    if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURN_TOLD or sigma > TURN_SIGMA):
         return found
     side = ", with y to the right" if frame.mirrored else ""
-    figure = next((one.found for one in found if one.cause == "sensor frame"), "")
+    turned = told("turned", angle=_angle(frame.turn + yaw, 1), side=side)
+    figures = [one.found for one in found if one.cause == "sensor frame"]
     others = [one for one in found if one.cause not in ("sensor frame", "y to the right")]
-    return [*others, told("turned", angle=_angle(frame.turn + yaw, 1), side=side, found=figure)]
+    return [*others, replace(turned, found=figures[0]) if figures else turned]
 
 
 def _placed(mounting: Mounting) -> list[Hint]:
     length, sigma = np.hypot(*mounting.values[1:]), mounting.sigmas[1:].max()
-    if length < ARM or sigma > ARM_SIGMA * length:
+    if length < ARM_TOLD or sigma > ARM_SIGMA * length:
         return []
     ahead, left = mounting.values[1:].tolist()
     words = {"ahead_or_behind": "ahead" if ahead > 0.0 else "behind"}
@@ -316,9 +319,9 @@ def _labelled(trials: Trials, best: Trial) -> list[Hint]:
 def _unexplained(trials: Trials, best: Trial) -> list[Hint]:
     pairs = trials.pairs
     motion, size = trials.motion(best.hypothesis), np.hypot(pairs.before[..., 0], pairs.before[..., 1])
-    near = np.hypot(motion[:, 0], motion[:, 1]) < NEAR * np.nanmedian(size)
-    near &= (np.abs(motion[:, 2]) < NEAR) & (pairs.count >= MANY)
-    share = float(best.explained[near].mean()) if near.sum() >= LEAST_NEAR else 1.0
+    near = np.hypot(motion[:, 0], motion[:, 1]) < SAME_CONES * np.nanmedian(size)
+    near &= (np.abs(motion[:, 2]) < SAME_CONES) & (pairs.count >= SAME_CONES_SEEN)
+    share = float(best.explained[near].mean()) if near.sum() >= SAME_CONES_PAIRS else 1.0
     return [] if share > UNEXPLAINED else camera(pairs) or [told("unexplained", share=100.0 * share)]
 
 
@@ -331,7 +334,7 @@ def camera(pairs: Pairs) -> list[Hint]:
     return [told("camera", thin=thin, **lengths)] if in_line else []
 
 
-NO_LABEL: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
+NO_LABEL_WORDS: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
 # causes for which a log can be refused: the size of its numbers. Labels and frames never are
 REFUSABLE: Final = frozenset(
     {"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"}
@@ -359,9 +362,9 @@ def refused_hints(folder: Path) -> list[Hint]:
     try:
         files = ODOMETRY_FILE, DETECTIONS_FILE
         odometry, table = (read_table(folder / file, logs.COLUMNS[file]) for file in files)
-        twists = Odometry(odometry.numbers("t", MOST), odometry.stack(("vx", "vy", "wz"), MOST))
-        stamps, points = table.numbers("t", MOST), table.stack(("x", "y"), MOST)
-        covariances = logs.covariances_of(*table.stack(("xx", "xy", "yy"), MOST).T)
+        twists = Odometry(odometry.numbers("t", LARGEST), odometry.stack(("vx", "vy", "wz"), LARGEST))
+        stamps, points = table.numbers("t", LARGEST), table.stack(("x", "y"), LARGEST)
+        covariances = logs.covariances_of(*table.stack(("xx", "xy", "yy"), LARGEST).T)
     except InputError:
         return []
     cycles = logs.cycles_of(stamps, points, covariances, logs.labels_of(table))
@@ -372,6 +375,6 @@ def _foreign_labels(folder: Path, log: Log) -> list[Hint]:
     if not log.cycles or any((cycle.labels != UNKNOWN).any() for cycle in log.cycles):
         return []
     met = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])
-    foreign = [word for word, _ in met.most_common() if word.strip().lower() not in NO_LABEL]
+    foreign = [word for word, _ in met.most_common() if word.strip().lower() not in NO_LABEL_WORDS]
     words = ", ".join(map(shown, foreign[:SHOWN_WORDS]))
     return [told("foreign labels", words=words)] if foreign else []

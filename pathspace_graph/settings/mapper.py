@@ -90,9 +90,8 @@ class GateSettings(Positive):
     """Gate of a detection's distance from a curve, in standard deviations of their joint uncertainty."""
     huber: float = 1.5
     """Whitened residual beyond which the Huber loss reduces a weight; `inf` for plain least squares."""
-    view_ahead: float = 25.0
-    """Farthest place on a curve that a detection may belong to, m ahead of the vehicle along the curve."""
 
+    view_ahead: ClassVar[float] = 25.0  # m along a curve, of the farthest place ahead that a detection is on
     view_behind: ClassVar[float] = 4.0  # farthest such place behind the vehicle, m
     chi_unknown: ClassVar[float] = 1.5  # gate of unknown colour, own sigmas: a start line would bend curves
     sigma_floor: ClassVar[float] = 0.1  # m, of errors that the model does not know, added in the gate

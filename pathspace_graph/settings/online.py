@@ -41,33 +41,23 @@ class ClosingSettings(Positive):
 
     min_path: float = 60.0
     """Least length of a lap (m)."""
-    check_interval: float = 2.0
-    """Least distance of two attempts to close the loop (m along the path)."""
-    radius: float = 8.0
-    """Distance from the first stretch of the drive within which the loop may close (m)."""
-    drift: float = 0.03
-    """Growth of `radius` with the path driven (m/m)."""
-    overlap: float = 8.0
-    """Length of the beginning that must have been driven again (m)."""
-    inlier_distance: float = 0.4
-    """Distance from the beginning's curve within which a detection is an inlier (m)."""
-    inlier_share: float = 0.8
-    """Least share of inliers among the matched detections."""
-    prior_scale: float = 1.5
-    """Factor of the vehicle's own standard deviations in the prior of the registration."""
-    sigma_reading: float = 0.5
-    """Standard deviation of a detection in the registration (m), large since many are of one cone."""
     sigma_max: float = 0.4
     """Largest standard deviation of the registered position along its worst direction (m)."""
-    patience: float = 40.0
-    """Length of the beginning driven again after which `sigma_patience` replaces `sigma_max` (m)."""
-    sigma_patience: float = 0.85
-    """Largest standard deviation of the registered position after `patience` (m): detections on a straight
-    leave it free. Where the vehicle is lost, `sigma_max` stays in force."""
-    iterations: int = 2
-    """Gauss-Newton steps after the loop is found, and again after simplification."""
     gauge_laps: float = 4.0
     """Laps on the closed map after which its position and heading as a whole are held; `inf` for never."""
+
+    check_interval: ClassVar[float] = 2.0  # m along the path, from one attempt to close the loop to the next
+    radius: ClassVar[float] = 8.0  # m from the first stretch of the drive, within which the loop may close
+    drift: ClassVar[float] = 0.03  # growth of `radius` with the path driven (m/m)
+    overlap: ClassVar[float] = 8.0  # length of the beginning that must have been driven again (m)
+    inlier_distance: ClassVar[float] = 0.4  # m from the beginning's curve, within which a detection is inlier
+    inlier_share: ClassVar[float] = 0.8  # least share of inliers among the matched detections
+    prior_scale: ClassVar[float] = 1.5  # factor of the vehicle's standard deviations in the prior
+    sigma_reading: ClassVar[float] = 0.5  # m, of a detection in the registration: many are of one cone
+    patience: ClassVar[float] = 40.0  # m of the beginning driven again, from which a straight may close:
+    sigma_patience: ClassVar[float] = 0.85
+    """Replaces `sigma_max` then (m), since detections on a straight leave it free; not for a lost vehicle."""
+    iterations: ClassVar[int] = 2  # Gauss-Newton steps after the loop is found, and after simplification
 
     def radius_after(self, length: float) -> float:
         """Return the distance from the first stretch within which the loop may close after a length (m)."""

@@ -22,12 +22,12 @@ from .centre_line import points_across
 
 LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
 MOST_POINTS: Final = 200_000  # largest number of points of a line, which bounds the memory
-_SAMPLE_STEP: Final = 0.5  # of boundaries (m); the circle at a sample is right to a millimetre
-_ACROSS: Final = 2  # stride of the samples among which the points across are searched
-_BEHIND: Final = 3.0  # distance behind the vehicle at which the samples begin (m), since it may stand askew
-_OUTER: Final = 1.8  # largest ratio of the length of a turn's outer boundary to that of the centre line
+_AHEAD_STEP: Final = 0.5  # of boundaries (m); the circle at a sample is right to a millimetre
+_ACROSS_STRIDE: Final = 2  # stride of the samples among which the points across are searched
+_SAMPLES_BEHIND: Final = 3.0  # of the first sample behind the vehicle (m), since it may stand askew
+_OUTER_LENGTH: Final = 1.8  # largest length of a turn's outer boundary by that of the centre line
 _SETTLING_STEPS: Final = 8  # largest number of Newton steps that settle the stations; mostly two are enough
-_SETTLED: Final = 1e-3  # largest difference of the distances from both boundaries on the line (m)
+_LINE_SETTLED: Final = 1e-3  # largest difference of the distances from both boundaries on the line (m)
 _LARGEST_GAP: Final = 2.0  # largest number of steps between neighbours
 
 
@@ -74,14 +74,11 @@ class TrackAhead:
     """Points (k, 2) of the left boundary from beside the vehicle on, in m."""
     right: Array
     """Points (h, 2) of the right boundary from beside the vehicle on, in m."""
+    closed: ClassVar[bool] = False
+    """What is ahead is a stretch, also of a closed track."""
 
     def __repr__(self) -> str:
         return f"TrackAhead({len(self.points)} points on {self.length:.1f} m)"
-
-    @property
-    def closed(self) -> bool:
-        """Return false: what is ahead is a stretch, also of a closed track."""
-        return False
 
     @property
     def length(self) -> float:
@@ -89,27 +86,20 @@ class TrackAhead:
         return float(self.arc_length[-1]) if len(self.arc_length) else 0.0
 
 
-def too_short(name: str, least: float, found: object) -> SettingsError:
-    """Return the error of a length that is less than `least` (m), or no number."""
-    number = f"{float(found):g}" if isinstance(found, Real) else repr(found)
-    return SettingsError(f"{name}: expected a number of at least {least:g} m, found {number}")
-
-
-def check_length(name: str, length: float, least: float = LEAST_STEP) -> None:
-    """Raise a SettingsError unless a length (m) is a number of at least the shortest step."""
-    if not isinstance(length, Real) or not least <= length < np.inf:
-        raise too_short(name, least, length)
+def check_length(name: str, length: float, least: float = 0.0) -> None:
+    """Raise a SettingsError unless a length (m) is a positive number, and at least the given one."""
+    if isinstance(length, Real) and least <= length < np.inf and length > 0.0:
+        return
+    expected = f"a number of at least {least:g} m" if least else "a positive number (m)"
+    found = f"{float(length):g}" if isinstance(length, Real) else repr(length)
+    raise SettingsError(f"{name}: expected {expected}, found {found}")
 
 
 def check_line(distance: float, step: float, scale: float) -> None:
     """Raise a SettingsError unless a scene of this scale can have such a line ahead, in its metres."""
     check_length("step", step, LEAST_STEP * scale)
-    if not isinstance(distance, Real):
-        raise SettingsError(f"distance: expected a number (m), found {distance!r}")
-    if not 0.0 < distance < np.inf:
-        raise SettingsError(f"distance: expected a positive number (m), found {distance:g}")
-    if distance > MOST_POINTS * step:
-        raise too_short("step", distance / MOST_POINTS, step)
+    check_length("distance", distance)
+    check_length("step", step, distance / MOST_POINTS)
 
 
 def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:
@@ -120,8 +110,8 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     samples = {label: _sampled(curve, distance) for label, curve in curves.items()}
     sides = [np.zeros((0, 2)) for _ in BOUNDARIES]
     for label, one in samples.items():
-        beside = (one.station >= -_SETTLED) & (one.station <= distance + _SETTLED)
-        sides[label] = to_vehicle(one.points[beside][::_ACROSS], pose[None])
+        beside = (one.station >= -_LINE_SETTLED) & (one.station <= distance + _LINE_SETTLED)
+        sides[label] = to_vehicle(one.points[beside][::_ACROSS_STRIDE], pose[None])
     line = _first_line(samples[LEFT], samples[RIGHT]) if len(samples) == len(BOUNDARIES) else None
     if line is None or len(line) < 2:
         no, none = np.zeros(0), np.zeros((0, 2))
@@ -143,15 +133,15 @@ class _Samples:
 
 def _sampled(curve: CurveAhead, distance: float) -> _Samples:
     tables = curve.tables
-    begin, end = curve.beside - _BEHIND, curve.beside + _OUTER * distance + _BEHIND
+    begin, end = curve.beside - _SAMPLES_BEHIND, curve.beside + _OUTER_LENGTH * distance + _SAMPLES_BEHIND
     if tables.periodic:
         end = min(end, begin + tables.length)  # at most once round
     else:
         begin, end = max(begin, tables.low), min(end, tables.high, curve.until)
     # a sample is beside the vehicle, if the curve is there
-    first = int(np.floor((begin - curve.beside) / _SAMPLE_STEP + _SETTLED))
-    last = int(np.ceil((end - curve.beside) / _SAMPLE_STEP - _SETTLED))
-    u = curve.beside + _SAMPLE_STEP * np.arange(first, last + 1)
+    first = int(np.floor((begin - curve.beside) / _AHEAD_STEP + _LINE_SETTLED))
+    last = int(np.ceil((end - curve.beside) / _AHEAD_STEP - _LINE_SETTLED))
+    u = curve.beside + _AHEAD_STEP * np.arange(first, last + 1)
     u = np.minimum(np.maximum(u, begin), max(end, begin))
     values, span = tables.evaluate(u, 2)
     columns = span[:, None] + np.arange(-tables.degree, 1)
@@ -178,7 +168,7 @@ def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Arra
     share = (lengths[:-1] / (lengths[:-1] + lengths[1:]))[:, None]
     inner = unit[:-1] * (1.0 - share) + unit[1:] * share
     slopes = np.concatenate([slope[None] / np.hypot(*slope), inner, unit[-1:]])
-    counts = np.maximum(np.ceil(lengths / _SAMPLE_STEP).astype(int), 1)
+    counts = np.maximum(np.ceil(lengths / _AHEAD_STEP).astype(int), 1)
     piece = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(len(piece)) - np.repeat(np.cumsum(counts) - counts, counts) + 1.0
     x, h = (within / counts[piece])[:, None], lengths[piece][:, None]
@@ -194,7 +184,7 @@ def _first_line(left: _Samples, right: _Samples) -> Array:
 
     Each row (4,) is a middle (m, map frame) and the stations of both samples (m).
     """
-    of = slice(None, None, _ACROSS)
+    of = slice(None, None, _ACROSS_STRIDE)
     lefts, rights = left.points[of], right.points[of]
     stations = left.station[of], right.station[of]
     apart = 0.5 * min(left.station[-1], right.station[-1])  # a loop must not be paired across its ends
@@ -202,7 +192,7 @@ def _first_line(left: _Samples, right: _Samples) -> Array:
     forward = j >= np.maximum.accumulate(j)
     i, j = i[forward], j[forward]
     line = np.column_stack([0.5 * (lefts[i] + rights[j]), stations[0][i], stations[1][j]])
-    apart_enough = _distances(line[:, :2]) > _SETTLED
+    apart_enough = _distances(line[:, :2]) > _LINE_SETTLED
     apart_enough[:1] = True
     return line[apart_enough]
 
@@ -217,7 +207,7 @@ def _from_beside(line: Array, position: Array, distance: float, step: float) -> 
     nearest = int(dot(away, away).argmin())
     lengths = np.append(0.0, np.cumsum(np.sqrt(squares)))
     begin = lengths[nearest] + share[nearest] * (lengths[nearest + 1] - lengths[nearest])
-    count = int(min(distance, lengths[-1] - begin) / step + _SETTLED)
+    count = int(min(distance, lengths[-1] - begin) / step + _LINE_SETTLED)
     at = begin + step * np.arange(count + 1)
     return np.column_stack([np.interp(at, lengths, values) for values in line.T])
 
@@ -234,10 +224,10 @@ def _settled(
         both = feet[0].normal + feet[1].normal
         square = np.maximum(dot(both, both), np.finfo(float).tiny)[:, None]
         inside = feet[0].inside & feet[1].inside
-        if not (inside & ((np.abs(off) > _SETTLED) | feet[0].slid | feet[1].slid)).any():
+        if not (inside & ((np.abs(off) > _LINE_SETTLED) | feet[0].slid | feet[1].slid)).any():
             break
         points = points - off[:, None] / square * both
-    good = (np.abs(off) <= _SETTLED) & (feet[0].distance < 0.0) & (feet[1].distance > 0.0)
+    good = (np.abs(off) <= _LINE_SETTLED) & (feet[0].distance < 0.0) & (feet[1].distance > 0.0)
     good &= inside & (_distances(points) <= _LARGEST_GAP * step)
     n = len(good) if good.all() else int(good.argmin())
     normal = both / np.sqrt(square)
@@ -288,7 +278,7 @@ class _Feet:
         self.distance = (2.0 * self.b - self.k * (self.a**2 + self.b**2)) / (1.0 + q)
         tangent, normal = samples.tangents[nearest], self._normals[nearest]
         self.normal = (cosine / q)[:, None] * normal - (sine / q)[:, None] * tangent
-        beyond = np.abs(self.a / self.spread) > 0.5 * _SAMPLE_STEP + _SETTLED
+        beyond = np.abs(self.a / self.spread) > 0.5 * _AHEAD_STEP + _LINE_SETTLED
         self.inside = ~(beyond & ((nearest == 0) | (nearest == last)))
         self.confirmed = samples.confirmed[nearest]
 
@@ -301,7 +291,7 @@ class _Feet:
 
     def _spread(self, distance: Array) -> Array:
         spread = 1.0 - self.k * distance
-        return np.where(np.abs(spread) > _SETTLED, spread, _SETTLED)
+        return np.where(np.abs(spread) > _LINE_SETTLED, spread, _LINE_SETTLED)
 
     @property
     def offset_curvature(self) -> Array:

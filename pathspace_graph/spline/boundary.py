@@ -17,7 +17,7 @@ from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
 from .bspline import BSpline, segments_cross, side_of
 
-ROUND_OFF = 1e-9  # largest difference from a knot of parameters that lie on it (m)
+KNOT_ROUND_OFF = 1e-9  # largest difference from a knot of parameters that lie on it (m)
 SAME_DIRECTION = 0.5  # least cosine of the angle between the curve beside a vehicle and the vehicle's heading
 
 
@@ -184,7 +184,7 @@ class Boundary:
         Knots are appended until the domain holds the last parameter, the new `confirmed_end`. Control points
         that act only beyond the last cone before are placed again: the direction at the end was a guess.
         """
-        before = int(self.cone_parameters.searchsorted(self.confirmed_end - ROUND_OFF))
+        before = int(self.cone_parameters.searchsorted(self.confirmed_end - KNOT_ROUND_OFF))
         from_u = float(self.cone_parameters[before - 1]) if before else self.confirmed_end
         return self.extend(len(control_points), targets_u, from_u).place(control_points, targets)
 
@@ -194,7 +194,7 @@ class Boundary:
         It is placed anew from `from_u` on, by default from its confirmed end on; its end stays where it is.
         """
         spacing = self.settings.spacing
-        missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - ROUND_OFF))
+        missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - KNOT_ROUND_OFF))
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
             self._set_tables(self.tables.extended(np.append(self.knots, last)))
@@ -205,7 +205,7 @@ class Boundary:
     def settled(self, size: int, u: float | None = None) -> int:
         """Return how many of the first `size` control points act before u, by default `confirmed_end`."""
         u = self.confirmed_end if u is None else u
-        return max(int(np.searchsorted(self.knots[:size], u - ROUND_OFF)) - 1, 0)
+        return max(int(np.searchsorted(self.knots[:size], u - KNOT_ROUND_OFF)) - 1, 0)
 
     def move(self, motion: Array) -> None:
         self.observed = move_points(motion, self.observed)
@@ -271,7 +271,7 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
 # --- whether boundaries cross ----------------------------------------------------------------------------
 
 NO_PATH: Final = np.zeros((0, 2))
-PATH_STEP: Final = 1.0  # step at which a driven path is looked at for crossings with itself (m)
+LEVEL_PATH_STEP: Final = 1.0  # step at which a driven path is looked at for crossings with itself (m)
 LEVEL_SINE: Final = 0.7  # of the angle of a level crossing, at least: laps over one road meet at less
 LEVEL_CROSSING: Final = 8.0  # largest distance of crossing boundaries from that of the path (m)
 
@@ -292,7 +292,7 @@ def at_level_crossing(points: Array, path: Array) -> BoolArray:
     """Return whether each point (m, 2) is at a place where a driven path (n, 2) crosses itself."""
     if len(points) == 0 or len(path) < 2:
         return np.zeros(len(points), bool)
-    _, kept = np.unique(path_lengths(path) // PATH_STEP, return_index=True)
+    _, kept = np.unique(path_lengths(path) // LEVEL_PATH_STEP, return_index=True)
     places = KDTree(crossings(path[kept], path[kept], LEVEL_SINE))
     return np.asarray(places.query(points)[0] < LEVEL_CROSSING)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from scipy.interpolate import BSpline as ScipyBSpline
 
 _PERIODIC_TOLERANCE: Final = 1e-9  # of repeated values, over (1 + the largest)
-_GRID_PER_SPAN: Final = 8  # grid points on each span of a foot-point search over the whole curve
+_FOOT_GRID: Final = 8  # grid points on each span of a foot-point search over the whole curve
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
 _ARC_NEWTON_STEPS: Final = 4  # Newton steps that invert the arc length, from a table with the same grid
 _SHORTEST_EXTENSION: Final = 1e-3  # knot interval over the mean one, where the point is the end
@@ -212,7 +212,7 @@ class BSpline:
     def foot_points(self, points: Array) -> FootPoints:
         """Search the whole curve for the foot points of points (k, 2), map frame."""
         low, high = self.domain
-        step = (high - low) / (_GRID_PER_SPAN * (len(self.control_points) - self.degree))
+        step = (high - low) / (_FOOT_GRID * (len(self.control_points) - self.degree))
         lows, highs = np.full(len(points), low), np.full(len(points), high)
         return foot_points(self.tables, self.control_points, points, lows, highs, step)
 
@@ -231,7 +231,7 @@ class BSpline:
         """Return u (k,) at arc lengths (k,), clipped to the curve: the inverse of `arc_length`."""
         low, high = self.domain
         lengths = np.clip(lengths, 0.0, self.length())
-        grid = np.linspace(low, high, _GRID_PER_SPAN * (len(self.breaks) - 1) + 1)
+        grid = np.linspace(low, high, _FOOT_GRID * (len(self.breaks) - 1) + 1)
         u = np.interp(lengths, self.arc_length(grid), grid)
         for _ in range(_ARC_NEWTON_STEPS):
             speed = np.linalg.norm(self.evaluate(u, 1), axis=1)

@@ -86,17 +86,17 @@ class Ribbon(BSpline):
 
 # --- the line between two boundaries ---------------------------------------------------------------------
 
-SPACING: Final = 3.0  # of the knots of a planner's line (m); shorter kinks are smoothed
+RIBBON_SPACING: Final = 3.0  # of the knots of a planner's line (m); shorter kinks are smoothed
 MOST_SAMPLES: Final = 200_000  # largest number of samples of a boundary, which bounds the memory
-_FEWEST: Final = 4  # smallest number of samples of a boundary and of knot intervals of a line
-_STARTS: Final = 200  # number of samples of the left boundary among which the march begins
-_NEAR: Final = 12  # distance in samples from a pair within which segments are tested for a crossing
-_ROUNDS: Final = 3  # moves of the line to the middle between the crossings of its normals
-_SMOOTHNESS: Final = 1e-3  # weight of second differences, for what the samples leave open
+_FEWEST_SPANS: Final = 4  # smallest number of samples of a boundary and of knot intervals of a line
+_PAIR_STARTS: Final = 200  # number of samples of the left boundary among which the march begins
+_PAIRS_NEAR: Final = 12  # distance in samples from a pair within which segments are tested for a crossing
+_RIBBON_ROUNDS: Final = 3  # moves of the line to the middle between the crossings of its normals
+_RIBBON_SMOOTHNESS: Final = 1e-3  # weight of second differences, for what the samples leave open
 _CROSSING_STEPS: Final = 8  # number of Newton steps to the crossing of a normal and a boundary
 _CROSSED: Final = 1e-6  # distance of the point found from a boundary below which a normal crosses it (m)
 _LEAST_COSINE: Final = 0.1  # least cosine of the angle between boundary and line at a crossing
-_FARTHEST: Final = 1.5  # of a crossing over the paired sample; beyond, it is of another stretch
+_FARTHEST_ACROSS: Final = 1.5  # of a crossing over the paired sample; beyond, it is of another stretch
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class CentreCurve:
         for side, spline in enumerate(self.sides):
             outward, (low, high) = SIDE[side], spline.domain
             begin = u = np.interp(at, *self.table(side).T[::-1])
-            far = _FARTHEST * np.linalg.norm(spline.evaluate(u) - points, axis=1)
+            far = _FARTHEST_ACROSS * np.linalg.norm(spline.evaluate(u) - points, axis=1)
             for _ in range(_CROSSING_STEPS):
                 point, first = spline.derivatives(u, 1)
                 ahead, slope = dot(point - points, tangent), dot(first, tangent)
@@ -191,7 +191,7 @@ class Crossing:
         return sparse_rows(entries, 2 * (columns + first)[:, :, None] + np.arange(2), 2 * size)
 
 
-def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPACING) -> CentreCurve:
+def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = RIBBON_SPACING) -> CentreCurve:
     """Return the line between two boundaries, on knots about `spacing` (m) apart.
 
     Samples of both are paired along the strip between them, always over the shorter diagonal. A ribbon is
@@ -214,14 +214,14 @@ def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = SPAC
         paired.append(u[k % len(u)] + (high - low) * (k // len(u)))  # indices go on past the end of a loop
     values = np.column_stack([0.5 * (a + b), 0.5 * np.hypot(*(a - b).T)])
     lengths = path_lengths(values)
-    blank = Ribbon.even(0.0, lengths[-1], max(round(lengths[-1] / spacing), _FEWEST), closed)
+    blank = Ribbon.even(0.0, lengths[-1], max(round(lengths[-1] / spacing), _FEWEST_SPANS), closed)
     count = max(int(np.ceil(lengths[-1] / SAMPLE_STEP)), RIBBON * (len(blank.breaks) - 1))
     u = np.linspace(0.0, lengths[-1], count + 1)[: count if closed else None]
     middles = np.column_stack([np.interp(u, lengths, column) for column in values.T])
     beside = np.interp(u, lengths, paired[0]), np.interp(u, lengths, paired[1])
     fit = _Fit(blank, u)
     line = CentreCurve(blank.with_points(fit.solve(middles)), u, sides, beside)
-    for _ in range(_ROUNDS):  # to the middle between the crossings of its normals, where these cross both
+    for _ in range(_RIBBON_ROUNDS):  # to the middle between its normals' crossings, where they cross both
         one, other = line.crossings(u)
         good = one.good & other.good
         middle = 0.5 * (one.offset + other.offset)[:, None] * one.normal + line.ribbon.centre.evaluate(u)
@@ -239,7 +239,8 @@ class _Fit:
         self._basis = sparse_rows(*ribbon.local_basis(u), ribbon.size)
         triples = (np.arange(len(ribbon.bending))[:, None] + np.arange(RIBBON)) % ribbon.size
         D = sparse_rows(ribbon.bending, triples, ribbon.size)
-        self._factor: SuperLU = splu(csc_array(self._basis.T @ self._basis + _SMOOTHNESS**2 * (D.T @ D)))
+        information = self._basis.T @ self._basis + _RIBBON_SMOOTHNESS**2 * (D.T @ D)
+        self._factor: SuperLU = splu(csc_array(information))
 
     def solve(self, values: Array) -> Array:
         return np.asarray(self._factor.solve(np.asarray(self._basis.T @ values)))
@@ -256,7 +257,7 @@ def sparse_rows(values: Array, columns: IntArray, size: int) -> csr_array:
 
 def _samples(spline: BSpline, closed: bool) -> Array:
     length = spline.length()
-    count = max(int(np.ceil(length / SAMPLE_STEP)), _FEWEST)
+    count = max(int(np.ceil(length / SAMPLE_STEP)), _FEWEST_SPANS)
     return spline.parameters_at(np.linspace(0.0, length, count + 1)[: count if closed else None])
 
 
@@ -285,7 +286,7 @@ def _first_pair(
     sides: tuple[BSpline, BSpline], samples: list[Array], points: list[Array], closed: bool
 ) -> tuple[int, int]:
     """Return the nearest pair of samples that face each other, the left one on the left."""
-    some = np.unique(np.linspace(0, len(samples[0]) - 1, _STARTS).astype(int))
+    some = np.unique(np.linspace(0, len(samples[0]) - 1, _PAIR_STARTS).astype(int))
     lengths = [np.linspace(0.0, spline.length(), len(u)) for spline, u in zip(sides, samples, strict=True)]
     tangents = [spline.tangent_unit(u) for spline, u in zip(sides, samples, strict=True)]
     # an open map may overlap itself before its loop is closed
@@ -344,7 +345,7 @@ def _square(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 def _check_apart(lefts: Array, rights: Array, i: IntArray, j: IntArray, closed: bool) -> None:
     """Raise a SettingsError where the boundaries cross near a pair of samples that face each other."""
     mode: Literal["wrap", "clip"] = "wrap" if closed else "clip"
-    near = j[:, None] + np.arange(-_NEAR, _NEAR + 1)
+    near = j[:, None] + np.arange(-_PAIRS_NEAR, _PAIRS_NEAR + 1)
     p, q = (lefts.take(i[:, None] + k, axis=0, mode=mode) for k in range(2))
     r, s = (rights.take(near + k, axis=0, mode=mode) for k in range(2))
     crossed = segments_cross(p, q, r, s).any(axis=1)

@@ -19,18 +19,18 @@ from pathspace_graph.lengths import Length, Text
 from .boundary import crossing_segments
 from .bspline import BSpline, cross, dot
 
-SAMPLES: Final = 8  # number of points for each control point by which the usual distance is found
-STEP: Final = 0.15  # distance of the samples of curves and drive
-MISSING: Final = 5.0  # step of a drive beyond which it is not known between two poses
-DEPTH: Final = 0.35  # how far behind a boundary the vehicle is across it: drivers cut corners
-BESIDE: Final = 2.5  # farthest that the boundary of a road lies from the drive along it
-ANOTHER: Final = 15.0  # least length driven between two passes of one place
-ALONG: Final = 0.9  # least cosine of the angle of a boundary and the drive along it
-PARTED: Final = 0.87  # largest cosine of the angle of two ways that cross
-MEETING: Final = 7.0  # how near to such a place boundaries may be crossed
-MET: Final = 0.5  # largest distance of two ways that cross
-MOST: Final = 500  # most samples of the drive that are looked at there
-ON_ROAD: Final = 0.5  # share of a stretch with another boundary beside it from which it is on the road
+COARSE: Final = 8  # number of points for each control point by which the usual distance is found
+CROSSING_STEP: Final = 0.15  # distance of the samples of curves and drive
+DRIVE_GAP: Final = 5.0  # step of a drive beyond which it is not known between two poses
+CROSSED_DEPTH: Final = 0.35  # how far behind a boundary the vehicle is across it: drivers cut corners
+ROADSIDE: Final = 2.5  # farthest that the boundary of a road lies from the drive along it
+PASSES_APART: Final = 15.0  # least length driven between two passes of one place
+ALONG_COSINE: Final = 0.9  # least cosine of the angle of a boundary and the drive along it
+PARTED_COSINE: Final = 0.87  # largest cosine of the angle of two ways that cross
+MEETING_REACH: Final = 7.0  # how near to such a place boundaries may be crossed
+MEETING_DISTANCE: Final = 0.5  # largest distance of two ways that cross
+MEETING_SAMPLES: Final = 500  # most samples of the drive that are looked at there
+ON_ROAD_SHARE: Final = 0.5  # share of a stretch with another boundary beside it from which it is on the road
 
 
 class Crossing(NamedTuple):
@@ -65,10 +65,10 @@ def crossed_boundaries(curves: Mapping[int, BSpline], path: Array) -> list[Cross
     path = path[np.append(moves[:1], moves)]
     if len(path) < 2 or not curves:
         return []
-    coarse = [curve.evaluate(np.linspace(*curve.domain, SAMPLES * curve.size)) for curve in curves.values()]
+    coarse = [curve.evaluate(np.linspace(*curve.domain, COARSE * curve.size)) for curve in curves.values()]
     aside = float(np.median([KDTree(points).query(path)[0] for points in coarse]))
     drive = _drive(path, aside)
-    lines = {label: _line(curve, STEP * aside) for label, curve in curves.items()}
+    lines = {label: _line(curve, CROSSING_STEP * aside) for label, curve in curves.items()}
     found = [one for label in lines for one in _crossings(label, lines, drive, aside)]
     return sorted(found, key=lambda one: one.driven)
 
@@ -92,9 +92,9 @@ def _line(curve: BSpline, step: float) -> _Way:
 
 def _drive(path: Array, aside: float) -> _Way:
     length = path_lengths(path)
-    missing = np.flatnonzero(np.diff(length) > MISSING * aside) + 1
+    missing = np.flatnonzero(np.diff(length) > DRIVE_GAP * aside) + 1
     known = [rows for rows in np.split(length, missing) if len(rows) > 1]
-    at = [np.linspace(rows[0], rows[-1], int(np.ptp(rows) / (STEP * aside)) + 2) for rows in known]
+    at = [np.linspace(rows[0], rows[-1], int(np.ptp(rows) / (CROSSING_STEP * aside)) + 2) for rows in known]
     ends = np.cumsum([0, *map(len, at)]).tolist()
     where = np.concatenate([np.zeros(0), *at])
     points = np.column_stack([np.interp(where, length, column) for column in path.T])
@@ -108,8 +108,9 @@ def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float)
     line, found = lines[label], []
     distance, foot = map(np.asarray, KDTree(line.points).query(drive.points))
     inside = (foot > 0) & (foot < len(line.points) - 1)
-    deep = (line.closed | inside) & (distance > DEPTH * aside)  # nothing is beside a curve that has ended
-    reaches = np.asarray(KDTree(drive.points).query(line.points)[0]) > DEPTH * aside
+    depth = CROSSED_DEPTH * aside
+    deep = (line.closed | inside) & (distance > depth)  # nothing is beside a curve that has ended
+    reaches = np.asarray(KDTree(drive.points).query(line.points)[0]) > depth
     for piece in drive.pieces:
         rows, at, share = crossing_segments(drive.points[piece], line.points)
         order = np.argsort(rows + share)
@@ -122,7 +123,7 @@ def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float)
             row, on_line = int(rows[change]), int(at[change])
             step = drive.points[row + 1] - drive.points[row]
             one = Crossing(label, drive.points[row] + share[change] * step, float(drive.length[row]))
-            leaves = (_turn(line.heading[on_line], step) > 0.0) == (label == LEFT)
+            leaves = (cross(line.heading[on_line], step) > 0.0) == (label == LEFT)
             beyond = slice(row + 1, ends[k + 2]) if leaves else slice(ends[k], row + 1)
             is_last = k == (len(changes) - 1 if leaves else 0)
             allowed = is_last and _is_off_road(label, lines, drive, beyond, aside)
@@ -153,7 +154,7 @@ def _changes(deep: set[int]) -> list[int]:
 def _is_off_road(label: int, lines: Mapping[int, _Way], drive: _Way, beyond: slice, aside: float) -> bool:
     """Return whether the drive beyond a boundary is along no other one, as where it comes onto the road."""
     others = [_beside(other, line, drive, beyond, aside) for other, line in lines.items() if other != label]
-    return bool(others) and max(float(one.mean()) for one in others) < ON_ROAD
+    return bool(others) and max(float(one.mean()) for one in others) < ON_ROAD_SHARE
 
 
 def _beside(label: int, line: _Way, drive: _Way, rows: slice, aside: float) -> BoolArray:
@@ -161,31 +162,26 @@ def _beside(label: int, line: _Way, drive: _Way, rows: slice, aside: float) -> B
     distance, foot = map(np.asarray, KDTree(line.points).query(drive.points[rows]))
     heading, off = drive.heading[rows], line.points[foot] - drive.points[rows]
     on_side = (cross(heading, off) > 0.0) == (label == LEFT)
-    along = np.abs(dot(heading, line.heading[foot])) > ALONG
-    return np.asarray(on_side & along & (distance < BESIDE * aside))
+    along = np.abs(dot(heading, line.heading[foot])) > ALONG_COSINE
+    return np.asarray(on_side & along & (distance < ROADSIDE * aside))
 
 
 def _meets_itself(place: Array, drive: _Way, aside: float) -> bool:
     """Return whether the way crosses another part of itself near a place (2,)."""
-    near = np.flatnonzero(np.hypot(*(drive.points - place).T) < MEETING * aside)
-    near = near[:: 1 + len(near) // MOST]
+    near = np.flatnonzero(np.hypot(*(drive.points - place).T) < MEETING_REACH * aside)
+    near = near[:: 1 + len(near) // MEETING_SAMPLES]
     points, heading, length = drive.points[near], drive.heading[near], drive.length[near]
-    parted = np.abs(heading @ heading.T) < PARTED
-    parted &= np.abs(length[:, None] - length) > ANOTHER * aside
+    parted = np.abs(heading @ heading.T) < PARTED_COSINE
+    parted &= np.abs(length[:, None] - length) > PASSES_APART * aside
     offset = points[:, None] - points
-    return bool((parted & (np.hypot(offset[..., 0], offset[..., 1]) < MET * aside)).any())
+    return bool((parted & (np.hypot(offset[..., 0], offset[..., 1]) < MEETING_DISTANCE * aside)).any())
 
 
 def _is_of_another_lap(one: Crossing, heading: Array, drive: _Way, aside: float) -> bool:
     """Return whether a boundary with a heading (2,) lies beside another part of the way, on its own side."""
     off = one.place - drive.points
     across = cross(drive.heading, off) * (1.0 if one.label == LEFT else -1.0)
-    beside = (across > DEPTH * aside) & (across < BESIDE * aside)
-    beside &= np.abs(dot(drive.heading, off)) < STEP * aside
-    beside &= np.abs(drive.heading @ heading) > ALONG
-    return bool((beside & (np.abs(drive.length - one.driven) > ANOTHER * aside)).any())
-
-
-def _turn(a: Array, b: Array) -> float:
-    """Return the cross product of two vectors (2,), which is positive where b points to the left of a."""
-    return float(a[0] * b[1] - a[1] * b[0])
+    beside = (across > CROSSED_DEPTH * aside) & (across < ROADSIDE * aside)
+    beside &= np.abs(dot(drive.heading, off)) < CROSSING_STEP * aside
+    beside &= np.abs(drive.heading @ heading) > ALONG_COSINE
+    return bool((beside & (np.abs(drive.length - one.driven) > PASSES_APART * aside)).any())

@@ -14,11 +14,11 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.spline.bspline import BSpline
 
-DEGREE: Final = 3  # of a curve, where none is given
-BASELINE: Final = 0.5  # share in [0, 1] of the knots that is spread evenly, so that straights have some
+CUBIC: Final = 3  # of a curve, where none is given
+LINEAR_BASELINE: Final = 0.5  # share in [0, 1] of the knots that is spread evenly, for straights
 CURVATURE_MAX: Final = 0.7  # that larger ones count as (1/m), so that a kink does not attract all knots
-SMOOTHNESS: Final = 1e-3  # weight (m^3) of the integral of |S''|^2 beside the sum of squared distances
-ROUNDS: Final = 4  # times that a fit's knots are placed anew by curvature, after evenly spaced ones
+ENERGY_WEIGHT: Final = 1e-3  # weight (m^3) of the integral of |S''|^2 beside the sum of squared distances
+KNOT_ROUNDS: Final = 4  # times that a fit's knots are placed anew by curvature, after evenly spaced ones
 REFITS: Final = 4  # least-squares fits on each set of knots, with refreshed foot points
 _SAMPLES_PER_BREAK: Final = 40  # equally spaced samples of the curvature for each requested break
 _SAMPLES_PER_SPAN: Final = 8  # least-squares samples of a refit on each span: enough for any degree up to 7
@@ -26,7 +26,7 @@ _BRIDGE: Final = 1e-3  # weight of second derivatives on spans with too few samp
 _BENDING_PER_SPAN: Final = 3  # places on each such span at which the second derivative is taken
 
 
-def quantile_breaks(u: Array, curvature: Array, count: int, baseline: float = BASELINE) -> Array:
+def quantile_breaks(u: Array, curvature: Array, count: int, baseline: float = LINEAR_BASELINE) -> Array:
     """Return breaks (count + 1,) at equal quantiles of (1 - b) |kappa| / sum |kappa| + b / N.
 
     The N equally long intervals between parameters u (N + 1,) have curvature kappa (N,) in 1/m; b is the
@@ -46,7 +46,7 @@ def quantile_breaks(u: Array, curvature: Array, count: int, baseline: float = BA
 def curvature_weighted_breaks(
     spline: BSpline,
     count: int,
-    baseline: float = BASELINE,
+    baseline: float = LINEAR_BASELINE,
     low: float | None = None,
     high: float | None = None,
 ) -> Array:
@@ -154,7 +154,7 @@ def _on_spans(spline: BSpline, count: int) -> Array:
 
 
 def fit_spline(
-    points: Array, size: int, periodic: bool, degree: int = DEGREE, breaks: Array | None = None
+    points: Array, size: int, periodic: bool, degree: int = CUBIC, breaks: Array | None = None
 ) -> BSpline:
     """Fit a spline of `size` distinct control points to ordered points (k, 2) in m, by least squares.
 
@@ -169,7 +169,7 @@ def fit_spline(
     if breaks is not None:
         return _fit_on(points, u, breaks, periodic, degree)[0]
     knots, fits = np.linspace(0.0, high, count + 1), []
-    for _ in range(ROUNDS + 1):
+    for _ in range(KNOT_ROUNDS + 1):
         spline, u, rmse = _fit_on(points, u, knots, periodic, degree)
         fits.append((rmse, spline))
         knots = curvature_weighted_breaks(spline, count)
@@ -189,7 +189,7 @@ def _fit_on(
     points: Array, u: Array, breaks: Array, periodic: bool, degree: int
 ) -> tuple[BSpline, Array, float]:
     frame = _frame(breaks, periodic, degree)
-    bending = np.sqrt(SMOOTHNESS) * energy_rows(frame)
+    bending = np.sqrt(ENERGY_WEIGHT) * energy_rows(frame)
     values = np.concatenate([points, np.zeros((len(bending), 2))])
     reach = (breaks[-1] - breaks[0]) / max(len(breaks) - 1, len(points))
     for _ in range(REFITS):
@@ -213,9 +213,9 @@ def energy_rows(spline: BSpline) -> Array:
 # --- knots where cones ask for them ----------------------------------------------------------------------
 
 
-EVEN: Final = 1e-9  # weight of the square of the interval left by a removal against its cost, for ties
-MARGIN: Final = 0.1  # least share by which a smaller curve's sum of squares must be smaller
-COINCIDENT: Final = 1e-9  # difference of parameters of cones that share one knot (m), lest 0 / 0
+EVEN_WEIGHT: Final = 1e-9  # weight of the square of the interval left by a removal against its cost, for ties
+SIZE_MARGIN: Final = 0.1  # least share by which a smaller curve's sum of squares must be smaller
+COINCIDENT_CONES: Final = 1e-9  # difference of parameters of cones that share one knot (m), lest 0 / 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,14 +236,14 @@ class Thinned:
 def chosen_breaks(points: Array, periodic: bool, degree: int, least: int, most: int) -> Thinned:
     """Choose, among the curves of `thin` with `least` to `most` control points, by cross-validation.
 
-    The largest is chosen, unless a smaller one predicts a point left out better by `MARGIN`. BIC takes a knot
-    for every cone, since rss vanishes; knots by curvature leave 0.107 m to cones where these leave 0.066 m.
+    The largest is chosen, unless a smaller one predicts a point left out better by `SIZE_MARGIN`. BIC takes a
+    knot for every cone, since rss vanishes. Knots by curvature leave 0.107 m to cones, these 0.066 m.
     """
     along = path_lengths(points)
     high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
     path = list(thin(points, along, high, periodic, degree, least))
     within = [curve for curve in path if curve.size <= most] or path[-1:]
-    return min(within, key=lambda curve: (1.0 if curve is within[0] else 1.0 + MARGIN) * curve.crossed)
+    return min(within, key=lambda curve: (1.0 if curve is within[0] else 1.0 + SIZE_MARGIN) * curve.crossed)
 
 
 def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, least: int) -> Iterator[Thinned]:
@@ -258,15 +258,15 @@ def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, leas
     decreases by `w' G^-1 a / (a' G^-1 a) a'c`. So it suffices to update `W c` and `W G^-1 A'` by a rank of
     one, where the rows of W are the jumps A at all knots and the basis at the points.
     """
-    inner = np.unique(u[(u > COINCIDENT) & (u < high - COINCIDENT)])
-    breaks = np.concatenate([[0.0], inner[np.diff(inner, prepend=0.0) > COINCIDENT], [high]])
+    inner = np.unique(u[(u > COINCIDENT_CONES) & (u < high - COINCIDENT_CONES)])
+    breaks = np.concatenate([[0.0], inner[np.diff(inner, prepend=0.0) > COINCIDENT_CONES], [high]])
     while periodic and len(breaks) <= degree + 1:
         breaks = np.sort(np.append(breaks, 0.5 * (breaks[1:] + breaks[:-1])))
     frame = _frame(breaks, periodic, degree)
     B, bending = frame.basis_matrix(u), energy_rows(frame)
     highest = frame.basis_matrix(0.5 * (frame.breaks[1:] + frame.breaks[:-1]), degree)
     jumps = np.diff(highest, axis=0)  # of the highest derivative at each inner break, by control point
-    factor = cho_factor(B.T @ B + SMOOTHNESS * bending.T @ bending)
+    factor = cho_factor(B.T @ B + ENERGY_WEIGHT * bending.T @ bending)
     watched, n, remaining = np.concatenate([jumps, B]), len(jumps), np.arange(len(jumps))
     spread = np.asfortranarray(watched @ cho_solve(factor, jumps.T))
     values = watched @ cho_solve(factor, B.T @ points)
@@ -277,7 +277,7 @@ def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, leas
         if len(remaining):
             jump = values[remaining]
             cost = (jump[:, 0] ** 2 + jump[:, 1] ** 2) / spread[remaining, remaining]
-            removed = int((cost + EVEN * (kept[2:] - kept[:-2]) ** 2).argmin())
+            removed = int((cost + EVEN_WEIGHT * (kept[2:] - kept[:-2]) ** 2).argmin())
             k, column = remaining[removed], spread[:, remaining[removed]].copy()
             leverage, share = leverage - column[n:] ** 2 / column[k], column / column[k]
             values = values - share[:, None] * values[k]

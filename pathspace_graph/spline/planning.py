@@ -14,7 +14,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.settings.output import SpeedSettings
 
-from .ahead import MOST_POINTS, TrackAhead, check_length
+from .ahead import LEAST_STEP, MOST_POINTS, TrackAhead, check_length
 from .bspline import BSpline, cross, dot
 from .centre_line import RIBBON, CentreCurve, Crossing, find_line, sparse_rows
 
@@ -54,39 +54,40 @@ def speed_profile(
     than two points, a speed is not a number from 0 on, or one is given for a closed line.
     """
     settings = settings or SpeedSettings()
-    count = len(line.curvature)
-    if count < 2:
-        raise SettingsError(f"a speed profile: expected a line of at least 2 points, found {count}")
-    if line.closed and (begin is not None or end is not None):
-        raise SettingsError(
-            "a speed profile: expected an open line for a first or a last speed, found a loop"
-        )
+    _check_ends(line, begin, end)
+    count, steps = len(line.curvature), np.diff(line.arc_length)
     bend = np.abs(line.curvature) / settings.lateral
     squares = np.minimum(1.0 / np.maximum(bend, np.finfo(float).tiny), settings.top**2)
-    steps = np.diff(line.arc_length)
     if line.closed:  # from the slowest point once round, back to it
         first = int(squares.argmin())
         around = np.arange(first, first + count + 1) % count
         steps = np.append(steps, line.length - line.arc_length[-1])[around[:-1]]
         squares, bend = squares[around], bend[around]
-    else:
-        for at, limit in ((0, begin), (-1, end)):
-            if limit is not None and not 0.0 <= limit < np.inf:
-                raise SettingsError(f"a speed profile: expected a speed (m/s) from 0 on, found {limit:g}")
-            squares[at] = squares[at] if limit is None else min(squares[at], limit**2)
+    for at, limit in ((0, begin), (-1, end)):
+        squares[at] = squares[at] if limit is None else min(squares[at], limit**2)
     squares = _accelerated(squares, steps, bend, settings.forward)
     squares = _accelerated(squares[::-1], steps[::-1], bend[::-1], settings.braking)[::-1]
     acceleration, speed = 0.5 * np.diff(squares) / steps, np.sqrt(squares)
     sums = speed[:-1] + speed[1:]
     seconds = np.divide(2.0 * steps, sums, out=np.full(len(steps), np.inf), where=sums > 0.0)
     if line.closed:
-        speed, acceleration, seconds = (
-            np.roll(values, first) for values in (speed[:-1], acceleration, seconds)
-        )
+        columns = speed[:-1], acceleration, seconds
+        speed, acceleration, seconds = (np.roll(column, first) for column in columns)
     else:
         acceleration = np.append(acceleration, 0.0)
     time = np.append(0.0, np.cumsum(seconds))
     return SpeedProfile(speed, acceleration, time[:count], float(time[-1]))
+
+
+def _check_ends(line: CentreLine | TrackAhead, begin: float | None, end: float | None) -> None:
+    limits, where = [limit for limit in (begin, end) if limit is not None], "a speed profile: expected"
+    if len(line.curvature) < 2:
+        raise SettingsError(f"{where} a line of at least 2 points, found {len(line.curvature)}")
+    if line.closed and limits:
+        raise SettingsError(f"{where} an open line for a first or a last speed, found a loop")
+    for limit in limits:
+        if not 0.0 <= limit < np.inf:
+            raise SettingsError(f"{where} a speed (m/s) from 0 on, found {limit:g}")
 
 
 def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Array:
@@ -98,9 +99,9 @@ def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Arra
     return np.array(reached)
 
 
-_FEWEST: Final = 4  # smallest number of points of a line
-_NEIGHBOURS: Final = 10  # number of points apart up to which normals must not cross
-_SHORT: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
+_FEWEST_POINTS: Final = 4  # smallest number of points of a line
+_NORMALS_APART: Final = 10  # number of points apart up to which normals must not cross
+_WIDTH_SHARE: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -161,14 +162,14 @@ def centre_line(
     The joint covariance of the control points of the left and then the right boundary, in the order x0, y0,
     x1 and so on (m^2), is propagated to first order. SettingsError where the step is out of its range.
     """
-    check_length("step", step)
+    check_length("step", step, LEAST_STEP)
     most, longest = MOST_POINTS * step, max(left.length(), right.length())
     if longest > most:
         raise SettingsError(f"expected boundaries of at most {most:g} m at this step, found {longest:.6g} m")
     line = find_line(left, right, closed)
     centre = line.ribbon.centre
     length = centre.length()
-    count = max(round(length / step), _FEWEST)
+    count = max(round(length / step), _FEWEST_POINTS)
     arc_length = np.linspace(0.0, length, count + 1)
     u, own = centre.parameters_at(arc_length), slice(count if closed else None)
     points, tangent, crossings = centre.evaluate(u)[own], centre.tangent_unit(u), line.crossings(u)
@@ -201,7 +202,7 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
     """
     left, right = (width.copy() for width in widths)
     count = len(points)
-    for apart in range(1, min(_NEIGHBOURS, count - 1) + 1):
+    for apart in range(1, min(_NORMALS_APART, count - 1) + 1):
         i = np.arange(count if closed else count - apart)
         j = (i + apart) % count
         turn, way = cross(normal[i], normal[j]), points[j] - points[i]
@@ -210,8 +211,8 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
         b = np.divide(cross(way, normal[i]), turn, out=np.full(len(i), np.inf), where=known)
         for width, side in ((left, 1.0), (right, -1.0)):
             meet = (side * a > 0.0) & (side * b > 0.0) & (side * a <= width[i]) & (side * b <= width[j])
-            np.minimum.at(width, i[meet], _SHORT * np.abs(a[meet]))
-            np.minimum.at(width, j[meet], _SHORT * np.abs(b[meet]))
+            np.minimum.at(width, i[meet], _WIDTH_SHARE * np.abs(a[meet]))
+            np.minimum.at(width, j[meet], _WIDTH_SHARE * np.abs(b[meet]))
     return [left, right]
 
 

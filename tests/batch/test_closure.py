@@ -74,9 +74,9 @@ def ring(radius: float, centre: float = 0.0) -> BSpline:
     return BSpline(np.arange(-3.0, 16.0), np.concatenate([points, points[:3]]), 3, True)
 
 
-def circle(radius: float, centre: float = 0.0) -> Array:
-    """Poses once around."""
-    phi = np.linspace(0.0, 2.0 * np.pi, 60)
+def circle(radius: float, centre: float = 0.0, begin: float = 0.0) -> Array:
+    """Poses once around, from an angle on (rad)."""
+    phi = begin + np.linspace(0.0, 2.0 * np.pi, 60)
     return np.column_stack([centre + radius * np.cos(phi), radius * np.sin(phi), phi + 0.5 * np.pi])
 
 
@@ -103,10 +103,14 @@ def test_a_vehicle_has_driven_beside_all_of_a_boundary() -> None:
     )
 
 
-def test_where_cycles_are_missing_nothing_is_asked_of_the_boundaries() -> None:
-    """The drive's step over a quarter of the circle crosses the inner boundary, but the vehicle did not."""
+@pytest.mark.parametrize("begin", [0.0, np.pi])
+def test_where_cycles_are_missing_nothing_is_asked_of_the_boundaries(begin: float) -> None:
+    """The drive's step over a quarter of the circle crosses the inner boundary, but the vehicle did not.
+
+    Where it begins opposite to the curves' seam, that lies in the quarter.
+    """
     curves = {LEFT: ring(18.0), RIGHT: ring(24.0)}
-    whole = circle(20.0)
+    whole = circle(20.0, begin=begin)
     without = np.delete(whole, np.arange(20, 35), axis=0)
     assert objection(curves, without, USED, SETTINGS) == ""
     narrow = {LEFT: ring(18.0), RIGHT: ring(24.0, 8.0)}

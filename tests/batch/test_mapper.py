@@ -202,7 +202,7 @@ def test_the_command_writes_its_result(tmp_path: Path) -> None:
 def test_a_run_that_did_not_converge_is_written_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_log(bean(), tmp_path / "log")
+    write_log(broken_off(bean(), 0.3), tmp_path / "log")
     arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
     monkeypatch.setattr("pathspace_graph.batch.optimizer.Effort", lambda: Effort(rounds=1))
     with pytest.raises(SystemExit) as end:

@@ -198,10 +198,11 @@ def test_a_boundary_across_the_drive_is_told_with_its_place_and_exit_code_3(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    log = beginning_of(log_folder, tmp_path / "log")
     found = [Crossing(RIGHT, np.array([12.0, -3.5]), 40.0), Crossing(LEFT, np.zeros(2), 90.0)]
     monkeypatch.setattr("pathspace_graph.plausibility.diagnosis.crossed_boundaries", lambda *_: found)
     with pytest.raises(SystemExit) as end:
-        main([command, str(log_folder), "--out", str(tmp_path / "map")])
+        main([command, str(log), "--out", str(tmp_path / "map")])
     assert end.value.code == 3
     said = capsys.readouterr().err.splitlines()
     (line,) = [one for one in said if one.startswith("not a map of the drive")]
@@ -237,16 +238,15 @@ def test_an_estimate_that_cannot_be_computed_is_one_line_and_exit_code_3(
     assert not (tmp_path / "map").exists()
 
 
-def test_a_saved_mapper_goes_on_with_the_rest_of_a_log(
-    log_folder: Path, map_folder: Path, tmp_path: Path
-) -> None:
-    log, file = read_log(log_folder), tmp_path / "half.snap"
-    half = beginning_of(log_folder, tmp_path / "half", len(log.cycles) // 2)
-    assert main(["online", str(half), "--out", str(tmp_path / "map"), "--save", str(file)]) == 0
-    resume = ["online", str(log_folder), "--out", str(tmp_path / "rest"), "--resume", str(file)]
-    assert main(resume) == 0
-    assert (tmp_path / "rest" / MAP_FILE).read_bytes() == (map_folder / MAP_FILE).read_bytes()
-    assert len((tmp_path / "rest" / "cycles.csv").read_text().splitlines()) == 1 + (len(log.cycles) + 1) // 2
+def test_a_saved_mapper_goes_on_with_the_rest_of_a_log(log_folder: Path, tmp_path: Path) -> None:
+    half, log = (beginning_of(log_folder, tmp_path / f"{cycles}", cycles) for cycles in (20, 45))
+    file, command = tmp_path / "half.snap", ["online", "--out"]
+    assert main([*command, str(tmp_path / "begun"), str(half), "--save", str(file)]) == 0
+    assert main([*command, str(tmp_path / "rest"), str(log), "--resume", str(file)]) == 0
+    assert main([*command, str(tmp_path / "map"), str(log)]) == 0
+    rest, whole = ((tmp_path / name / MAP_FILE).read_bytes() for name in ("rest", "map"))
+    assert rest == whole
+    assert len((tmp_path / "rest" / "cycles.csv").read_text().splitlines()) == 1 + 25
 
 
 def test_a_log_that_does_not_go_on_is_refused(

@@ -41,12 +41,19 @@ TOPICS = ["--odometry", "/odom", "--detections", "/cones"]
 
 
 @pytest.fixture(scope="module")
-def drive() -> Log:
-    """The first seconds of a simulated drive."""
-    log = simulate(generate_track(np.random.default_rng(3)), SimulationSettings(laps=1), 3)
-    cycles = log.cycles[:60]
-    until = cycles[-1].t
-    return Log(log.odometry.between(0.0, until), cycles, log.odometry_sigma, log.sensor)
+def long_drive() -> Log:
+    """The first six seconds of a simulated drive, in which its noise can be measured."""
+    return beginning_of(simulate(generate_track(np.random.default_rng(3)), SimulationSettings(laps=1), 3), 60)
+
+
+@pytest.fixture(scope="module")
+def drive(long_drive: Log) -> Log:
+    return beginning_of(long_drive, 20)
+
+
+def beginning_of(log: Log, cycles: int) -> Log:
+    kept = log.cycles[:cycles]
+    return Log(log.odometry.between(0.0, kept[-1].t), kept, log.odometry_sigma, log.sensor)
 
 
 STATED = ("--sigma-odometry", "0.25", "0.12", "0.035")
@@ -96,7 +103,7 @@ def test_a_folder_is_a_bag_of_rosbag2_whatever_its_name(drive: Log, tmp_path: Pa
 
 
 def test_a_mistake_in_the_bag_is_told_with_its_cause(
-    drive: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    long_drive: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The good bag is told nothing of; with y to the right the log is written, and told of in a line."""
 
@@ -105,9 +112,9 @@ def test_a_mistake_in_the_bag_is_told_with_its_cause(
         points, covariances = cycle.points_vehicle * flip, cycle.covariances * np.outer(flip, flip)
         return messages.cloud_of(Detections(cycle.t, points, covariances, cycle.labels))
 
-    convert(write_bag(tmp_path, "mcap", of_log(drive, Messages.cloud_of)), tmp_path / "good")
+    convert(write_bag(tmp_path, "mcap", of_log(long_drive, Messages.cloud_of)), tmp_path / "good")
     assert capsys.readouterr().err == ""
-    convert(write_bag(tmp_path, "sqlite3", of_log(drive, mirrored)), tmp_path / "spoiled")
+    convert(write_bag(tmp_path, "sqlite3", of_log(long_drive, mirrored)), tmp_path / "spoiled")
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("hint: ")
     assert "to the right" in line
@@ -132,9 +139,9 @@ def test_noise_that_is_stated_is_not_measured(drive: Log, tmp_path: Path) -> Non
     assert "noise" not in (tmp_path / "log" / "log.toml").read_text()
 
 
-def test_noise_that_is_not_stated_is_measured_and_the_log_says_so(drive: Log, tmp_path: Path) -> None:
+def test_noise_that_is_not_stated_is_measured_and_the_log_says_so(long_drive: Log, tmp_path: Path) -> None:
     """Markers have no covariances: they get those of single detections, by the measured noise."""
-    bag = write_bag(tmp_path, "mcap", of_log(drive, markers))
+    bag = write_bag(tmp_path, "mcap", of_log(long_drive, markers))
     log = convert(bag, tmp_path / "log")
     header = (tmp_path / "log" / "log.toml").read_text()
     assert '[noise]\nodometry = "measured"\ndetections = "measured"\n' in header
@@ -148,9 +155,9 @@ def test_noise_that_is_not_stated_is_measured_and_the_log_says_so(drive: Log, tm
 
 
 def test_noise_of_detections_that_is_stated_stays_where_that_of_the_odometry_is_measured(
-    drive: Log, tmp_path: Path
+    long_drive: Log, tmp_path: Path
 ) -> None:
-    bag = write_bag(tmp_path, "mcap", of_log(drive, markers))
+    bag = write_bag(tmp_path, "mcap", of_log(long_drive, markers))
     log = convert(bag, tmp_path / "log", "--sigma-bearing", "0.02")
     assert not log.odometry_stated and log.detections_stated
     assert (
@@ -466,8 +473,9 @@ def test_a_bag_that_was_indexed_again_is_read_under_its_name(drive: Log, tmp_pat
     assert len(log.cycles) == len(drive.cycles)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("more", [(), ("--from-poses",), ("--imu", "/imu")])
+@pytest.mark.parametrize(
+    ("kind", "more"), [*zip(KINDS, [(), ("--from-poses",), ("--imu", "/imu")], strict=True)]
+)
 def test_a_bag_that_was_played_in_a_loop_is_refused_until_the_times_of_receipt_are_taken(
     kind: Kind, more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -643,7 +651,7 @@ def test_a_wrong_topic_lists_all_with_types_counts_and_rates(
     for options, said in cases:
         line = refused(bag, tmp_path / "log", capsys, *options)
         assert said in line
-        assert f"/cones ({CONES}, 60 messages, 10." in line
+        assert f"/cones ({CONES}, {len(drive.cycles)} messages, 10." in line
         assert f"/odom (nav_msgs/msg/Odometry, {len(drive.odometry.t)} messages, " in line
 
 

@@ -21,13 +21,13 @@ from pathspace_graph.factors.bspline import (
 )
 from pathspace_graph.factors.footpoint import (
     FootPoints,
-    Stretch,
     foot_points,
     joint_foot_points,
     refine_joint_foot_points,
-    stretch_of,
 )
 from pathspace_graph.spline.bspline import end_change_matrix
+
+from ..oracles.footpoint import Stretch, curve_coefficients, stretch_of
 
 TOLERANCE = 1e-12
 KINDS = ("random", "repeated", "clamped", "uniform")
@@ -165,7 +165,7 @@ def test_curve_coefficients_give_the_curve() -> None:
     tables = SpanPolynomials(knots, 3)
     u = rng.uniform(tables.low, tables.high, 30)
     number, s = tables.locate(u)
-    terms = tables.alone.curve_coefficients(points)[..., number]
+    terms = curve_coefficients(tables.alone, points)[..., number]
     curve = np.einsum("krdm,mk->rmd", terms, s[:, None] ** np.arange(4))
     for order in range(3):
         expected = ScipyBSpline(knots, points, 3)(u, nu=order)

@@ -1,44 +1,36 @@
-"""The compiled versions of functions of arrays against those in numpy."""
+"""The compiled functions of arrays against those in numpy."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import ast
 from collections.abc import Callable, Iterator
-from importlib import import_module
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
 from pathspace_graph.factors.footpoint import TOLERANCES, joint_foot_points, refine_joint_foot_points
-from pathspace_graph.factors.kernels import _KERNELS, COMPILED, IN_NUMPY, NUMPY_ONLY
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, ORIGIN_KEY, Layout, control_keys, pose_keys
 
-for _module in (
-    "front_end.gate",
-    "front_end.measurement",
-    "front_end.scan_matching",
-    "front_end.sightings",
-    "graph.inactive",
-    "graph.relative",
-    "graph.rows",
-    "mapping.constellation",
-    "mapping.path",
-    "mapping.smoother",
-    "mapping.tentative",
-):
-    import_module(f"pathspace_graph.{_module}")  # each registers its functions
+from ..oracles import cones, curves, footpoint, front_end, measuring, rows
 
 Arguments = Callable[[np.random.Generator], tuple[Any, ...]]
 COUNT = 17
 """Rows of each argument."""
 
-needs_compiled = pytest.mark.skipif(not COMPILED, reason="the package was built without a compiler")
+KERNELS = {name: one for name, one in vars(kernels).items() if callable(one)}
+ORACLES = {
+    name: one
+    for module in (cones, curves, footpoint, front_end, measuring, rows)
+    for name, one in vars(module).items()
+    if name in KERNELS and one.__module__ == module.__name__
+}
 
 
 def poses(rng: np.random.Generator, count: int | None = None) -> np.ndarray:
@@ -333,30 +325,35 @@ def assert_equal(found: list[Any], expected: list[Any]) -> None:
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12 * scale)
 
 
-@needs_compiled
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("name", CASES)
 def test_a_compiled_function_is_the_one_in_numpy(name: str, seed: int) -> None:
     arguments = CASES[name](np.random.default_rng(seed))
-    assert_equal(results(getattr(_KERNELS, name), arguments), results(IN_NUMPY[name], arguments))
+    assert_equal(results(KERNELS[name], arguments), results(ORACLES[name], arguments))
 
 
-@needs_compiled
 @pytest.mark.parametrize("name", sorted(set(CASES) - {"integrated", "columns_of", "laid"}))
 def test_no_rows_are_no_rows(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nothing is seen; none is asked for steps without twists, columns or places without rows."""
     monkeypatch.setitem(globals(), "COUNT", 0)
     arguments = CASES[name](np.random.default_rng(0))
-    assert_equal(results(getattr(_KERNELS, name), arguments), results(IN_NUMPY[name], arguments))
+    assert_equal(results(KERNELS[name], arguments), results(ORACLES[name], arguments))
 
 
-@needs_compiled
 def test_every_compiled_function_is_tested() -> None:
-    assert set(IN_NUMPY) == set(CASES) | SEARCHES
-    assert set(IN_NUMPY) <= set(dir(_KERNELS))
+    assert set(KERNELS) == set(ORACLES) == set(CASES) | SEARCHES
 
 
-@needs_compiled
+def test_every_compiled_function_has_a_signature() -> None:
+    stub = ast.parse(Path(str(kernels.__file__)).with_name("_kernels.pyi").read_text())
+    declared = [node for node in stub.body if isinstance(node, ast.FunctionDef)]
+    assert {function.name for function in declared} == set(KERNELS)
+    assert all(ast.get_docstring(function) for function in declared)
+    for function in declared:
+        assert f"arg{len(function.args.args) - 1}:" in str(KERNELS[function.name].__doc__)
+        assert f"arg{len(function.args.args)}:" not in str(KERNELS[function.name].__doc__)
+
+
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
@@ -376,7 +373,7 @@ def test_every_compiled_function_is_tested() -> None:
 def test_cases_at_the_edge(name: str, arguments: Arguments) -> None:
     """One pose for all points, no points, no calibration, small angles, nothing remembered, at rest."""
     chosen = arguments(np.random.default_rng(3))
-    assert_equal(results(getattr(_KERNELS, name), chosen), results(IN_NUMPY[name], chosen))
+    assert_equal(results(KERNELS[name], chosen), results(ORACLES[name], chosen))
 
 
 def curves(rng: np.random.Generator, periodic: bool, degree: int) -> tuple[Any, np.ndarray]:
@@ -403,7 +400,6 @@ def curves(rng: np.random.Generator, periodic: bool, degree: int) -> tuple[Any, 
     return lay_out(tables, [0, sizes[0]], sizes if periodic else None), np.concatenate(points)
 
 
-@needs_compiled
 @pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("periodic", [False, True])
 @pytest.mark.parametrize("seed", range(8))
@@ -417,9 +413,9 @@ def test_foot_points(seed: int, periodic: bool, degree: int, monkeypatch: pytest
     high = low + rng.choice([-1.0, 0.0, 5.0, 15.0, 200.0], 60)
     start = rng.uniform(-10.0, 50.0, 60)
     both = []
-    for versions in ({name: getattr(_KERNELS, name) for name in SEARCHES}, IN_NUMPY):
+    for versions in (KERNELS, ORACLES):
         for name in SEARCHES:
-            monkeypatch.setattr(f"pathspace_graph.factors.footpoint._{name}", versions[name])
+            monkeypatch.setattr(kernels, name, versions[name])
         searched = joint_foot_points(spans, control_points, points, curve, low, high, 0.7)
         refined = refine_joint_foot_points(spans, control_points, points, curve, start, low, high)
         both.append([searched, refined])
@@ -430,19 +426,6 @@ def test_foot_points(seed: int, periodic: bool, degree: int, monkeypatch: pytest
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
-@needs_compiled
 def test_shapes_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="shapes that fit"):
-        _KERNELS.to_map(np.zeros((3, 2)), np.zeros((2, 3)))
-
-
-def test_the_environment_keeps_the_compiled_versions_out() -> None:
-    code = "from pathspace_graph.factors import kernels, se2; print(kernels.COMPILED, se2.to_map.__module__)"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={NUMPY_ONLY: "1", "PATH": ""},
-    )
-    assert done.stdout.split() == ["False", "pathspace_graph.factors.se2"]
+        kernels.to_map(np.zeros((3, 2)), np.zeros((2, 3)))

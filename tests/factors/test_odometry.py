@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pathspace_graph.factors._kernels import odometry_residuals
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_poses, integrate_twists, odometry_residuals
+from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_poses, integrate_twists
 from pathspace_graph.factors.se2 import compose, se2_exp
 
 from ..scenes.jacobians import assert_jacobians

@@ -6,10 +6,10 @@ import gtsam
 import numpy as np
 import pytest
 
+from pathspace_graph.factors._kernels import station_rows
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.bspline import SpanPolynomials, periodic_knots
 from pathspace_graph.factors.gtsam_factors import pose_array, station_factors
-from pathspace_graph.factors.residuals import station_rows
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.factors.sensor import corrected
 from pathspace_graph.graph.variables import SENSOR_KEY, control_keys, pose_key

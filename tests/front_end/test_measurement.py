@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from pathspace_graph.factors._kernels import by_constants
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import BENDS_FROM
@@ -25,7 +26,6 @@ from pathspace_graph.front_end.measurement import (
     ROUNDS,
     ROUNDS_AGAIN,
     Measurement,
-    _by_constants,
     measure,
 )
 from pathspace_graph.front_end.sightings import TwistRecord
@@ -116,7 +116,7 @@ def test_columns_are_derivatives_in_the_map_of_corrected_detections() -> None:
     """By the five errors and the bend."""
     rng = np.random.default_rng(0)
     seen, (poses, twists) = rng.normal(scale=12.0, size=(9, 2)), rng.normal(size=(2, 9, 3))
-    columns = _by_constants(seen, twists, poses, np.zeros((9, 3)), np.zeros(9, np.intp), BENDS_FROM)
+    columns = by_constants(seen, twists, poses, np.zeros((9, 3)), np.zeros(9, np.intp), BENDS_FROM)
     for k, step in enumerate(1e-6 * np.eye(6)):
         known = MeasuredNoise(np.ones(3), np.ones(3), 0.02, sensor=step[:5], range_bend=step[5])
         moved = to_map(known.corrected(seen, twists), poses) - to_map(seen, poses)

@@ -9,7 +9,7 @@ import pytest
 
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log
-from pathspace_graph.front_end.sides import FORGET_AFTER, ConeRow, NearCones, SideJudge, follow_rows
+from pathspace_graph.front_end.sides import FORGET_AFTER, NearCones, SideJudge
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.run import split_odometry
@@ -136,15 +136,17 @@ def test_where_colours_are_common_an_unknown_one_stays_unknown() -> None:
 def test_one_wrong_colour_among_ten_excludes_no_cone_from_its_row(
     own: int, other: int, follows: bool
 ) -> None:
-    """The third cone of the left row; its votes may be one more for the right than for the left."""
-    points = np.array([[0.0, 1.5], [4.0, 1.5], [8.0, 1.5]])
-    votes = np.array([[3, 0], [3, 0], [own, other]], np.intp)
-    rows = {
-        LEFT: ConeRow([0], points[0], 0.0),
-        RIGHT: ConeRow([], np.array([0.0, -1.5]), 0.0),
-    }
-    follow_rows(rows, points, votes, np.array([1, 2]))
-    assert rows[LEFT].cones == ([0, 1, 2] if follows else [0, 1])
+    """The votes of the third cone of the left row may be one more for the right than for the left."""
+    judge = SideJudge(SidesSettings())
+    points = np.array([[0.0, 1.5], [0.0, -1.5], [4.0, 1.5], [4.0, -1.5], [8.0, 1.5], [8.0, -1.5]])
+    for k in range(own + other + 8):
+        labels = np.full(6, UNKNOWN)
+        if 2 <= k < 2 + own + other:
+            labels[4] = LEFT if k < 2 + own else RIGHT
+        cycle = detections(0.1 * k, points, labels)
+        found = judge.update(np.array([-2.0, 0.0, 0.0]), np.zeros((1, 3)), cycle)
+    assert found.labels.tolist()[:4] == [LEFT, RIGHT, LEFT, RIGHT]
+    assert found.labels[4] == (LEFT if follows else UNKNOWN)
 
 
 def test_near_cones_are_means_of_their_detections() -> None:

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
+from pathspace_graph.factors._kernels import odometry_residuals
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.odometry import odometry_residuals
 from pathspace_graph.factors.se2 import compose, inverse, move_points, rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, marginalize, normal_equations
 from pathspace_graph.graph.inactive import InactiveChain, pose_and_reference

@@ -19,10 +19,8 @@ from pathspace_graph.graph.variables import (
     pose_keys,
 )
 from pathspace_graph.io.map import SplineBoundary
-from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.growth import Growth
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import FarSettings, MapperSettings
 
@@ -223,10 +221,8 @@ def test_steps_of_the_active_variables_are_steps_of_the_whole_system() -> None:
     """The log has two laps: the curves grow, and are closed."""
     log = lap_log(bean_track(), overrun=100.0)
     mapper = FixedLagMapper(EAGER, log.odometry_sigma)
-    mapper.smoother = smoother = Checked(EAGER)
-    mapper.growth = Growth(smoother)
-    smoother.attach(mapper.path, mapper.growth)
-    mapper.loop = TrackLoop(smoother, mapper.path, mapper.front_end.noise)
+    mapper.road.smoother = smoother = Checked(EAGER)
+    smoother.attached = [smoother.map, mapper.road.path, mapper.road.growth, mapper.road.orange]
     map_log(log, mapper)
     assert mapper.closed
     assert smoother.checked > 0.3 * len(log.cycles)
@@ -245,7 +241,7 @@ def test_reactivation_does_not_change_the_map(cycles: int) -> None:
     for _, (odometry, cycle) in zip(range(cycles), split_odometry(log), strict=False):
         mapper.update(odometry, cycle)
     assert mapper.closed == (cycles == 240)
-    smoother = mapper.smoother
+    smoother = mapper.road.smoother
     smoother.transform_to_origin()
     assert len(smoother.inactive) >= (1 if mapper.closed else 3)
     size, before, calibration = smoother.layout.size, mapper.map(), mapper.calibration.copy()

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pathspace_graph.factors._kernels import odometry_residuals
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, odometry_residuals
+from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.gaussian import graph_of, normal_equations
 from pathspace_graph.graph.rows import (

@@ -316,7 +316,7 @@ def test_substituted_points_know_what_the_old_ones_did() -> None:
 def drive_bean(settings: MapperSettings, cycles: int) -> FixedLagMapper:
     """A mapper somewhere on a lap, with the tolerances that hold after it has closed."""
     mapper = FixedLagMapper(settings, ODOMETRY_SIGMA)
-    mapper.smoother.window.exact = False
+    mapper.road.smoother.window.exact = False
     for _, (odometry, cycle) in zip(range(cycles), split_odometry(lap_log(bean_track(), 0.0)), strict=False):
         mapper.update(odometry, cycle)
     return mapper
@@ -324,7 +324,7 @@ def drive_bean(settings: MapperSettings, cycles: int) -> FixedLagMapper:
 
 def rows_of(mapper: FixedLagMapper) -> dict[int, Array]:
     """The rows of each cycle as they were linearized last."""
-    kept = mapper.smoother.window.measured
+    kept = mapper.road.smoother.window.measured
     return {
         owner: np.concatenate([rows.residual[rows.owner == owner] for rows in kept.groups])
         for owner in np.unique(kept.owners).tolist()
@@ -336,14 +336,14 @@ def test_the_tolerance_holds_once_the_loop_has_closed() -> None:
     mapper = FixedLagMapper(odometry_sigma=ODOMETRY_SIGMA)
     for odometry, cycle in split_odometry(lap_log(bean_track(), 45.0)):
         mapper.update(odometry, cycle)
-        assert mapper.smoother.window.exact is not mapper.closed
+        assert mapper.road.smoother.window.exact is not mapper.closed
     assert mapper.closed
 
 
 @pytest.mark.parametrize("into_use", [False, True])
 def test_a_reading_that_goes_in_or_out_of_use_makes_its_cycle_stale(into_use: bool) -> None:
     mapper = drive_bean(MapperSettings(relinearize=RelinearizeSettings(1e3, 1e3)), 60)
-    smoother, detections = mapper.smoother, mapper.smoother.map.detections
+    smoother, detections = mapper.road.smoother, mapper.road.smoother.map.detections
     cycle = smoother.first_cycle + 5
     row = np.flatnonzero(detections.used & (detections.cycle == cycle))[:1]
     where = detections.boundary[row].copy(), detections.u[row].copy()
@@ -384,7 +384,7 @@ def test_the_steps_system_is_that_of_the_graph_at_the_estimate() -> None:
 
 def numeric_end(mapper: FixedLagMapper) -> tuple[Array, Array, Array]:
     """Derivatives of the newest pose by the one before, by the calibration, and by the odometry's noise."""
-    start, odometry = mapper.poses[-2].copy(), mapper.smoother.window.odometry
+    start, odometry = mapper.poses[-2].copy(), mapper.road.smoother.window.odometry
     delta, G = odometry.deltas[-1], odometry.by_calibration[-1]
     b = mapper.calibration.copy()
 
@@ -409,7 +409,7 @@ def numeric_end(mapper: FixedLagMapper) -> tuple[Array, Array, Array]:
 def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(together: int) -> None:
     """The newest pose was not in the step: its odometry predicts it and adds noise."""
     mapper = drive_bean(MapperSettings(), 59)
-    smoother, odometry = mapper.smoother, list(split_odometry(lap_log(bean_track(), 0.0)))[59]
+    smoother, odometry = mapper.road.smoother, list(split_odometry(lap_log(bean_track(), 0.0)))[59]
     mapper._predict(mapper.front_end.update(*odometry))
     step = smoother.last_step
     assert step is not None
@@ -457,7 +457,7 @@ def test_covariance_is_the_dense_inverse_of_the_graph_at_the_estimate() -> None:
 
 def test_a_loop_is_solved_with_its_keyframes_and_without_them_afterwards() -> None:
     mapper = drive_bean(MapperSettings(), 100)
-    smoother = mapper.smoother
+    smoother = mapper.road.smoother
     assert smoother.submaps is not None and len(smoother.submaps.keyframes) > 1
     keys = smoother.variables.keys
     stay = ~np.isin(keys, smoother.variables.keyframes)

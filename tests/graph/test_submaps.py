@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pathspace_graph.factors._kernels import odometry_residuals
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.odometry import odometry_residuals
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, normal_equations
 from pathspace_graph.graph.relative import RelativeFactor, Submaps

@@ -125,7 +125,7 @@ def test_factors_across_poses_of_the_window_are_full_batch(span: int) -> None:
     deltas = truth[span:] - truth[:-span] + [0.1, 0.0, 0.0] * rng.normal(size=(len(truth) - span, 1))
     factors = {k: [between(k - span, k, deltas[k - span])] for k in range(span, len(truth), 2)}
     mapper, _ = drive(log, factors, CHAIN)
-    assert are_poses(keys_of(mapper.smoother.prior)).sum() > 1
+    assert are_poses(keys_of(mapper.road.smoother.prior)).sum() > 1
     np.testing.assert_allclose(mapper.poses, batch(log, factors)[-9:], atol=1e-9)
 
 
@@ -424,13 +424,13 @@ def test_a_key_that_is_not_in_the_window_is_named_and_nothing_is_done(key: int, 
     pairs = list(split_odometry(straight(np.random.default_rng(0))))
     for odometry, cycle in pairs[:30]:
         mapper.update(odometry, cycle)
-    before = mapper.smoother.variables.copy()
+    before = mapper.road.smoother.variables.copy()
     noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.1)
     wrong = gtsam.PriorFactorPose2(key, gtsam.Pose2(), noise)
     with pytest.raises(SettingsError, match=rf"row 1: expected keys .* x21 to x30.* found {name}$"):
         mapper.update(*pairs[30], [gnss(30, np.zeros(2), 0.1), wrong])
-    np.testing.assert_array_equal(mapper.smoother.variables.values, before.values)
-    np.testing.assert_array_equal(mapper.smoother.variables.keys, before.keys)
-    assert len(mapper.smoother.user_factors.factors) == 0
+    np.testing.assert_array_equal(mapper.road.smoother.variables.values, before.values)
+    np.testing.assert_array_equal(mapper.road.smoother.variables.keys, before.keys)
+    assert len(mapper.road.smoother.user_factors.factors) == 0
     assert mapper.next_pose_key == pose_key(30)
     mapper.update(*pairs[30], [gnss(21, np.zeros(2), 10.0), gnss(30, np.zeros(2), 10.0)])

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pathspace_graph.factors._kernels import spread
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
@@ -26,7 +27,6 @@ from pathspace_graph.graph.variables import (
     pose_keys,
     rotation_blocks,
     sizes,
-    spread,
 )
 
 from ..scenes.graph import KEYS, LEFT_KEYS, MAP_KEYS, POSE_KEYS, RIGHT_KEYS, columns_of, random_variables

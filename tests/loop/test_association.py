@@ -45,7 +45,7 @@ def next_cycle(
     mapper: FixedLagMapper, points_vehicle: Array, labels: list[int]
 ) -> tuple[Odometry, Detections]:
     """Returns the next cycle straight on, with detections (m, 2) that are put in by hand."""
-    t = mapper.smoother.times[-1]
+    t = mapper.road.smoother.times[-1]
     odometry = Odometry(t + DT * np.arange(CYCLE), ahead(SPEED, CYCLE * DT))
     return odometry, detections(t + CYCLE * DT, points_vehicle, np.array(labels, np.intp))
 
@@ -53,8 +53,8 @@ def next_cycle(
 def used_of(mapper: FixedLagMapper, points_vehicle: Array, labels: list[int]) -> list[int]:
     """Returns the boundary that each detection of the next cycle is used on, or -1 for none."""
     mapper.update(*next_cycle(mapper, points_vehicle, labels))
-    table = mapper.smoother.map.detections
-    newest = table.cycle == mapper.smoother.next_cycle - 1
+    table = mapper.road.smoother.map.detections
+    newest = table.cycle == mapper.road.smoother.next_cycle - 1
     return np.where(table.used, table.boundary, -1)[newest].tolist()
 
 
@@ -79,7 +79,7 @@ def variance_of_residual(mapper: FixedLagMapper) -> float:
     g = np.zeros(3 + 2 * len(keys))
     g[:3] = [0.0, 1.0, AHEAD + step.delta[0]]
     g[4::2] = -spline.basis_matrix(spline.foot_points(np.array([[x, 2.0]])).u)[0]
-    pose, by_step = mapper.pose_key(mapper.smoother.next_cycle - 1), np.array([0.0, 1.0, AHEAD])
+    pose, by_step = mapper.pose_key(mapper.road.smoother.next_cycle - 1), np.array([0.0, 1.0, AHEAD])
     joint = g @ mapper.marginal_covariance([pose, *keys]) @ g + by_step @ step.covariance @ by_step
     return float(joint + OWN_VARIANCE)
 
@@ -99,7 +99,7 @@ def test_what_is_rough_off_is_never_used(monkeypatch: pytest.MonkeyPatch) -> Non
     """The gate by sigmas alone would accept both."""
     mapper = driven()
     monkeypatch.setattr(GateSettings, "rough", 1.0)
-    mapper.smoother.map.settings = replace(mapper.settings, gate=GateSettings(chi=100.0))
+    mapper.road.smoother.map.settings = replace(mapper.settings, gate=GateSettings(chi=100.0))
     assert used_of(mapper, at([2.9, 3.1]), [LEFT, LEFT]) == [LEFT, -1]
 
 
@@ -136,13 +136,13 @@ def test_a_detection_of_unknown_colour_between_two_curves_is_ambiguous() -> None
 
 def test_older_detections_are_tested_again_only_where_a_curve_has_grown() -> None:
     mapper = driven()
-    smoother, table = mapper.smoother, mapper.smoother.map.detections
+    smoother, table = mapper.road.smoother, mapper.road.smoother.map.detections
     released = np.concatenate([table.used_on(label)[-5:] for label in (LEFT, RIGHT)])
     labels = table.boundary[released].copy()
     table.release(released)
     odometry, cycle = next_cycle(mapper, at([]), [])
     motion = MeasuredMotion(integrate_odometry(odometry, cycle.t, ODOMETRY_SIGMA), odometry.twist)
-    predict(smoother, mapper.path, motion, cycle.t)
+    predict(smoother, mapper.road.path, motion, cycle.t)
     smoother.associate(frozenset())
     assert not table.used[released].any()
     for label in (LEFT, RIGHT):  # the newest pose's parameter was appended; it is found anew
@@ -158,9 +158,9 @@ def test_older_detections_are_tested_again_only_where_a_curve_has_grown() -> Non
 def test_the_pose_is_found_beside_the_curve_in_every_cycle() -> None:
     """The parameter of a straight curve is the way along it, up to where the first cone was."""
     mapper = driven()
-    before = {label: u.copy() for label, u in mapper.smoother.map.state.pose_u.items()}
+    before = {label: u.copy() for label, u in mapper.road.smoother.map.state.pose_u.items()}
     used_of(mapper, at([]), [])
-    for label, u in mapper.smoother.map.state.pose_u.items():
+    for label, u in mapper.road.smoother.map.state.pose_u.items():
         assert len(u) == len(mapper.poses)
         assert u[-1] - before[label][-1] == pytest.approx(SPEED * CYCLE * DT, abs=0.02)
 
@@ -204,10 +204,12 @@ def test_the_other_leg_of_a_hairpin_accepts_nothing(hairpin: FixedLagMapper) -> 
 
 def test_a_vehicle_that_has_lost_its_place_is_relocated(hairpin: FixedLagMapper) -> None:
     """Its parameters are put on the other leg, where both curves lead against its heading."""
-    pose_u = hairpin.smoother.map.state.pose_u
+    pose_u = hairpin.road.smoother.map.state.pose_u
     before = {label: pose_u[label][-1] for label in (LEFT, RIGHT)}
     for u in pose_u.values():
         np.subtract(u, 30.0, out=u)
     used_of(hairpin, at([]), [])
     for label, u in before.items():
-        assert hairpin.smoother.map.state.pose_u[label][-1] == pytest.approx(u + SPEED * CYCLE * DT, abs=0.1)
+        assert hairpin.road.smoother.map.state.pose_u[label][-1] == pytest.approx(
+            u + SPEED * CYCLE * DT, abs=0.1
+        )

@@ -28,9 +28,10 @@ from ..scenes.drives import (
     ahead,
     bean_track,
     corridor,
+    exact_lap,
     exact_log,
-    lap_log,
     map_log,
+    mapped,
     replay,
     true_poses,
 )
@@ -40,20 +41,20 @@ Array = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def log() -> Log:
-    return lap_log(bean_track(), overrun=45.0)
+    return exact_lap()
 
 
 @pytest.fixture(scope="module")
 def run(log: Log) -> tuple[FixedLagMapper, list[CycleResult]]:
     """The whole drive."""
-    return map_log(log)
+    return mapped(log)
 
 
 @pytest.fixture(scope="module")
 def snapshot(log: Log, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The mapper a cycle before its curves are met again, as a file; cones don't count."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pathspace_graph.loop.drive_record.return_to_beginning", lambda *_: None)
+        patch.setattr("pathspace_graph.loop.returns.return_to_beginning", lambda *_: None)
         mapper, results = map_log(log)
         cycle = next(k for k, result in enumerate(results) if result.closed) - mapper.settings.open_lap.cycles
         mapper, results = map_log(replace(log, cycles=log.cycles[:cycle]))
@@ -73,9 +74,9 @@ def before(snapshot: Path) -> FixedLagMapper:
 def without_batch(log: Log, snapshot: Path) -> FixedLagMapper:
     """The mapper after the cycle in which a registration closed it, as there can be no batch."""
     mapper = FixedLagMapper.restore(snapshot)
-    mapper.loop.record.give_up("no batch")
+    mapper.drive.record.give_up("no batch")
     cycles = [*split_odometry(log)]
-    while not replay(mapper, *cycles[mapper.smoother.next_cycle]).closed:
+    while not replay(mapper, *cycles[mapper.road.smoother.next_cycle]).closed:
         pass
     return mapper
 
@@ -142,11 +143,11 @@ def test_closing_leaves_the_pose_where_it_is(log: Log, run: tuple[FixedLagMapper
 def test_readings_in_use_lie_on_the_closed_curve(when: str, request: pytest.FixtureRequest) -> None:
     mapper = request.getfixturevalue(when)
     mapper = mapper[0] if isinstance(mapper, tuple) else mapper
-    detections = mapper.smoother.map.detections
+    detections = mapper.road.smoother.map.detections
     for label, boundary in mapper.boundaries.items():
         rows = detections.used_on(label)
         assert len(rows) > 20
-        points = detections.points_map(rows, mapper.smoother.variables)
+        points = detections.points_map(rows, mapper.road.smoother.variables)
         on_curve = boundary.evaluate(mapper.control_points(label), detections.u[rows])
         distances = np.hypot(*(points - on_curve).T)
         assert np.median(distances) < 0.15
@@ -159,7 +160,7 @@ def test_readings_in_use_lie_on_the_closed_curve(when: str, request: pytest.Fixt
 
 def covariance_of(mapper: FixedLagMapper) -> Array:
     """(3, 3) of the newest pose."""
-    return mapper.marginal_covariance([mapper.pose_key(mapper.smoother.next_cycle - 1)])
+    return mapper.marginal_covariance([mapper.pose_key(mapper.road.smoother.next_cycle - 1)])
 
 
 def registered(mapper: FixedLagMapper, theta: float, shift: Array) -> RefinedMotion:
@@ -172,10 +173,10 @@ def registered(mapper: FixedLagMapper, theta: float, shift: Array) -> RefinedMot
     mapper.poses[:, :2] = (mapper.poses[:, :2] - centre) @ np.array([[c, s], [-s, c]]) + centre + shift
     mapper.poses[:, 2] += theta
     registration = register(
-        mapper.smoother.map,
-        mapper.smoother.times,
+        mapper.road.smoother.map,
+        mapper.road.smoother.times,
         covariance_of(mapper),
-        mapper.path.beginning,
+        mapper.road.path.beginning,
         ClosingSettings(sigma_max=10.0),
     )
     assert registration is not None
@@ -194,11 +195,11 @@ def test_a_drifted_window_is_registered_back(
     assert registration.motion.vector[2] == pytest.approx(-theta, abs=0.02)
     moved = registration.motion.apply(mapper.poses[:, :2])
     np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.3)
-    detections = mapper.smoother.map.detections
+    detections = mapper.road.smoother.map.detections
     for label in mapper.boundaries:
         rows, u = registration.matches.inliers(label)
         assert (detections.label[rows] == label).all()
-        points = registration.motion.apply(detections.points_map(rows, mapper.smoother.variables))
+        points = registration.motion.apply(detections.points_map(rows, mapper.road.smoother.variables))
         on_curve = mapper.boundaries[label].evaluate(mapper.control_points(label), u)
         distances = np.hypot(*(points - on_curve).T)
         assert np.median(distances) < 0.1
@@ -207,8 +208,8 @@ def test_a_drifted_window_is_registered_back(
 
 def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: FixedLagMapper) -> None:
     """Of the same number of control points, and where a cone asks for one."""
-    before.smoother.reactivate()
-    state, settings = before.smoother.map.state, before.settings
+    before.road.smoother.reactivate()
+    state, settings = before.road.smoother.map.state, before.settings
     kinds: tuple[Knots, Knots] = ("cones", "curvature")
     for label, boundary in state.boundaries.items():
         points = state.control_points(label)
@@ -223,8 +224,8 @@ def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: F
 
 def prior_system(mapper: FixedLagMapper) -> tuple[Layout, Array, Array]:
     """`1/2 d' L d - g' d` of the prior, d = value - reference."""
-    layout = Layout(keys_of(mapper.smoother.prior))
-    return layout, *normal_equations(mapper.smoother.prior, layout)
+    layout = Layout(keys_of(mapper.road.smoother.prior))
+    return layout, *normal_equations(mapper.road.smoother.prior, layout)
 
 
 def change_of_variables(
@@ -253,7 +254,7 @@ def test_the_change_of_variables_is_exact(
 
     With S the covariance of the shift: `L (1 + S L)^-1` and `(1 + L S)^-1 g`, also where L is singular.
     """
-    smoother = before.smoother
+    smoother = before.road.smoother
     smoother.reactivate()
     monkeypatch.setattr(SplineSettings, "sigma_simplify", sigma)
     settings = before.settings
@@ -283,7 +284,7 @@ def test_the_change_of_variables_is_exact(
 def test_an_open_track_stays_open() -> None:
     log = exact_log(ahead(10.0, 9.0), *corridor(110.0))
     mapper, results = map_log(log)
-    assert mapper.path.length > mapper.settings.closing.min_path
+    assert mapper.road.path.length > mapper.settings.closing.min_path
     assert not any(result.closed for result in results)
     assert not mapper.map().closed
 
@@ -295,14 +296,14 @@ def test_no_loop_is_shorter_than_the_shortest(log: Log) -> None:
     for odometry, cycle in split_odometry(replace(log, cycles=log.cycles[:175])):
         mapper.update(odometry, cycle)
     assert not mapper.closed
-    assert not near_start(mapper.path, mapper.poses[-1], settings.closing)
-    assert near_start(mapper.path, mapper.poses[-1], MapperSettings().closing)
+    assert not near_start(mapper.road.path, mapper.poses[-1], settings.closing)
+    assert near_start(mapper.road.path, mapper.poses[-1], MapperSettings().closing)
 
 
 def test_standing_on_the_start_line_closes_nothing() -> None:
     log = exact_log(ahead(0.0, 4.0), *corridor(60.0))
     mapper, _ = map_log(log)
-    assert not near_start(mapper.path, mapper.poses[-1], mapper.settings.closing)
+    assert not near_start(mapper.road.path, mapper.poses[-1], mapper.settings.closing)
     assert not mapper.closed
 
 
@@ -311,7 +312,7 @@ def test_another_way_past_the_beginning_is_no_loop() -> None:
     turning = np.tile([6.0, 0.0, np.pi / 3.0], (150, 1))
     twists = np.concatenate([ahead(10.0, 6.0), turning, ahead(10.0, 7.0)])
     mapper, _ = map_log(exact_log(twists, *corridor(80.0)))
-    assert mapper.path.length > mapper.settings.closing.min_path
+    assert mapper.road.path.length > mapper.settings.closing.min_path
     assert not mapper.closed
 
 
@@ -340,8 +341,8 @@ def test_a_window_that_has_drifted_far_is_registered_back(before: FixedLagMapper
     mapper, poses_before = before, before.poses.copy()
     mapper.poses[:, :2] += [6.0, -5.0]
     unsure = covariance_of(mapper) + np.diag([25.0, 25.0, 1e-3])
-    track, times = mapper.smoother.map, mapper.smoother.times
-    registration = register(track, times, unsure, mapper.path.beginning, ClosingSettings(sigma_max=10.0))
+    track, times = mapper.road.smoother.map, mapper.road.smoother.times
+    registration = register(track, times, unsure, mapper.road.path.beginning, ClosingSettings(sigma_max=10.0))
     assert registration is not None
     moved = registration.motion.apply(mapper.poses[:, :2])
     np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.4)

@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.loop.known_loop import Loop, is_mapped
 from pathspace_graph.loop.map_repair import CERTAIN, SETTLE, SIGHTINGS, Contradictions, in_rows
-from pathspace_graph.loop.relocalization import KnownLoop, Loop, is_mapped
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -33,14 +33,9 @@ def lane(gap: tuple[float, float] | None = None) -> Loop:
     left, right = np.column_stack([x, np.full(len(x), 2.0)]), np.column_stack([x, np.full(len(x), -2.0)])
     mapped = np.ones(len(x), bool) if gap is None else (x < gap[0]) | (x > gap[1])
     curves = {LEFT: KDTree(left), RIGHT: KDTree(right)}
-    return Loop(0.5 * (left + right), x, 100.0, {LEFT: x, RIGHT: x}, curves, {LEFT: mapped, RIGHT: mapped})
-
-
-class WithoutGaps(KnownLoop):
-    """A map without gaps, whatever its curves are."""
-
-    def with_gaps(self) -> list[int]:
-        return []
+    begins = dict.fromkeys((LEFT, RIGHT), 0.0)
+    beside, gaps = {LEFT: x, RIGHT: x}, {LEFT: mapped, RIGHT: mapped}
+    return Loop(0.5 * (left + right), x, 100.0, beside, curves, gaps, begins)
 
 
 def seen(
@@ -53,7 +48,7 @@ def seen(
     """Contradictions after cones were detected from a vehicle that stands at the origin; it has no map."""
     mapper = FixedLagMapper()
     found = found or Contradictions(SETTINGS.growth)
-    smoother, points = mapper.smoother, np.array(cones, float)
+    smoother, points = mapper.road.smoother, np.array(cones, float)
     smoother.variables.insert(pose_keys(np.arange(1)), np.zeros(3))
     smoother.times.append(0.0)
     own = to_vehicle(points, np.zeros((len(points), 3)))
@@ -61,7 +56,7 @@ def seen(
         cycle = detections(0.1 * number, own, np.full(len(points), label))
         cycle = replace(cycle, covariances=np.tile(np.diag(sigmas) ** 2, (len(points), 1, 1)))
         new = smoother.map.detections.append(cycle, 0)
-        found.observe(smoother.map, WithoutGaps(smoother), new, cycle.t)
+        found.observe(smoother.map, lane(), new, cycle.t)
     return found
 
 

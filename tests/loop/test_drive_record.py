@@ -13,12 +13,12 @@ from pathspace_graph.factors.se2 import compose, wrap_angle
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.graph.variables import CALIBRATION_KEY, pose_keys
+from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.drive_record import DriveRecord, bend
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry, known_noise
-from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import OdometrySettings
 
@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 RADIUS, SPEED, CYCLE = 40.0, 10.0, 0.1
 LAP = 2.0 * np.pi * RADIUS
 AGAIN = Revisit(0, 1, np.zeros(3), np.eye(3))
+NOISE = NoiseLearner(known_noise(np.full(3, 0.01)), None)
 NOTHING = np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp)
 
 
@@ -40,9 +41,8 @@ def on_circle(angle: Array, side: float = 0.0) -> Array:
 
 def driven(laps: float, drift: float) -> DriveRecord:
     """Returns the record of a circle, driven for some laps; its odometry turns by `drift` rad/m too much."""
-    noise, end = NoiseLearner(known_noise(np.full(3, 0.01)), None), 2.0 * np.pi * laps
-    record, state = DriveRecord(MapperSettings(), noise), State()
-    state.variables.insert(np.array([CALIBRATION_KEY]), np.zeros(2))
+    record, road = DriveRecord(MapperSettings()), Road(MapperSettings())
+    state, end = road.smoother.map.state, 2.0 * np.pi * laps
     state.variables.insert(pose_keys(np.arange(1)), np.zeros(3))
     angles = np.arange(0.0, end + 0.3, 3.0 / RADIUS)
     for label, side in ((LEFT, 2.0), (RIGHT, -2.0)):
@@ -53,10 +53,10 @@ def driven(laps: float, drift: float) -> DriveRecord:
         step = integrate_odometry(Odometry(np.array([t - CYCLE]), twist), t, np.full(3, 0.01))
         nothing = Detections(t, *NOTHING)
         motion, none = MeasuredMotion(step, twist), np.zeros(0, bool)
-        record.measured(Reading(motion, nothing, none, nothing, (nothing, nothing)))
+        record.measured(Reading(motion, nothing, none, nothing, (nothing, nothing), NOISE))
         state.poses[-1] = np.append(on_circle(np.array([angle]))[0], angle)
         state.pose_u = {LEFT: np.array([angle * (RADIUS - 2.0)]), RIGHT: np.array([angle * (RADIUS + 2.0)])}
-        record.estimated(state)
+        record.estimated(road)
     return record
 
 
@@ -70,7 +70,7 @@ def test_a_record_that_was_given_up_keeps_the_first_reason() -> None:
 def test_the_chain_of_the_lap_is_the_odometry_that_was_measured() -> None:
     record = driven(0.5, 0.0)
     settings = MapperSettings(odometry=OdometrySettings(sigma_scale=0.1, sigma_bias=0.2))
-    chain = record.lap(3, AGAIN, settings).chain
+    chain = record.lap(3, AGAIN, settings, NOISE).chain
     np.testing.assert_array_equal(chain.calibration_sigma, [0.1, 0.2])
     poses = chain.dead_reckoned(np.zeros(2))
     angle = len(poses) * SPEED * CYCLE / RADIUS
@@ -127,8 +127,7 @@ def test_a_lap_is_solved_with_the_noise_that_is_known_when_it_closes() -> None:
     """Cycle 0 was driven with the stated noise, before any was measured: it counts as the others do."""
     stated, drift = np.array([0.01, 0.01, 0.002]), np.array([0.05, 0.05, 0.0017])
     front_end = FrontEnd(MapperSettings(noise="measured"), KnownNoise(stated))
-    noise = front_end.noise
-    record = DriveRecord(MapperSettings(), noise)
+    noise, record = front_end.noise, DriveRecord(MapperSettings())
     cone = Detections(0.2, np.array([[6.0, 2.0]]), 1e-4 * np.eye(2)[None], np.array([LEFT]))
     twist = np.array([[SPEED, 0.0, 0.3]] * 4)
     for k in range(2):
@@ -136,7 +135,7 @@ def test_a_lap_is_solved_with_the_noise_that_is_known_when_it_closes() -> None:
         record.measured(front_end.update(odometry, replace(cone, t=0.2 * (k + 1))))
     along, across = RayNoise(np.array([0.1, 0.05])), RayNoise(np.array([0.0, 0.02]))
     noise.measured = MeasuredNoise(stated, drift, 0.05, along, across)
-    lap = record.lap(0, AGAIN, MapperSettings())
+    lap = record.lap(0, AGAIN, MapperSettings(), noise)
     expected = integrate_twists(np.full(4, 0.05), twist, np.hypot(stated, drift / np.sqrt(0.05)))
     found = lap.chain.odometry.intervals[0].covariance
     np.testing.assert_allclose(found, expected.covariance, atol=2.0 * MIN_SIGMA**2)

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop.closing import hold_gauge, motion_across
 from pathspace_graph.mapping.state import State
@@ -21,6 +20,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
+from ..oracles.copied import copied
 from ..scenes.drives import bean_track, replay
 
 Array = NDArray[np.float64]
@@ -63,12 +63,12 @@ def _run(laps: float, until: float) -> FixedLagMapper:
 
 def run(laps: float, until: float) -> FixedLagMapper:
     """Returns a copy of a mapper after the cycles up to a stamp (s), which are mapped once."""
-    return copied(_run(laps, until), {})
+    return copied(_run(laps, until))
 
 
 def drive_on(mapper: FixedLagMapper, until: float) -> FixedLagMapper:
     """Hands the cycles up to a stamp (s) to a mapper that has had the first ones."""
-    for odometry, detections in islice(split_odometry(log()), mapper.smoother.next_cycle, None):
+    for odometry, detections in islice(split_odometry(log()), mapper.road.smoother.next_cycle, None):
         if detections.t > until:
             break
         replay(mapper, odometry, detections)
@@ -91,7 +91,7 @@ def mid() -> float:
 def test_holding_moves_nothing_and_keeps_what_is_known_of_map_and_pose() -> None:
     """Nothing that is relative to the map changes by holding it, and no covariance does at that moment."""
     mapper = run(np.inf, mid())
-    smoother = mapper.smoother
+    smoother = mapper.road.smoother
     assert mapper.closed and smoother.held is None
     keys, rows = across(smoother.map.state)
     newest = np.array([mapper.next_pose_key - 1])
@@ -120,17 +120,17 @@ def test_a_step_of_a_held_map_is_that_of_a_free_one_given_that_the_whole_does_no
 
 def test_the_map_is_held_after_the_laps_that_were_set_and_its_shape_is_not() -> None:
     early, free = run(0.4, held_since()), drive_on(run(np.inf, mid()), np.inf)
-    held = drive_on(copied(early, {}), np.inf)
-    assert held.smoother.held is not None and free.smoother.held is None
-    known = held.smoother.held
-    keys, rows = across(early.smoother.map.state)
-    moved = held.smoother.variables.of(keys) - early.smoother.variables.of(keys)
+    held = drive_on(copied(early), np.inf)
+    assert held.road.smoother.held is not None and free.road.smoother.held is None
+    known = held.road.smoother.held
+    keys, rows = across(early.road.smoother.map.state)
+    moved = held.road.smoother.variables.of(keys) - early.road.smoother.variables.of(keys)
     sigma = np.sqrt(np.diag(rows @ known.covariance @ rows.T))
     assert (np.abs(rows @ moved) < 0.1 * sigma).all()
     assert np.abs(moved).max() > 5e-3
-    claimed = held.smoother.covariance(known.keys)
+    claimed = held.road.smoother.covariance(known.keys)
     np.testing.assert_allclose(claimed, known.covariance, atol=0.02 * known.covariance.max())
-    assert np.trace(claimed) > np.trace(free.smoother.covariance(known.keys))
+    assert np.trace(claimed) > np.trace(free.road.smoother.covariance(known.keys))
 
 
 def held_since() -> float:
@@ -147,7 +147,7 @@ def test_factors_of_the_user_may_tell_the_gauge_so_that_it_is_not_held() -> None
         mapper.update(odometry, detections, own)
         if detections.t > mid():
             break
-    assert mapper.closed and mapper.smoother.held is None
+    assert mapper.closed and mapper.road.smoother.held is None
 
 
 def test_a_map_that_replaces_another_has_a_gauge_of_its_own() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop import map_repair
+from pathspace_graph.loop.drive import Drive
+from pathspace_graph.loop.known_loop import KnownLoop
 from pathspace_graph.loop.map_repair import REPAIRED, ContradictedStretch, carried, led_through, newest_lap
-from pathspace_graph.loop.relocalization import KnownLoop
-from pathspace_graph.loop.track_loop import TrackLoop
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
 from pathspace_graph.sim.faults import Faults, SensorFaults
@@ -94,13 +95,13 @@ def test_a_map_without_holes_is_never_solved_again(
     false_positives: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun: list[object] = []
-    begin = TrackLoop._begin_batch
+    begin = Drive.begin_batch
 
-    def count(self: TrackLoop, start: object) -> None:
-        begun.append(start)
-        begin(self, start)  # type: ignore[arg-type]
+    def count(self: Drive, *arguments: Any) -> None:
+        begun.append(arguments[-1])
+        begin(self, *arguments)
 
-    monkeypatch.setattr(TrackLoop, "_begin_batch", count)
+    monkeypatch.setattr(Drive, "begin_batch", count)
     log = cluttered(clean(), false_positives, seed=1) if false_positives else clean()
     mapper, results = map_log(log)
     assert mapper.closed and len(begun) == 1  # the batch of the open lap
@@ -109,7 +110,7 @@ def test_a_map_without_holes_is_never_solved_again(
 
 def test_the_record_has_the_pose_of_every_cycle_in_the_frame_of_the_mended_map() -> None:
     mapper, results = repaired()
-    poses = np.array(mapper.loop.record.poses)
+    poses = np.array(mapper.drive.record.poses)
     assert len(poses) == len(results)
     assert np.hypot(*(poses - true_poses(clean()))[:, :2].T).max() < 0.3
 
@@ -130,7 +131,7 @@ def test_a_map_that_does_not_explain_the_contradictions_is_refused(
 
 def test_a_curve_is_led_through_new_cones_and_stays_elsewhere() -> None:
     mapper, _ = repaired()
-    track, poses = mapper.smoother.map, np.array(mapper.loop.record.poses)
+    track, poses = mapper.road.smoother.map, np.array(mapper.drive.record.poses)
     before = sampled(track.state.spline(LEFT), 0.25)
     u = np.array([30.0, 33.0, 36.0, 39.0])
     boundary, points = track.state.boundaries[LEFT], mapper.control_points(LEFT)
@@ -146,7 +147,7 @@ def test_a_curve_is_led_through_new_cones_and_stays_elsewhere() -> None:
 
 
 def test_a_curve_without_contradictions_stays_to_the_bit() -> None:
-    track = repaired()[0].smoother.map
+    track = repaired()[0].road.smoother.map
     same = led_through(track, RIGHT, [ContradictedStretch(LEFT, np.zeros((3, 2)))], np.zeros((2, 3)))
     assert (same.control_points == track.state.spline(RIGHT).control_points).all()
 
@@ -168,7 +169,7 @@ def test_cones_are_carried_by_the_pose_next_to_them() -> None:
 
 
 def test_known_gaps_are_gone_after_mending() -> None:
-    assert KnownLoop(repaired()[0].smoother).with_gaps() == []
+    assert KnownLoop().of(repaired()[0].road.smoother).with_gaps() == []
 
 
 # --- a whole drive ---------------------------------------------------------------------------------------

@@ -16,7 +16,8 @@ from pathspace_graph.run import CycleResult
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
 
-from ..scenes.drives import bean_track, beginning, lap_log, map_log, path_of, true_poses
+from ..scenes import drives
+from ..scenes.drives import beginning, map_log, path_of, true_poses
 
 STEP = 1.0
 SECONDS, PERIOD = 24.0, 0.1
@@ -84,12 +85,12 @@ def test_the_map_is_better_for_them_and_nothing_is_closed(monkeypatch: pytest.Mo
     mapper, results = mapped()
     truth = true_poses(drive())
     notices = [result.notice for result in results if "met again" in result.notice]
-    assert len(notices) == 1 and not mapper.closed and mapper.recovery.failures == 0
+    assert len(notices) == 1 and not mapper.closed and mapper.failures == 0
     jumps = [result.jump for result in results if result.jump is not None]
     assert len(jumps) == len(mapper.revisits)
     with_them = errors(np.array([result.pose for result in results]), truth)
     smoothed = errors(mapper.corrected_poses, truth)
-    monkeypatch.setattr(Revisits, "use", lambda _: None)
+    monkeypatch.setattr(Revisits, "find", lambda *_: None)
     _, without = map_log(drive())
     alone = errors(np.array([result.pose for result in without]), truth)
     assert with_them[-50:].mean() < 0.5 * alone[-50:].mean()
@@ -113,9 +114,9 @@ def test_a_window_that_holds_the_whole_drive_has_none_and_fails_in_no_cycle() ->
     settings = MapperSettings(lag=60.0, max_poses=1000)
     log = beginning(drive(), 130)
     mapper, _ = map_log(log, FixedLagMapper(settings, log.odometry_sigma))
-    assert mapper.recovery.failures == 0 and not mapper.revisits
+    assert mapper.failures == 0 and not mapper.revisits
 
 
 def test_a_lap_that_closes_has_none() -> None:
-    mapper, _ = map_log(lap_log(bean_track(), 30.0))
+    mapper, _ = drives.mapped(drives.exact_lap())
     assert mapper.closed and not mapper.revisits

@@ -31,7 +31,7 @@ def mapper() -> FixedLagMapper:
 
 
 def rows_of(mapper: FixedLagMapper, settings: MapperSettings) -> Rows:
-    smoother = mapper.smoother
+    smoother = mapper.road.smoother
     track = CurveMap(settings, smoother.map.state)
     track.detections = smoother.map.detections
     return track.rows(np.arange(smoother.first_cycle, smoother.next_cycle))[0]
@@ -39,7 +39,7 @@ def rows_of(mapper: FixedLagMapper, settings: MapperSettings) -> Rows:
 
 def test_a_reading_that_slides_to_where_an_open_map_is_inactive_brings_that_back() -> None:
     found, _ = map_log(exact_log(ahead(6.0, 9.0), *corridor(80.0)))
-    smoother, state = found.smoother, found.smoother.map.state
+    smoother, state = found.road.smoother, found.road.smoother.map.state
     detections = smoother.map.detections
     assert not state.whole and len(smoother.inactive) > 0
     rows, size = int(detections.used.sum()), smoother.layout.size
@@ -56,7 +56,7 @@ def test_a_reading_that_slides_to_where_an_open_map_is_inactive_brings_that_back
 def test_rows_are_the_derivatives_of_the_distances(mapper: FixedLagMapper) -> None:
     """By every variable of the map at once; 0.6 m aside Huber's weight is not 1, so it is held."""
     free = replace(ACROSS, gate=replace(ACROSS.gate, huber=1e9))
-    variables, layout = mapper.smoother.variables, mapper.smoother.variables.layout
+    variables, layout = mapper.road.smoother.variables, mapper.road.smoother.variables.layout
     rows = rows_of(mapper, free)
     dense = np.zeros((len(rows), layout.size))
     np.put_along_axis(dense, rows.columns(layout), rows.jacobian, axis=1)
@@ -73,7 +73,7 @@ def test_rows_are_the_derivatives_of_the_distances(mapper: FixedLagMapper) -> No
 
 
 def test_rows_of_some_cycles_are_those_of_the_whole_window(mapper: FixedLagMapper) -> None:
-    smoother = mapper.smoother
+    smoother = mapper.road.smoother
     every = smoother.map.rows(np.arange(smoother.first_cycle, smoother.next_cycle))[0]
     some = np.array([smoother.first_cycle, smoother.first_cycle + 3, smoother.next_cycle - 1])
     rows, own = smoother.map.rows(some)[0], np.isin(every.owner, some)
@@ -110,7 +110,7 @@ def gauge_energy(mapper: FixedLagMapper, boundary_points: dict[int, Array]) -> f
 
 def test_the_weak_priors_are_the_spacing_s_and_the_second_differences(mapper: FixedLagMapper) -> None:
     """On even knots; and nothing comes from the anchors, which hold each point where it is."""
-    track, rng = CurveMap(ACROSS, mapper.smoother.map.state.copy()), np.random.default_rng(1)
+    track, rng = CurveMap(ACROSS, mapper.road.smoother.map.state.copy()), np.random.default_rng(1)
     for label in BOUNDARIES:
         track.state.control_points(label)[:] += 0.3 * rng.normal(size=(track.state.boundaries[label].size, 2))
     groups = [*track.gauge(True), *track.linear_gauge(True)]
@@ -132,7 +132,7 @@ def test_a_drive_without_noise_is_mapped() -> None:
 def test_the_cones_of_a_curve_move_with_the_map() -> None:
     """A quarter turn and a shift."""
     found, _ = map_log(exact_log(ahead(6.0, 4.0), *corridor(40.0)))
-    curves = found.smoother.map
+    curves = found.road.smoother.map
     before = {label: np.array(boundary.observed) for label, boundary in curves.state.boundaries.items()}
     curves.move(np.array([2.0, -1.0, 0.5 * np.pi]))
     for label, boundary in curves.state.boundaries.items():

@@ -366,11 +366,14 @@ def test_near_the_start_is_a_matter_of_place_and_direction(
     assert not near_start(path, np.array(pose), ClosingSettings(min_path=100.0))
 
 
-@pytest.mark.parametrize(("lateral", "passes"), [(0.0, True), (4.9, True), (5.1, False), (-5.1, False)])
-def test_the_start_is_not_passed_on_a_neighbouring_lane(lateral: float, passes: bool) -> None:
+@pytest.mark.parametrize(
+    ("lateral", "row", "passes"),
+    [(0.0, 7.0, True), (4.9, 7.0, True), (5.1, 7.0, False), (-5.1, 7.0, False), (4.9, 2.5, False)],
+)
+def test_the_start_is_not_passed_on_a_neighbouring_lane(lateral: float, row: float, passes: bool) -> None:
     """The drive began at the origin along x; 300 m later it comes back beside it, up to 5 m away.
 
-    Only a row of cones 7 m to the left is known, which doesn't lie between the lanes.
+    Only a row of cones to the left is known. At 7 m it doesn't lie between the lanes, at 2.5 m it does.
     """
     path = DrivenPath()
     loop = [[0.0, 0.0], [100.0, 0.0], [100.0, -50.0], [-20.0, -50.0]]
@@ -380,6 +383,6 @@ def test_the_start_is_not_passed_on_a_neighbouring_lane(lateral: float, passes: 
         for share in np.linspace(0.0, 1.0, round(float(np.hypot(*(end - begin))) * 2)):
             path.update(np.append(begin + share * (end - begin), heading))
     state, x = State(), np.arange(0.0, 40.0, 4.0)
-    state.add_boundary(LEFT, *boundary_through(np.column_stack([x, np.full(10, 7.0)])))
+    state.add_boundary(LEFT, *boundary_through(np.column_stack([x, np.full(10, row)])))
     assert passes_start(state, path, motion(0.0, 0.0, 0.0)) is passes
     assert not passes_start(state, path, motion(0.0, 0.0, 0.6))  # nor across the lane

@@ -161,9 +161,9 @@ def test_an_outline_does_not_update_the_inactive_map(
     mapped: tuple[FixedLagMapper, list[CycleResult]],
 ) -> None:
     mapper, _ = mapped
-    values = mapper.smoother.variables.values
-    assert len(mapper.smoother.inactive)
-    values[mapper.smoother.variables.layout.entries(mapper.smoother.inactive.keys)] += 1.0
+    values = mapper.road.smoother.variables.values
+    assert len(mapper.road.smoother.inactive)
+    values[mapper.road.smoother.variables.layout.entries(mapper.road.smoother.inactive.keys)] += 1.0
     before = values.copy()
     track = mapper.outline()
     np.testing.assert_array_equal(values, before)
@@ -174,7 +174,7 @@ def test_the_same_log_gives_the_same_map_to_the_bit(lap: Log) -> None:
     start = replace(lap, cycles=lap.cycles[:80])
     (first, poses), (second, again) = map_log(start), map_log(start)
     np.testing.assert_array_equal(poses_of(poses), poses_of(again))
-    np.testing.assert_array_equal(first.smoother.variables.values, second.smoother.variables.values)
+    np.testing.assert_array_equal(first.road.smoother.variables.values, second.road.smoother.variables.values)
 
 
 # --- exact drives ----------------------------------------------------------------------------------------
@@ -239,7 +239,9 @@ def test_unknown_readings_that_either_curve_would_take_are_left_out() -> None:
     labels = np.where(np.arange(len(labels)) % 3 == 0, UNKNOWN, labels)
     mapper, _ = map_log(exact_log(ahead(8.0, 4.0), cones, labels))
     assert set(mapper.boundaries) == {LEFT, RIGHT}
-    assert not mapper.smoother.map.detections.used[mapper.smoother.map.detections.label == UNKNOWN].any()
+    assert not mapper.road.smoother.map.detections.used[
+        mapper.road.smoother.map.detections.label == UNKNOWN
+    ].any()
 
 
 def test_unknown_readings_on_a_curve_are_used() -> None:
@@ -247,10 +249,10 @@ def test_unknown_readings_on_a_curve_are_used() -> None:
     cones, labels = corridor(100.0)
     labels = np.where(np.arange(len(labels)) % 3 == 0, UNKNOWN, labels)
     mapper, _ = map_log(exact_log(ahead(8.0, 8.0), cones, labels))
-    detections = mapper.smoother.map.detections
+    detections = mapper.road.smoother.map.detections
     used = detections.used & (detections.label == UNKNOWN)
     assert used.sum() > 10
-    y = detections.points_map(used, mapper.smoother.variables)[:, 1]
+    y = detections.points_map(used, mapper.road.smoother.variables)[:, 1]
     np.testing.assert_array_equal(detections.boundary[used], np.where(y > 0.0, LEFT, RIGHT))
     for label, line in ((LEFT, 2.0), (RIGHT, -2.0)):
         assert straightness(mapper.map(), label, line, 60.0) < 0.02
@@ -264,7 +266,7 @@ def test_cones_of_a_start_line_beside_the_boundary_do_not_bend_it() -> None:
         ahead(8.0, 8.0), np.concatenate([cones, gate]), np.append(labels, np.full(len(gate), UNKNOWN))
     )
     mapper, _ = map_log(log)
-    detections = mapper.smoother.map.detections
+    detections = mapper.road.smoother.map.detections
     assert not detections.used[detections.label == UNKNOWN].any()
     for label, line in ((LEFT, 2.0), (RIGHT, -2.0)):
         assert straightness(mapper.map(), label, line, 60.0) < 1e-6
@@ -384,7 +386,7 @@ def test_twists_of_cycles_that_are_left_out_are_not_lost(
     expected, used = integrate(twists[:-1], DT)[::CYCLE], np.ones(len(results), bool)
     used[20 : 20 + left_out] = False
     np.testing.assert_allclose(poses_of(results)[used], expected[used], atol=1e-9)
-    assert len(mapper.smoother.times) <= used.sum()
+    assert len(mapper.road.smoother.times) <= used.sum()
 
 
 def test_a_first_cycle_after_the_first_odometry_starts_where_it_has_driven() -> None:
@@ -452,10 +454,12 @@ def test_looking_at_the_map_changes_nothing() -> None:
         looked.update(odometry, cycle)
         looked.map()
         looked.graph().error(looked.values())
-        looked.smoother.linear_graph()
-        looked.marginal_covariance([looked.pose_key(looked.smoother.next_cycle - 1)])
-    left_alone.smoother.refresh()
-    np.testing.assert_array_equal(looked.smoother.variables.values, left_alone.smoother.variables.values)
+        looked.road.smoother.linear_graph()
+        looked.marginal_covariance([looked.pose_key(looked.road.smoother.next_cycle - 1)])
+    left_alone.road.smoother.refresh()
+    np.testing.assert_array_equal(
+        looked.road.smoother.variables.values, left_alone.road.smoother.variables.values
+    )
 
 
 def test_a_setting_out_of_range_is_named() -> None:

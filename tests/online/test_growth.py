@@ -12,10 +12,10 @@ from scipy.spatial import KDTree
 from pathspace_graph.eval.metrics.accuracy import mapped_points, true_curve
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.mapping import growth
+from pathspace_graph.mapping.growth import _uncrossed, check_order, end_of, undisputed
 from pathspace_graph.mapping.path import END_BEHIND, Candidates, End, PathAhead
-from pathspace_graph.online import growth
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.online.growth import check_order, undisputed
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import GrowthSettings
 
@@ -48,14 +48,14 @@ def test_a_place_is_of_the_label_that_most_readings_around_it_have(
 ) -> None:
     """Two to one, one to one, and nothing at all; those of unknown colour have no say."""
     places = np.array([[10.0, 0.0], [0.0, 8.0], [5.0, 5.0]])
-    assert undisputed(seen.smoother.map, label, places, 1.0).tolist() == expected
+    assert undisputed(seen.road.smoother.map, label, places, 1.0).tolist() == expected
 
 
 def test_readings_farther_away_than_the_radius_have_no_say(seen: FixedLagMapper) -> None:
     """Of those about (10, 0) only the right one is within 0.25 m of (10, 0.5)."""
     place = np.array([[10.0, 0.5]])
-    assert undisputed(seen.smoother.map, RIGHT, place, 0.25).tolist() == [True]
-    assert undisputed(seen.smoother.map, LEFT, place, 0.25).tolist() == [False]
+    assert undisputed(seen.road.smoother.map, RIGHT, place, 0.25).tolist() == [True]
+    assert undisputed(seen.road.smoother.map, LEFT, place, 0.25).tolist() == [False]
 
 
 def miscoloured(log: Log, every: int) -> Log:
@@ -103,7 +103,7 @@ def test_a_boundary_is_not_led_over_cones_of_which_most_readings_have_the_other_
 def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() -> None:
     """An older stretch ran against this one, 3 m to the left of it; what was sighted beside it is its own."""
     mapper, _ = map_log(exact_log(ahead(8.0, 5.0), *corridor(100.0)))
-    boundary, tentative = mapper.boundaries[LEFT], mapper.growth.tentative[LEFT]
+    boundary, tentative = mapper.boundaries[LEFT], mapper.road.growth.tentative[LEFT]
     confirmed, size = boundary.confirmed_end, boundary.size
     tentative.clear()
     for t in (5.0, 5.1, 5.2):
@@ -113,7 +113,8 @@ def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() ->
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
     stations = np.union1d(np.arange(0.0, along[-1], 0.3), along)  # the path is stored in such steps
     points = np.column_stack([np.interp(stations, along, corners[:, k]) for k in range(2)])
-    assert mapper.growth.expand(PathAhead(points, stations, float(along[3]))) == frozenset()
+    path = PathAhead(points, stations, float(along[3]))
+    assert mapper.road.growth.expand(mapper.road.smoother, path) == (frozenset(), "")
     assert (boundary.confirmed_end, boundary.size) == (confirmed, size)
 
 
@@ -136,12 +137,14 @@ def along_x(driven: float = 0.0, begin: float = -10.0) -> PathAhead:
 def track(mapper: FixedLagMapper, *points: tuple[float, float], label: int = LEFT, times: int = 3) -> None:
     """Makes tentative tracks at points, detected so many times."""
     for k in range(times):
-        mapper.growth.tentative[label].add(np.array(points), np.tile(ROUND, (len(points), 1, 1)), 0.1 * k)
+        mapper.road.growth.tentative[label].add(
+            np.array(points), np.tile(ROUND, (len(points), 1, 1)), 0.1 * k
+        )
 
 
 def grow(mapper: FixedLagMapper, path: PathAhead) -> list[tuple[float, float]]:
     """Expands the curves along a path; returns the cones of the left one, to a centimetre."""
-    mapper.growth.expand(path)
+    mapper.road.growth.expand(mapper.road.smoother, path)
     observed = mapper.boundaries[LEFT].observed if LEFT in mapper.boundaries else []
     return [(round(float(x), 2), round(float(y), 2)) for x, y in observed]
 
@@ -154,8 +157,8 @@ def test_a_curve_begins_with_two_confirmed_tracks_in_the_order_of_the_path(alone
     track(alone, (-2.0, 2.2), (4.0, 2.0), times=3)
     assert grow(alone, along_x()) == [(-2.0, 2.2), (1.0, 2.0), (4.0, 2.0)]
     assert RIGHT not in alone.boundaries
-    assert len(alone.growth.tentative[LEFT].points) == 0
-    assert len(alone.smoother.map.state.pose_u[LEFT]) == len(alone.poses)
+    assert len(alone.road.growth.tentative[LEFT].points) == 0
+    assert len(alone.road.smoother.map.state.pose_u[LEFT]) == len(alone.poses)
 
 
 def test_a_curve_begins_on_its_own_side_within_reach_and_not_too_far_from_the_path(
@@ -386,7 +389,7 @@ def far_track(mapper: FixedLagMapper, point: tuple[float, float], sigma: float, 
     """Adds sightings of a cone on the left whose ranges, along x, have this standard deviation (m)."""
     covariance = np.diag([sigma**2, 0.05**2])[None]
     for k in range(times):
-        mapper.growth.tentative[LEFT].add(np.array([point]), covariance, 0.1 * k)
+        mapper.road.growth.tentative[LEFT].add(np.array([point]), covariance, 0.1 * k)
 
 
 def test_an_uncertain_cone_extends_a_curve_once_it_is_certain(alone: FixedLagMapper) -> None:
@@ -396,7 +399,7 @@ def test_an_uncertain_cone_extends_a_curve_once_it_is_certain(alone: FixedLagMap
     far_track(alone, (6.5, 2.0), 1.2, 3)
     assert len(grow(alone, along_x())) == 2
     far_track(alone, (6.5, 2.0), 1.2, 5)
-    assert alone.growth.tentative[LEFT].counts.tolist() == [8]
+    assert alone.road.growth.tentative[LEFT].counts.tolist() == [8]
     assert len(grow(alone, along_x())) == 2
     far_track(alone, (6.5, 2.0), 0.3, 1)
     assert grow(alone, along_x())[2:] == [(6.5, 2.0)]
@@ -427,7 +430,7 @@ def uncrossed(mapper: FixedLagMapper, path: PathAhead, *points: tuple[float, flo
     places = np.array(points)
     found = Candidates(places, np.arange(len(places)), places[:, 0], places[:, 1])
     end = End(np.array([4.0, 2.0]), 4.0, 2.0)
-    return mapper.growth._uncrossed(LEFT, path, end, found).tolist()
+    return _uncrossed(mapper.road.smoother.map.state, LEFT, path, end, found).tolist()
 
 
 @pytest.fixture
@@ -478,7 +481,7 @@ def test_one_wrong_cone_at_the_end_leads_no_farther(alone: FixedLagMapper) -> No
     """The newest cones are 2, 2 and 3.4 m beside the path: the next may be 2.7 m and a step away."""
     track(alone, (-4.0, 2.0), (0.0, 2.0), (4.0, 3.4))
     assert len(grow(alone, along_x())) == 3
-    end = alone.growth.end(LEFT, along_x(), 5.0)
+    end = end_of(alone.road.smoother.map.state, LEFT, along_x(), 5.0)
     assert end.side == pytest.approx(2.7, abs=0.05)  # of the cones and the end, four values
     assert end.position == pytest.approx([4.0, 3.4], abs=0.05)
 
@@ -497,6 +500,7 @@ def test_an_end_that_was_carried_on_around_a_bend_has_the_side_that_it_has(alone
     stations = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     path = PathAhead(points, stations, float(stations[-1]))
     boundary, control_points = boundary_through(inner)
-    alone.smoother.map.state.add_boundary(LEFT, boundary, control_points)
+    state = alone.road.smoother.map.state
+    state.add_boundary(LEFT, boundary, control_points)
     boundary.observed = np.array([[x, 2.0] for x in (0.0, 4.0, 8.0, 12.0)])
-    assert alone.growth.end(LEFT, path, END_BEHIND).side == pytest.approx(2.0, abs=0.1)
+    assert end_of(state, LEFT, path, END_BEHIND).side == pytest.approx(2.0, abs=0.1)

@@ -23,13 +23,13 @@ def mapper() -> FixedLagMapper:
     settings = MapperSettings(relinearize=RelinearizeSettings(1e-12, 1e-12))
     own = FixedLagMapper(settings, log.odometry_sigma)
     mapper = map_log(replace(log, cycles=log.cycles[:60]), own)[0]
-    mapper.smoother.reactivate()
+    mapper.road.smoother.reactivate()
     return mapper
 
 
 def linear_window(mapper: FixedLagMapper) -> gtsam.GaussianFactorGraph:
     """The window with the whole map, linearized at its estimate, and the damping of a step."""
-    smoother, keys = mapper.smoother, mapper.smoother.map.state.map_keys
+    smoother, keys = mapper.road.smoother, mapper.road.smoother.map.state.map_keys
     smoother.refresh()
     now, sigma = (
         smoother.variables.change(smoother.variables.layout.entries(keys)),
@@ -42,7 +42,7 @@ def linear_window(mapper: FixedLagMapper) -> gtsam.GaussianFactorGraph:
 @pytest.mark.parametrize("ordering", ["none", "COLAMD", "poses first"])
 def test_gtsam_solves_the_system_that_the_mapper_solves(mapper: FixedLagMapper, ordering: str) -> None:
     """In every ordering; the window is left as it is."""
-    variables = mapper.smoother.variables
+    variables = mapper.road.smoother.variables
     before = variables.values.copy()
     window = linear_window(mapper)
     np.testing.assert_array_equal(variables.values, before)
@@ -52,6 +52,6 @@ def test_gtsam_solves_the_system_that_the_mapper_solves(mapper: FixedLagMapper, 
         "poses first": gtsam.Ordering(keys[np.argsort(~are_poses(keys), kind="stable")].tolist()),
     }
     solution = window.optimize(*[orderings[ordering]] if ordering in orderings else ())
-    mapper.smoother.step(mapper.settings.sigma_step)
+    mapper.road.smoother.step(mapper.settings.sigma_step)
     now = variables.change(np.arange(variables.layout.size))
     np.testing.assert_allclose(solution.vector(variables.keys.tolist()), now, atol=1e-7)

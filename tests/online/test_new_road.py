@@ -8,8 +8,8 @@ import pytest
 
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import DEGRADED, LOST
+from pathspace_graph.loop.lost import NEW_ROAD, Lost
 from pathspace_graph.loop.relocalization import FOUND
-from pathspace_graph.loop.track_loop import NEW_ROAD
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -34,7 +34,7 @@ def driven() -> tuple[FixedLagMapper, list[CycleResult], list[TrackAhead], list[
             break
         results.append(replay(mapper, odometry, detections))
         ahead.append(mapper.ahead(10.0))
-        maps.append(mapper.smoother.map.state.map_points.copy())
+        maps.append(mapper.road.smoother.map.state.map_points.copy())
     return mapper, results, ahead, maps
 
 
@@ -74,8 +74,9 @@ def test_the_new_road_is_seen_by_the_calibrated_sensor() -> None:
     for odometry, seen in split_odometry(log):
         turned = replace(seen, points_vehicle=seen.points_vehicle @ np.array([[c, -s], [s, c]]))
         replay(mapper, odometry, turned)
-        if mapper.new_road is not None:
-            known, own = (one.smoother.variables.sensor[0] for one in (mapper, mapper.new_road))
+        if isinstance(mapper.phase, Lost) and mapper.phase.new_road is not None:
+            roads = mapper.road, mapper.phase.new_road
+            known, own = (road.smoother.variables.sensor[0] for road in roads)
             assert abs(known - turn) < np.deg2rad(0.3) and abs(own - known) < np.deg2rad(0.3)
             checked += 1
         if seen.t > 0.5 * (leaves + back):

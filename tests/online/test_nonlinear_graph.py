@@ -70,23 +70,23 @@ def mapper(request: pytest.FixtureRequest, log: Log) -> FixedLagMapper:
     far = FarSettings(stretch=1e4, room=1e4) if case.endswith("all") else EAGER
     found = driven(log, cycles, MapperSettings(far=far, relinearize=EXACT), case == "factors")
     assert found.closed == case.startswith("closed")
-    assert (len(found.smoother.inactive) > 0) == (not case.endswith("all"))
+    assert (len(found.road.smoother.inactive) > 0) == (not case.endswith("all"))
     return found
 
 
 def turned(mapper: FixedLagMapper) -> Array:
     """Block-diagonal T (n, n) from the tangents of `gtsam.Pose2` to our unknowns, on the window's columns."""
-    keys = mapper.smoother.layout.keys
-    matrix = np.eye(mapper.smoother.layout.size)
+    keys = mapper.road.smoother.layout.keys
+    matrix = np.eye(mapper.road.smoother.layout.size)
     for key, x in pose_columns(keys):
-        theta = mapper.smoother.variables.of(np.array([key]))[2]
+        theta = mapper.road.smoother.variables.of(np.array([key]))[2]
         matrix[x : x + 2, x : x + 2] = rotation(theta)
     return matrix
 
 
 def own_system(mapper: FixedLagMapper) -> tuple[Array, Array]:
     """Hessian and negative gradient of the engine's graph at the estimate, in GTSAM's tangents."""
-    smoother = mapper.smoother
+    smoother = mapper.road.smoother
     hessian, vector = normal_equations(smoother.linear_graph(), smoother.layout)
     entries = smoother.variables.layout.entries(smoother.layout.keys)
     T = turned(mapper)
@@ -96,7 +96,7 @@ def own_system(mapper: FixedLagMapper) -> tuple[Array, Array]:
 def test_its_linearization_is_the_mapper_s_own_system(mapper: FixedLagMapper) -> None:
     hessian, negative_gradient = own_system(mapper)
     linear = mapper.graph().linearize(mapper.values())
-    found, found_descent = linear.hessian(mapper.smoother.layout.ordering)
+    found, found_descent = linear.hessian(mapper.road.smoother.layout.ordering)
     np.testing.assert_allclose(found, hessian, atol=1e-8 * np.abs(hessian).max())
     np.testing.assert_allclose(found_descent, negative_gradient, atol=1e-7 * np.abs(hessian).max())
     largest = np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)))
@@ -104,10 +104,10 @@ def test_its_linearization_is_the_mapper_s_own_system(mapper: FixedLagMapper) ->
 
 
 def test_its_values_are_the_active_variables(mapper: FixedLagMapper) -> None:
-    values, layout = mapper.values(), mapper.smoother.layout
+    values, layout = mapper.values(), mapper.road.smoother.layout
     assert list(values.keys()) == layout.keys.tolist()
     assert list(mapper.graph().keyVector()) == layout.keys.tolist()
-    newest = values.atPose2(mapper.pose_key(mapper.smoother.next_cycle - 1))
+    newest = values.atPose2(mapper.pose_key(mapper.road.smoother.next_cycle - 1))
     np.testing.assert_allclose([newest.x(), newest.y()], mapper.poses[-1, :2])
 
 
@@ -125,7 +125,7 @@ def test_levenberg_marquardt_stays_where_the_mapper_is(mapper: FixedLagMapper) -
     found = optimizer.optimize()
     assert optimizer.error() <= graph.error(values)
     assert optimizer.iterations() < 50
-    for cycle in range(mapper.smoother.first_cycle, mapper.smoother.next_cycle):
+    for cycle in range(mapper.road.smoother.first_cycle, mapper.road.smoother.next_cycle):
         before, after = (one.atPose2(pose_key(cycle)) for one in (values, found))
         assert np.hypot(after.x() - before.x(), after.y() - before.y()) < 0.3
         assert abs(after.theta() - before.theta()) < 0.05
@@ -134,7 +134,7 @@ def test_levenberg_marquardt_stays_where_the_mapper_is(mapper: FixedLagMapper) -
 def test_gtsam_s_marginals_are_the_mapper_s(mapper: FixedLagMapper) -> None:
     """Of the newest and the oldest pose, of an active control point and of the calibration."""
     marginals = gtsam.Marginals(mapper.graph(), mapper.values())
-    smoother = mapper.smoother
+    smoother = mapper.road.smoother
     points = smoother.layout.keys[~are_poses(smoother.layout.keys)]
     poses = [pose_key(smoother.next_cycle - 1), pose_key(smoother.first_cycle)]
     for key in (*poses, int(points[0]), int(points[len(points) // 2])):
@@ -153,10 +153,10 @@ def test_it_can_be_printed_and_drawn(
 ) -> None:
     graph, values = mapper.graph(), mapper.values()
     graph.printErrors(values)
-    assert f"x{mapper.smoother.first_cycle}" in capfd.readouterr().out
+    assert f"x{mapper.road.smoother.first_cycle}" in capfd.readouterr().out
     graph.saveGraph(str(tmp_path / "window.dot"), values)
     text = (tmp_path / "window.dot").read_text()
-    assert f"x{mapper.smoother.next_cycle - 1}" in text and text.rstrip().endswith("}")
+    assert f"x{mapper.road.smoother.next_cycle - 1}" in text and text.rstrip().endswith("}")
 
 
 def test_it_shares_nothing_with_the_mapper(log: Log) -> None:
@@ -178,7 +178,7 @@ def test_it_is_the_mapper_s_system_for_other_degrees(log: Log, degree: int) -> N
     mapper = driven(log, 60, settings)
     assert {LEFT, RIGHT} == set(mapper.boundaries)
     hessian, _ = own_system(mapper)
-    found, _ = mapper.graph().linearize(mapper.values()).hessian(mapper.smoother.layout.ordering)
+    found, _ = mapper.graph().linearize(mapper.values()).hessian(mapper.road.smoother.layout.ordering)
     np.testing.assert_allclose(found, hessian, atol=1e-8 * np.abs(hessian).max())
 
 

@@ -26,7 +26,7 @@ def test_a_bias_is_estimated_as_bayes_says(sign: float) -> None:
     log = exact_log(ahead(10.0, 60.0), *corridor(640.0))
     biased = log.odometry.twist + np.array([0.0, 0.0, sign * BIAS])
     mapper, _ = map_log(replace(log, odometry=Odometry(log.odometry.t, biased)))
-    variance = mapper.smoother.covariance(np.array([CALIBRATION_KEY]))[1, 1]
+    variance = mapper.road.smoother.covariance(np.array([CALIBRATION_KEY]))[1, 1]
     share = variance / MapperSettings().odometry.sigma_bias ** 2
     expected = sign * BIAS * (1.0 - share)
     assert share < 0.9

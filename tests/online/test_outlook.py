@@ -17,7 +17,15 @@ from pathspace_graph.online.outlook import SIGMA_BEND, Outlook, joint_covariance
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.drives import ahead, bean_track, corridor, detections, exact_log, lap_log, map_log
+from ..scenes.drives import (
+    ahead,
+    corridor,
+    detections,
+    exact_lap,
+    exact_log,
+    map_log,
+    mapped,
+)
 
 Array = NDArray[np.float64]
 
@@ -34,10 +42,13 @@ def mapper(log: Log) -> FixedLagMapper:
     return map_log(log)[0]
 
 
+def outlooks(mapper: FixedLagMapper) -> dict[int, Outlook]:
+    road = mapper.road
+    return look_ahead(road.smoother.map, road.growth.tentative, road.path, road.smoother.times[-1])
+
+
 def outlook(mapper: FixedLagMapper, label: int = LEFT) -> Outlook:
-    return look_ahead(mapper.smoother.map, mapper.growth.tentative, mapper.path, mapper.smoother.times[-1])[
-        label
-    ]
+    return outlooks(mapper)[label]
 
 
 def test_an_open_map_leads_on_through_all_cones_in_sight(mapper: FixedLagMapper) -> None:
@@ -82,9 +93,7 @@ def test_a_detection_that_is_not_repeated_is_taken_back() -> None:
     mapper, ends = FixedLagMapper(odometry_sigma=log.odometry_sigma), []
     for odometry, detected in split_odometry(log):
         mapper.update(odometry, detected)
-        found = look_ahead(
-            mapper.smoother.map, mapper.growth.tentative, mapper.path, mapper.smoother.times[-1]
-        ).get(LEFT)
+        found = outlooks(mapper).get(LEFT)
         ends.append(found.tracks[-1, 0] if found is not None and len(found.tracks) else 0.0)
     assert max(ends[:at]) < 25.0
     assert [end > 27.0 for end in ends[at : at + 6]] == [True] * 4 + [False] * 2
@@ -119,7 +128,7 @@ def test_a_mapper_that_has_seen_nothing_has_no_outline() -> None:
 
 
 def test_a_closed_map_is_confirmed_as_a_whole() -> None:
-    mapper, _ = map_log(lap_log(bean_track(), overrun=45.0))
+    mapper, _ = mapped(exact_lap())
     assert mapper.closed
     track = mapper.map()
     for label, outline in mapper.outline().boundaries.items():
@@ -132,9 +141,9 @@ def test_a_closed_map_is_confirmed_as_a_whole() -> None:
 
 def test_the_covariance_is_that_of_the_fit_by_differences(mapper: FixedLagMapper) -> None:
     """The tracks move with the vehicle; their own errors and the bends are independent of everything."""
-    found, state = outlook(mapper), mapper.smoother.map.state
-    newest = pose_keys(np.array([mapper.smoother.next_cycle - 1]))
-    joint = mapper.smoother.covariance(np.concatenate([state.keys(LEFT), newest]))
+    found, state = outlook(mapper), mapper.road.smoother.map.state
+    newest = pose_keys(np.array([mapper.road.smoother.next_cycle - 1]))
+    joint = mapper.road.smoother.covariance(np.concatenate([state.keys(LEFT), newest]))
     assert found.placement is not None
     vehicle, tracks, bend = mapper.poses[-1], found.tracks, SIGMA_BEND
 

@@ -58,10 +58,10 @@ def test_a_mapper_that_is_looked_at_goes_on_to_the_same_estimate(log: Log) -> No
     looked_at, alone = (FixedLagMapper(odometry_sigma=log.odometry_sigma) for _ in range(2))
     for number, (odometry, detections) in enumerate(split_odometry(log)):
         ours, theirs = looked_at.update(odometry, detections), alone.update(odometry, detections)
-        before = looked_at.smoother.variables.values.copy()
+        before = looked_at.road.smoother.variables.values.copy()
         looks = (looked_at.map, looked_at.outline, looked_at.readings, looked_at.vehicle_state)
         for look in looks if number % 4 == 0 else ():
             with looked_at.looked_at():
                 look()
-            np.testing.assert_array_equal(looked_at.smoother.variables.values, before)
+            np.testing.assert_array_equal(looked_at.road.smoother.variables.values, before)
         np.testing.assert_array_equal(ours.pose, theirs.pose)

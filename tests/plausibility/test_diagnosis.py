@@ -11,7 +11,13 @@ from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import CALIBRATION
 from pathspace_graph.io.results import RunNoise, VehicleState
-from pathspace_graph.plausibility.diagnosis import CAUSES, by_prior, diagnose, measured_line, noise_lines
+from pathspace_graph.plausibility.diagnosis import (
+    CALIBRATION_CAUSES,
+    by_prior,
+    diagnose,
+    measured_line,
+    noise_lines,
+)
 
 SETTINGS = {
     "odometry": {"sigma_scale": 0.005, "sigma_bias": 0.002},
@@ -71,7 +77,7 @@ def test_settings_of_another_estimator_give_no_line() -> None:
 
 
 def test_every_calibration_has_a_cause() -> None:
-    assert set(CAUSES) == {*CALIBRATION, *SENSOR}
+    assert set(CALIBRATION_CAUSES) == {*CALIBRATION, *SENSOR}
 
 
 # --- measured noise --------------------------------------------------------------------------------------
@@ -95,13 +101,14 @@ def test_what_was_measured_is_a_line() -> None:
     assert measured_line(MEASURED).split("; ")[1:] == [
         "detections 0.37 m along and 0.14 m across the ray at 10 m, of which 50 % and 80 % of the variance "
         "stay with a cone for 2 s and 8 s",
-        "stamps 115 ms early, turned 1.3 degrees to the right, ranges +10.0 % - 0.31 m",
+        "the sensor is turned by 1.3 degrees to the right, detections are 115 ms newer than their stamps, "
+        "ranges are 10.0 % too long, ranges are 0.31 m too short",
     ]
 
 
 def test_errors_of_the_sensor_that_are_not_clear_are_not_told() -> None:
     unclear = replace(MEASURED, sensor_sigma=np.abs(MEASURED.sensor) / 3.9)
-    assert "stamps" not in measured_line(unclear)
+    assert measured_line(unclear).endswith("for 2 s and 8 s")
     small = replace(MEASURED, sensor=np.full(5, 1e-3), sensor_sigma=np.full(5, 1e-5))
     assert measured_line(small) == measured_line(unclear)
 

@@ -7,7 +7,7 @@ import pytest
 
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.io.log import Detections
-from pathspace_graph.plausibility.hypotheses import LONGEST, REACH, Pairs, pairs_of, spacing_of
+from pathspace_graph.plausibility.hypotheses import EXPLAINED_REACH, LONGEST_PAIR, Pairs, pairs_of, spacing_of
 
 CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1]])
 MOTION = np.array([1.0, 0.3, 0.2])
@@ -40,7 +40,7 @@ def test_a_detection_at_one_reach_counts_by_its_weight() -> None:
     cones = np.array([[0.0, 0.0], [100.0, 0.0]])
     found = pairs_of([cycle(0.0, np.zeros(3), cones), cycle(0.1, np.zeros(3), cones)])
     assert found is not None
-    assert found.reach == pytest.approx(100.0 * REACH)
+    assert found.reach == pytest.approx(100.0 * EXPLAINED_REACH)
     off = np.array([[0.0, found.reach, 0.0]])
     assert found.explained(np.eye(2), off)[0] == pytest.approx(np.exp(-0.5))
 
@@ -60,7 +60,7 @@ def test_cycles_far_apart_are_no_pair() -> None:
     gap = [cycle(100.0 + 0.1 * k, np.zeros(3)) for k in range(5)]
     found = pairs_of([*cycles, *gap])
     assert found is not None
-    assert (found.end - found.begin).max() < LONGEST
+    assert (found.end - found.begin).max() < LONGEST_PAIR
 
 
 def test_single_detections_give_no_pairs() -> None:

@@ -38,7 +38,7 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.diagnosis import diagnose, measured_line
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.run import CycleResult, run_online, split_odometry
-from pathspace_graph.scale import ENOUGH, PATIENCE, SCALES, SceneScale, scale_of, width_and_gap
+from pathspace_graph.scale import SCALES, SCENE_ENOUGH, SCENE_PATIENCE, SceneScale, scale_of, width_and_gap
 from pathspace_graph.settings.mapper import BatchSettings, MapperSettings
 from pathspace_graph.settings.online import GrowthSettings, LimitSettings
 from pathspace_graph.sim.mistakes import in_frame
@@ -101,7 +101,7 @@ def test_a_cone_that_is_detected_twice_is_one() -> None:
     ],
 )
 def test_the_scale_is_what_width_and_gap_agree_on(width: float, gap: float, scale: float) -> None:
-    scene = driven(road(width, gap), speed=2.0 * gap, count=ENOUGH + 1)
+    scene = driven(road(width, gap), speed=2.0 * gap, count=SCENE_ENOUGH + 1)
     assert scene.value == scale
     assert scene.is_final
 
@@ -113,8 +113,8 @@ def test_a_vehicle_at_rest_learns_nothing_more() -> None:
 
 
 def test_a_scale_that_is_final_does_not_change() -> None:
-    scene = driven(road(0.35, 0.32), speed=2.0, count=ENOUGH)
-    for k in range(2 * ENOUGH):
+    scene = driven(road(0.35, 0.32), speed=2.0, count=SCENE_ENOUGH)
+    for k in range(2 * SCENE_ENOUGH):
         odometry = Odometry(np.array([3.0 + k]), np.array([[10.0, 0.0, 0.0]]))
         scene.see(odometry, replace(road(3.5, 3.2), t=4.0 + k))
     assert (scene.value, scene.is_final) == (0.1, True)
@@ -122,7 +122,7 @@ def test_a_scale_that_is_final_does_not_change() -> None:
 
 def test_a_scene_without_a_road_is_taken_as_one_of_scale_one_in_the_end() -> None:
     one_side = road(0.35, 0.32).where(np.arange(10) < 5)
-    scene = driven(one_side, speed=2.0, count=PATIENCE - 1)
+    scene = driven(one_side, speed=2.0, count=SCENE_PATIENCE - 1)
     assert not scene.is_final
     scene.see(STANDING, one_side)
     assert (scene.value, scene.is_final) == (1.0, True)
@@ -336,8 +336,8 @@ def test_the_smoothed_drive_has_the_size_of_the_scene() -> None:
     one, ten = (FixedLagMapper(MapperSettings(scale=s)) for s in (1.0, 10.0))
     t = np.array([log.cycles[0].t])
     for mapper in (one, ten):
-        mapper.loop.record.stamps[:] = t.tolist()
-        mapper.loop.corrected_poses = np.array([[2.0, 3.0, 0.5]])
+        mapper.drive.record.stamps.append(float(t[0]))
+        mapper.drive.record.corrected = np.array([[2.0, 3.0, 0.5]])
     np.testing.assert_allclose(one.smoothed(t), [[2.0, 3.0, 0.5]])
     np.testing.assert_allclose(ten.smoothed(t), [[20.0, 30.0, 0.5]])
 
@@ -467,5 +467,5 @@ def test_a_diagnosis_of_a_small_scene_is_by_the_prior_at_scale_one() -> None:
         sensor_sigma=np.full(5, 1e-3),
     )
     assert measured_line(noise, 0.1).endswith(
-        "detections 0.02 m along and 0.02 m across the ray at 1 m; 0.02 m too far to the left"
+        "detections 0.02 m along and 0.02 m across the ray at 1 m; the sensor sits 0.02 m too far to the left"
     )

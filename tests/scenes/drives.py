@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, RIGHT
@@ -21,6 +21,9 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings, drive, integrate
+
+from ..oracles.copied import copied
+from .session import once, pickled, unpickled
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -127,6 +130,18 @@ def noisy(log: Log, seed: int, sigma: float = 0.1) -> Log:
     return replace(log, cycles=cycles)
 
 
+@cache
+def exact_lap() -> Log:
+    """A lap and 45 m of the small track, in which the loop closes."""
+    return lap_log(bean_track(), overrun=45.0)
+
+
+@cache
+def noisy_lap() -> Log:
+    """A lap and 40 m of the small track with noise on the detections."""
+    return noisy(lap_log(bean_track(), overrun=40.0), seed=3)
+
+
 Mapped = tuple[FixedLagMapper, list[CycleResult]]
 """A mapper, and what it said after each cycle."""
 
@@ -147,7 +162,24 @@ def _beginning_of(log: Log, cycles: int, settings: MapperSettings | None) -> Map
 def map_beginning(log: Log, cycles: int, settings: MapperSettings | None = None) -> Mapped:
     """A copy of a mapper after the first cycles of a log that a scene keeps, which is mapped once."""
     mapper, results = _beginning_of(log, cycles, settings)
-    return copied(mapper, {}), [*results]
+    return copied(mapper), [*results]
+
+
+def mapped(log: Log) -> Mapped:
+    """A copy of a mapper after a log, which is mapped once a session, and what it said."""
+    mapper, results = once(lambda: map_log(log), "online", log, write=_save, read=_restore)
+    return copied(mapper), [*results]
+
+
+def _save(run: Mapped, folder: Path) -> None:
+    folder.mkdir()
+    mapper, results = run
+    mapper.save(folder / "mapper.snap")
+    pickled(results, folder / "results")
+
+
+def _restore(folder: Path) -> Mapped:
+    return FixedLagMapper.restore(folder / "mapper.snap"), unpickled(folder / "results")
 
 
 def replay(mapper: FixedLagMapper, odometry: Odometry, detections: Detections) -> CycleResult:

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors._kernels import odometry_residuals
 from pathspace_graph.factors.bspline import SpanPolynomials, uniform_knots
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.gtsam_factors import (
@@ -18,7 +19,7 @@ from pathspace_graph.factors.gtsam_factors import (
     spline_projection_factors,
 )
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists, odometry_residuals
+from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
 from pathspace_graph.factors.residuals import greville, pair_residuals, project, smoothness_matrix
 from pathspace_graph.factors.se2 import compose, rotation, to_map
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE

@@ -15,7 +15,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.spline.ahead import CurveAhead, check_line, track_ahead
 from pathspace_graph.spline.bspline import BSpline
 
-from ..scenes.drives import bean_track, lap_log, noisy
+from ..scenes.drives import noisy_lap
 
 Array = NDArray[np.float64]
 
@@ -150,14 +150,15 @@ def test_lengths_out_of_range_are_refused(distance: float, step: float, message:
 
 def test_a_drive_sees_its_centre_line_and_is_not_changed_by_looking() -> None:
     """In each tenth cycle the line is that of the whole outline, on the open map and on the closed one."""
-    log = noisy(lap_log(bean_track(), overrun=60.0), 0)
+    log = noisy_lap()
     looked = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     compared = {False: 0, True: 0}
     for cycle, (odometry, detections) in enumerate(split_odometry(log)):
+        looked.wait()
         looked.update(odometry, detections)
-        before = looked.smoother.variables.values.copy()
+        before = looked.road.smoother.variables.values.copy()
         ahead = looked.ahead(15.0)
-        assert np.array_equal(looked.smoother.variables.values, before)
+        assert np.array_equal(looked.road.smoother.variables.values, before)
         if cycle % 10 or len(ahead.points) < 2:
             continue
         pose = np.tile(looked.poses[-1], (len(ahead.points), 1))

@@ -8,7 +8,7 @@ import pytest
 from pathspace_graph.eval.metrics.accuracy import closest_points
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import SMOOTHNESS, chosen_breaks, energy_rows, fit_spline, thin
+from pathspace_graph.spline.knots import ENERGY_WEIGHT, chosen_breaks, energy_rows, fit_spline, thin
 
 DEGREE = 3
 
@@ -54,7 +54,7 @@ def test_the_price_of_a_knot_is_what_the_fit_loses() -> None:
 def sum_of_squares(points: Array, u: Array, breaks: Array) -> float:
     """What `thin` minimizes, bending included."""
     frame = BSpline.clamped_from(breaks, np.zeros((len(breaks) + 2, 2)), 3)
-    stacked = np.concatenate([frame.basis_matrix(u), np.sqrt(SMOOTHNESS) * energy_rows(frame)])
+    stacked = np.concatenate([frame.basis_matrix(u), np.sqrt(ENERGY_WEIGHT) * energy_rows(frame)])
     target = np.concatenate([points, np.zeros((len(stacked) - len(points), 2))])
     solution = np.linalg.lstsq(stacked, target, rcond=None)[0]
     return float(((stacked @ solution - target) ** 2).sum())

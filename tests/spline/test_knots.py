@@ -176,7 +176,7 @@ def test_curvature_weighted_knots_fit_a_hairpin_better_than_equal_ones(
         return float(np.mean([np.sqrt(np.mean(each.foot_points(points).distance ** 2)) for each in fitted]))
 
     by_curvature = mean_rmse()
-    monkeypatch.setattr(knots, "ROUNDS", 0)
+    monkeypatch.setattr(knots, "KNOT_ROUNDS", 0)
     assert by_curvature < 0.4 * mean_rmse()
 
 

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from pathspace_graph.baselines import ckf_curves as expansion
 from pathspace_graph.baselines.ckf_curves import CurveState, Expansion, beyond_end, proximity_chain
-from pathspace_graph.baselines.filters import REACH
+from pathspace_graph.baselines.filters import FILTER_REACH
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.belief import Belief
 from pathspace_graph.mapping.path import CARRIED_TO, DrivenPath, PathAhead
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 
+from ...scenes.digest import digest
 from .scenes import detections_of, straight_rows
 
 Array = NDArray[np.float64]
@@ -29,7 +30,7 @@ def path_along_x(x: float, settings: MapperSettings) -> PathAhead:
     path = DrivenPath()
     for at in np.arange(0.0, x + 0.25, 0.5):
         path.update(np.array([at, 0.0, 0.0]))
-    return path.ahead(np.array([x, 0.0, 0.0]), REACH)
+    return path.ahead(np.array([x, 0.0, 0.0]), FILTER_REACH)
 
 
 def expanded(
@@ -77,7 +78,7 @@ def test_the_curve_is_extended_to_the_last_point_of_the_chain() -> None:
 
 
 def test_a_long_extension_takes_a_point_between(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(expansion, "STRETCH", 5.0)
+    monkeypatch.setattr(expansion, "LONGEST_EXTENSION", 5.0)
     state = straight_rows()
     expanded(state, np.array([[18.5, 2.0], [16.5, 2.0]]))
     assert state.curves[LEFT].size == 6
@@ -142,3 +143,17 @@ def test_each_confirmed_cone_is_observed_once() -> None:
     _, expansion = expanded(straight_rows(), np.array([[16.5, 2.0], [18.5, 2.0]]), times=6)
     assert len(expansion.observed[LEFT]) == 2 and len(expansion.observed[RIGHT]) == 0
     np.testing.assert_allclose(np.sort(np.array(expansion.observed[LEFT])[:, 0]), [16.5, 18.5], atol=1e-9)
+
+
+def test_what_is_observed_later_is_not_in_a_copy() -> None:
+    state = straight_rows()
+    _, expansion = expanded(state, np.array([[16.0, 2.0]]))
+    copy = expansion.copy()
+    before = digest(copy)
+    assert before == digest(expansion)
+    seen = detections_of(np.array([[6.0, 2.0], [10.0, 2.0]]))
+    for k in range(3):
+        expansion.observe(state, replace(seen, t=0.5 + 0.1 * k))
+    free, path_ahead = np.zeros(0, bool), path_along_x(30.0, state.settings)
+    assert LEFT in expansion.expand(state, detections_of(np.zeros((0, 2))), path_ahead, free)
+    assert digest(copy) == before and len(expansion.observed[LEFT]) > len(copy.observed[LEFT])

@@ -10,8 +10,8 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from pathspace_graph.baselines.landmark_association import (
-    GATES,
-    Gates,
+    CREATE_GATE,
+    MATCH_GATE,
     associate,
     associate_created,
     associate_newest,
@@ -35,41 +35,41 @@ Array = NDArray[np.float64]
 
 def test_gates_are_those_of_two_degrees_of_freedom() -> None:
     """`P(d^2 < x) = 1 - exp(-x / 2)`."""
-    assert pytest.approx(-2.0 * np.log(0.05)) == GATES.match
-    assert pytest.approx(-2.0 * np.log(0.01)) == GATES.create
+    assert pytest.approx(-2.0 * np.log(0.05)) == MATCH_GATE
+    assert pytest.approx(-2.0 * np.log(0.01)) == CREATE_GATE
 
 
 def test_the_assignment_is_the_best_of_all_not_that_of_each_detection() -> None:
     cost = np.array([[1.0, 2.0], [1.5, 5.5]])  # greedy would take 1.0 and leave 5.5
-    np.testing.assert_array_equal(associate(cost, GATES)[0], [1, 0])
+    np.testing.assert_array_equal(associate(cost)[0], [1, 0])
 
 
 def test_a_bad_pair_is_not_taken_to_save_another() -> None:
     cost = np.array([[0.5, 50.0], [0.1, 50.0]])
-    landmark, _ = associate(cost, GATES)
+    landmark, _ = associate(cost)
     np.testing.assert_array_equal(landmark, [UNASSOCIATED, 0])
 
 
 def test_a_detection_between_the_gates_is_neither_associated_nor_new() -> None:
-    between = 0.5 * (GATES.match + GATES.create)
-    landmark, is_new = associate(np.array([[between, 99.0], [99.0, 99.0], [99.0, 1.0]]), GATES)
+    between = 0.5 * (MATCH_GATE + CREATE_GATE)
+    landmark, is_new = associate(np.array([[between, 99.0], [99.0, 99.0], [99.0, 1.0]]))
     np.testing.assert_array_equal(landmark, [UNASSOCIATED, UNASSOCIATED, 1])
     np.testing.assert_array_equal(is_new, [False, True, False])
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0)])
 def test_there_pairs_no_detections_or_no_landmarks(shape: tuple[int, int]) -> None:
-    landmark, is_new = associate(np.zeros(shape), GATES)
+    landmark, is_new = associate(np.zeros(shape))
     np.testing.assert_array_equal(landmark, np.full(shape[0], UNASSOCIATED))
     assert is_new.all()
 
 
 @given(arrays(float, (4, 5), elements=st.floats(0.0, 20.0) | st.just(np.inf)))
 def test_it_is_one_to_one_and_inside_the_gate(cost: Array) -> None:
-    landmark, is_new = associate(cost, GATES)
+    landmark, is_new = associate(cost)
     matched = np.flatnonzero(landmark != UNASSOCIATED)
     assert len(np.unique(landmark[matched])) == len(matched)
-    assert (cost[matched, landmark[matched]] < GATES.match).all()
+    assert (cost[matched, landmark[matched]] < MATCH_GATE).all()
     assert not is_new[matched].any()
 
 
@@ -79,11 +79,11 @@ def test_an_unknown_label_is_compatible_with_both() -> None:
 
 
 def test_a_held_pair_stays_as_long_as_it_passes_the_wide_gate() -> None:
-    between = 0.5 * (GATES.match + GATES.create)
-    cost = np.array([between, between, GATES.create + 1.0, 1.0])
+    between = 0.5 * (MATCH_GATE + CREATE_GATE)
+    cost = np.array([between, between, CREATE_GATE + 1.0, 1.0])
     held = np.array([True, False, True, True])
-    kept = hysteresis_costs(cost, held, GATES)
-    np.testing.assert_array_equal(kept < GATES.match, [True, False, False, True])
+    kept = hysteresis_costs(cost, held)
+    np.testing.assert_array_equal(kept < MATCH_GATE, [True, False, False, True])
     np.testing.assert_array_equal(kept[1:], cost[1:])
 
 
@@ -103,7 +103,6 @@ def test_distances_are_those_of_the_summed_covariance() -> None:
 
 def test_a_held_pair_is_kept_however_its_assignment_is_summed() -> None:
     """The pair is exactly at the edge of the gate, beside a detection without any landmark, in any order."""
-    gates = Gates(6.0, 9.0)
     cost = np.array([[np.inf, np.inf], [7.0, np.inf]])
     for own, expected in (
         (cost, [UNASSOCIATED, 0]),
@@ -111,7 +110,7 @@ def test_a_held_pair_is_kept_however_its_assignment_is_summed() -> None:
         (cost[:, ::-1], [UNASSOCIATED, 1]),
     ):
         held = np.isfinite(own)
-        assert associate(hysteresis_costs(own, held, gates), gates)[0].tolist() == expected
+        assert associate(hysteresis_costs(own, held))[0].tolist() == expected
 
 
 # --- online ----------------------------------------------------------------------------------------------

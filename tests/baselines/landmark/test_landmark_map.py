@@ -14,6 +14,7 @@ from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, merge_vari
 from pathspace_graph.graph.variables import landmark_keys, sizes
 from pathspace_graph.labels import LEFT, RIGHT
 
+from ...scenes.digest import digest
 from ...scenes.jacobians import assert_jacobians
 from .scenes import CONES, LABELS, QUADRATIC, SPEED, drive_on, driven
 
@@ -109,6 +110,21 @@ def test_a_landmark_has_the_label_of_most_of_its_detections(observed: int) -> No
     assert state.labels[0] == RIGHT  # an equal count changes nothing
     state.vote(np.array([LEFT]), n[[0]])
     assert state.labels[0] == LEFT
+
+
+def test_what_the_smoother_does_leaves_a_copy_of_its_map_as_it_was() -> None:
+    smoother = driven(4)
+    copy = smoother.map.copy()
+    before = digest(copy)
+    assert before == digest(smoother.map) and copy.state.variables is copy.variables
+    drive_on(smoother, 4, (SPEED, 0.1, 0.05))
+    smoother.map.state.vote(LABELS[:1], np.array([0]))
+    smoother.map.detections.take(np.array([0]), np.array([4]))
+    smoother.step()
+    smoother.map.merge(np.array([4]), np.array([0]))
+    smoother.marginalize()
+    assert digest(copy) == before
+    assert len(copy.state) == len(CONES) and len(smoother.map.state) == len(CONES) - 1
 
 
 def _dense(columns: IntArray, jacobian: Array, size: int) -> Array:

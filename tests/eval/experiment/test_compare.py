@@ -11,6 +11,7 @@ import pytest
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.experiment.compare import (
+    Comparison,
     NamedLog,
     choose,
     choose_reference,
@@ -51,6 +52,14 @@ def logs(folder: Path) -> list[NamedLog]:
     return read_logs(folder)
 
 
+@pytest.fixture(scope="module")
+def compared(logs: list[NamedLog]) -> Comparison:
+    """Two estimators on both logs."""
+    with pytest.MonkeyPatch.context() as patch:
+        register(patch)
+        return compare(logs, ["rings", "gaps"], reference="gaps")
+
+
 # --- choice ----------------------------------------------------------------------------------------------
 
 
@@ -60,13 +69,13 @@ def test_estimators_are_those_named_or_all_that_are_known() -> None:
     with pytest.raises(SettingsError, match=r"a known estimator, found 'nothing'$"):
         choose(("nothing",))
     assert choose_reference(None, ("gaps", "rings")) == "gaps"
-    assert choose_reference(None, ("gaps", registry.DEFAULT)) == registry.DEFAULT
+    assert choose_reference(None, ("gaps", registry.DEFAULT_ONLINE)) == registry.DEFAULT_ONLINE
     with pytest.raises(SettingsError, match="--reference"):
         choose_reference("rings", ("gaps",))
 
 
-def test_logs_of_a_folder(folder: Path, tmp_path: Path) -> None:
-    assert [named.name for named in read_logs(folder)] == ["a", "b"]
+def test_logs_of_a_folder(logs: list[NamedLog], folder: Path, tmp_path: Path) -> None:
+    assert [named.name for named in logs] == ["a", "b"]
     assert [named.name for named in read_logs(folder / "a")] == ["a"]
     with pytest.raises(InputError, match="found neither"):
         read_logs(tmp_path)
@@ -104,9 +113,8 @@ def test_a_failure_is_told_and_the_rest_goes_on(logs: list[NamedLog]) -> None:
     assert table.rows[0][:2] == ("broken", "failed")
 
 
-def test_the_paper_s_table_is_the_mean_over_logs(logs: list[NamedLog]) -> None:
-    found = compare(logs, ["rings", "gaps"])
-    frame = paper_frame(found)
+def test_the_paper_s_table_is_the_mean_over_logs(compared: Comparison) -> None:
+    frame = paper_frame(compared)
     assert frame[["estimator", "lap", "logs"]].values.tolist() == [
         ["rings", 1, 2],
         ["rings", 2, 2],
@@ -116,12 +124,12 @@ def test_the_paper_s_table_is_the_mean_over_logs(logs: list[NamedLog]) -> None:
     assert frame["size"].tolist() == [32, 32, 36, 36]
     # of 40 cones the middle one of three on end is more than 3 m away
     assert frame["missed"].tolist() == pytest.approx([0.0, 0.0, 0.075, 0.075])
-    assert paper_table(found).header == ("estimator", "lap", "logs", "rmse [m]", "missed [%]", "size")
-    assert paper_table(found).groups == (2,)
+    assert paper_table(compared).header == ("estimator", "lap", "logs", "rmse [m]", "missed [%]", "size")
+    assert paper_table(compared).groups == (2,)
 
 
-def test_differences_are_paired_over_logs(logs: list[NamedLog]) -> None:
-    found = paired_frame(compare(logs, ["rings", "gaps"], reference="gaps"))
+def test_differences_are_paired_over_logs(compared: Comparison) -> None:
+    found = paired_frame(compared)
     size = found[found["metric"] == "size"].iloc[0]
     assert (size["estimator"], size["reference"], size["pairs"]) == ("rings", "gaps", 2)
     assert (size["mean"], size["low"], size["high"]) == (-4.0, -4.0, -4.0)

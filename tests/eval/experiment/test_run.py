@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 from typing import Any, NoReturn
 
 import numpy as np
@@ -25,6 +26,9 @@ from ...scenes.pretenders import Fragile, Pretender, contents, register, write_r
 
 pytestmark = pytest.mark.usefixtures("png_only")
 
+CALLS = 6
+"""Runs of `pretender` in the study: three settings on two logs."""
+
 
 @pytest.fixture(scope="module")
 def track(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -36,16 +40,33 @@ def pretenders(monkeypatch: pytest.MonkeyPatch) -> None:
     register(monkeypatch)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def study(track: Path) -> Study:
-    return Study(
-        name="small",
-        tracks=(track,),
-        seeds=(0, 1),
-        laps=1,
-        estimators=("pretender", "fragile"),
-        grids=({"lag": [1.0, 2.0]},),
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        register(patch)
+        return Study(
+            name="small",
+            tracks=(track,),
+            seeds=(0, 1),
+            laps=1,
+            estimators=("pretender", "fragile"),
+            grids=({"lag": [1.0, 2.0]},),
+        )
+
+
+@pytest.fixture(scope="module")
+def ran(study: Study, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pd.DataFrame]:
+    """The folder of a finished study, and its frame."""
+    folder = tmp_path_factory.mktemp("ran") / "study"
+    with pytest.MonkeyPatch.context() as patch:
+        register(patch)
+        return folder, run_study(study, folder)
+
+
+@pytest.fixture
+def finished(ran: tuple[Path, pd.DataFrame], tmp_path: Path) -> Path:
+    """A copy of the folder of a finished study."""
+    return copytree(ran[0], tmp_path / "finished")
 
 
 # --- results ---------------------------------------------------------------------------------------------
@@ -72,13 +93,13 @@ def test_a_row_for_every_run_and_lap(study: Study) -> None:
     assert {"python", "gtsam", "numpy", "pathspace-graph", *TIMES} <= set(frame)
 
 
-def test_results_load_into_pandas(study: Study, tmp_path: Path) -> None:
-    frame = run_study(study, tmp_path)
-    write_study(study, frame, tmp_path)
-    loaded = pd.read_csv(tmp_path / "results.csv", keep_default_na=True)
+def test_results_load_into_pandas(study: Study, ran: tuple[Path, pd.DataFrame], finished: Path) -> None:
+    _, frame = ran
+    write_study(study, frame, finished)
+    loaded = pd.read_csv(finished / "results.csv", keep_default_na=True)
     assert list(loaded) == list(without_times(frame))
     np.testing.assert_array_equal(loaded["rmse"], frame["rmse"].astype(float))
-    times = pd.read_csv(tmp_path / "times.csv")
+    times = pd.read_csv(finished / "times.csv")
     merged = loaded.merge(times, on=["study", "track", "seed", "noise", "estimator", "variant", "lap"])
     assert len(merged) == len(frame)
 
@@ -111,10 +132,11 @@ def interrupt_after(cells: int) -> Any:
     return told
 
 
-def test_a_killed_study_goes_on_where_it_was_with_the_same_results(study: Study, tmp_path: Path) -> None:
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    write_study(study, run_study(study, whole), whole)
-    calls = Pretender.calls
+def test_a_killed_study_goes_on_where_it_was_with_the_same_results(
+    study: Study, ran: tuple[Path, pd.DataFrame], finished: Path, tmp_path: Path
+) -> None:
+    killed = tmp_path / "killed"
+    write_study(study, ran[1], finished)
     for cells in (3, 2):
         with pytest.raises(KeyboardInterrupt):
             run_study(study, killed, on_cell=interrupt_after(cells))
@@ -123,52 +145,46 @@ def test_a_killed_study_goes_on_where_it_was_with_the_same_results(study: Study,
     cell = next((killed / "cells").iterdir())
     cell.with_name(".half.tmp.json").write_text("{")
     write_study(study, run_study(study, killed), killed)
-    assert Pretender.calls == 2 * calls
-    first, second = contents(whole), contents(killed)
+    assert Pretender.calls == CALLS
+    first, second = contents(finished), contents(killed)
     for name in ("results.csv", "study.json"):
         assert first[name] == second[name]
 
 
-def test_a_damaged_cell_is_made_again(study: Study, tmp_path: Path) -> None:
-    first = run_study(study, tmp_path)
-    cells = sorted((tmp_path / "cells").iterdir())
+def test_a_damaged_cell_is_made_again(study: Study, ran: tuple[Path, pd.DataFrame], finished: Path) -> None:
+    cells = sorted((finished / "cells").iterdir())
     cells[0].write_text("{")
-    calls = Pretender.calls + Fragile.calls
-    again = run_study(study, tmp_path)
-    assert Pretender.calls + Fragile.calls == calls + 1
-    pd.testing.assert_frame_equal(without_times(first), without_times(again))
+    again = run_study(study, finished)
+    assert Pretender.calls + Fragile.calls == 1
+    pd.testing.assert_frame_equal(without_times(ran[1]), without_times(again))
 
 
 def test_cells_of_other_code_are_run_again_and_counted(
-    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    study: Study, ran: tuple[Path, pd.DataFrame], finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = run_study(study, tmp_path)
-    assert study_run.make_plan(study).stale(tmp_path) == 0
+    _, first = ran
+    assert study_run.make_plan(study).stale(finished) == 0
     monkeypatch.setattr(drives, "code_digest", lambda rooms: "other")
-    calls = Pretender.calls
-    assert study_run.make_plan(study).stale(tmp_path) == len(first)
-    pd.testing.assert_frame_equal(without_times(run_study(study, tmp_path)), without_times(first))
-    assert Pretender.calls == 2 * calls
+    assert study_run.make_plan(study).stale(finished) == len(first)
+    pd.testing.assert_frame_equal(without_times(run_study(study, finished)), without_times(first))
+    assert Pretender.calls == CALLS
 
 
-def test_a_finished_study_runs_nothing(study: Study, tmp_path: Path) -> None:
-    run_study(study, tmp_path)
-    calls = Pretender.calls
-    run_study(study, tmp_path)
-    assert Pretender.calls == calls
+def test_a_finished_study_runs_nothing(study: Study, finished: Path) -> None:
+    run_study(study, finished)
+    assert Pretender.calls == Fragile.calls == 0
 
 
 def test_failed_cells_are_kept_until_they_are_to_be_retried(
-    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    study: Study, finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run_study(study, tmp_path)
-    records = [json.loads(file.read_text()) for file in (tmp_path / "cells").iterdir()]
+    records = [json.loads(file.read_text()) for file in (finished / "cells").iterdir()]
     (failure, *_) = [record for record in records if record["failure"]]
     assert "in update" in failure["traceback"]
     monkeypatch.setattr(Fragile, "broken", False)
-    assert (run_study(study, tmp_path)["failure"] != "").sum() == 2
+    assert (run_study(study, finished)["failure"] != "").sum() == 2
     calls = Fragile.calls
-    assert (run_study(study, tmp_path, retry_failed=True)["failure"] == "").all()
+    assert (run_study(study, finished, retry_failed=True)["failure"] == "").all()
     assert Fragile.calls == calls + 2
 
 
@@ -188,15 +204,14 @@ def test_a_log_that_cannot_be_simulated_fails_its_cells_only(
     assert set(frame[frame["seed"] == 0]["failure"]) == {""}
 
 
-def test_a_folder_of_another_study_is_refused(study: Study, tmp_path: Path) -> None:
-    run_study(study, tmp_path / "mine")
-    before = contents(tmp_path / "mine")
+def test_a_folder_of_another_study_is_refused(study: Study, finished: Path, tmp_path: Path) -> None:
+    before = contents(finished)
     with pytest.raises(OutputError, match=r"laps = 2, found another, with 1"):
-        run_study(replace(study, laps=2), tmp_path / "mine")
+        run_study(replace(study, laps=2), finished)
     with pytest.raises(OutputError, match="varied"):
-        run_study(replace(study, grids=()), tmp_path / "mine")
-    assert contents(tmp_path / "mine") == before
-    run_study(replace(study, question="Why?", metrics=("size",)), tmp_path / "mine")
+        run_study(replace(study, grids=()), finished)
+    assert contents(finished) == before
+    run_study(replace(study, question="Why?", metrics=("size",)), finished)
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "thesis.tex").write_text("mine")
     with pytest.raises(OutputError, match=r"study\.json"):

@@ -18,7 +18,7 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 
-from ...scenes.drives import bean_track, lap_log, noisy
+from ...scenes.drives import noisy_lap
 
 BAND_EVERY = 7
 FILM = FilmSettings(seconds_per_lap=1.0, frames_per_second=10.0, width=300, height=200, hold=0.5)
@@ -41,7 +41,7 @@ class Watched:
 @pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     folder = tmp_path_factory.mktemp("view")
-    log = noisy(lap_log(bean_track(), overrun=35.0), seed=0)
+    log = noisy_lap()
     alone = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
     cycles: list[ObservedCycle] = []
     window: list[int] = []

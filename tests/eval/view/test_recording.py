@@ -118,4 +118,4 @@ def test_the_loop_of_the_page_records_every_cycle(tmp_path: Path) -> None:
     mapper = names["drive"](split_odometry(log), tmp_path / "own.rrd")
     chunks = [chunk for chunk in RrdReader(tmp_path / "own.rrd").stream() if not chunk.is_static]
     recorded = sum(chunk.num_rows for chunk in chunks if chunk.entity_path == f"/{VEHICLE}")
-    assert recorded == len(log.cycles) == mapper.smoother.next_cycle
+    assert recorded == len(log.cycles) == mapper.road.smoother.next_cycle

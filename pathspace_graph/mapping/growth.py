@@ -1,10 +1,11 @@
 """Growth of the open curves through confirmed tentative tracks ahead of their ends (paper: Expansion)."""
 
 from statistics import median
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
@@ -13,7 +14,9 @@ from pathspace_graph.mapping import path
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import SIDES, Candidates, End, PathAhead, chain, crosses
 from pathspace_graph.mapping.smoother import CurveSmoother
+from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
+from pathspace_graph.settings.online import GrowthSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
 NEWEST: Final = 3  # newest cones that, with the end of a curve, say how far it runs beside the path
@@ -26,137 +29,127 @@ LENGTH_DRIVEN: Final = 2.0  # further length for each metre driven, exceeded by 
 class Growth:
     """The tentative tracks of both boundaries, and the curves that begin and grow through them."""
 
-    def __init__(self, smoother: CurveSmoother) -> None:
-        self.settings = smoother.map.settings.growth
-        self.tentative = {label: TentativeTracks(self.settings) for label in BOUNDARIES}  # unexplained cones
-        self.notice = ""  # what is said in the cycle in which a boundary stops growing
-        self._smoother, self._map, self._state = smoother, smoother.map, smoother.map.state
-        self._full: set[int] = set()
+    def __init__(self, settings: GrowthSettings) -> None:
+        self.settings = settings
+        self.tentative = {label: TentativeTracks(settings) for label in BOUNDARIES}  # unexplained cones
+        self._full: frozenset[int] = frozenset()  # boundaries that have stopped growing
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
 
-    def observe(self, new: slice, t: float) -> None:
+    def copy(self) -> Self:
+        """Return tracks that can go on independently."""
+        other = shallow(self)
+        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
+        other._beside = self._beside.copy()
+        return other
+
+    def observe(self, track: CurveMap, new: slice, t: float) -> None:
         """Add the new detections that no curve uses to the tentative tracks, seen at t (s)."""
-        detections, variables = self._map.detections, self._map.variables
+        detections, variables = track.detections, track.variables
         rows = np.arange(new.start, new.stop)
         rows = rows[~detections.used[rows]]
         points = detections.points_map(rows, variables)
         covariances = detections.covariances_map(rows, variables)
         add_by_label(self.tentative, detections.label[rows], points, covariances, t)
 
-    def expand(self, path_ahead: PathAhead) -> frozenset[int]:
-        """Begin or extend each boundary; return the labels of the curves that were extended."""
-        self.notice, grown = "", set()
+    def expand(self, smoother: CurveSmoother, path_ahead: PathAhead) -> tuple[frozenset[int], str]:
+        """Begin or extend each boundary; return the labels of the curves that were extended, and a notice."""
+        full, grown = self._full, set()
         for label in BOUNDARIES:
-            if label not in self._state.boundaries:
-                self._begin(label, path_ahead)
-            elif not self._is_full(label, path_ahead) and self._grow(label, path_ahead):
+            if label not in smoother.map.state.boundaries:
+                self._begin(smoother.map, label, path_ahead)
+            elif not self._is_full(smoother.map, label, path_ahead) and self._grow(
+                smoother, label, path_ahead
+            ):
                 grown.add(label)
-        return frozenset(grown)
+        stopped = sorted(self._full - full)
+        return frozenset(grown), joined(_stopped(smoother.map, label) for label in stopped)
 
     def move(self, motion: Array) -> None:
         for tracks in self.tentative.values():
             tracks.move(motion)
 
     def clear(self) -> None:
-        self.notice = ""
         for tracks in self.tentative.values():
             tracks.clear()
 
-    def _begin(self, label: int, path_ahead: PathAhead) -> None:
+    def _begin(self, track: CurveMap, label: int, path_ahead: PathAhead) -> None:
         """Begin a curve through the first candidates, if there are at least two."""
-        found = self._candidates(label, path_ahead, None)
+        found = self._candidates(track, label, path_ahead, None)
         if len(found.points) < 2:
             return
         u = path_lengths(found.points)
-        boundary = open_boundary(self._map.settings.spline, self._map.settings.gauge)
-        self._state.add_boundary(label, boundary, boundary.grow(np.zeros((0, 2)), u, found.points))
-        self._consume(label, found, u)
-        self._state.locate(label, np.zeros(len(self._state.poses)))
-        self._relocate_poses(label, 0.0)
+        boundary, state = open_boundary(track.settings.spline, track.settings.gauge), track.state
+        state.add_boundary(label, boundary, boundary.grow(np.zeros((0, 2)), u, found.points))
+        self._consume(track, label, found, u)
+        state.locate(label, np.zeros(len(state.poses)))
+        _relocate_poses(state, label, 0.0)
 
-    def _grow(self, label: int, path_ahead: PathAhead) -> bool:
+    def _grow(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> bool:
         """Extend a curve, after it is taken back if its cones are out of order; True if it has changed."""
-        boundary = self._state.boundaries[label]
+        track, boundary = smoother.map, smoother.map.state.boundaries[label]
         kept, self._beside[label] = check_order(boundary, path_ahead, self._beside[label])
         if kept == len(boundary.observed):
-            return self._extend(label, path_ahead, path.END_BEHIND)
-        self._take_back(label, kept)
+            return self._extend(track, label, path_ahead, path.END_BEHIND)
+        self._take_back(smoother, label, kept)
         from_u = boundary.confirmed_end
-        self._extend(label, path_ahead, RECALL)
-        self._relocate_poses(label, from_u)
+        self._extend(track, label, path_ahead, RECALL)
+        _relocate_poses(track.state, label, from_u)
         return True
 
-    def _extend(self, label: int, path_ahead: PathAhead, behind: float) -> bool:
+    def _extend(self, track: CurveMap, label: int, path_ahead: PathAhead, behind: float) -> bool:
         """Extend a curve through all candidates, or carry on a stranded end; True if it has grown.
 
         The end is located on the path from `behind` (m) behind the vehicle on.
         """
-        end = self.end(label, path_ahead, behind)
-        found = self._candidates(label, path_ahead, end)
-        room = self.settings.max_unseen - self._state.boundaries[label].unseen
+        end = end_of(track.state, label, path_ahead, behind)
+        found = self._candidates(track, label, path_ahead, end)
+        room = self.settings.max_unseen - track.state.boundaries[label].unseen
         if len(found.points) and np.hypot(*(found.points[0] - end.position)) < room:
-            self._consume(label, found, self._extend_through(label, end.position, found.points))
+            u = _extend_through(track.state, label, end.position, found.points)
+            self._consume(track, label, found, u)
             return True
         if end.station < path_ahead.driven - path.STRANDED:
-            return self._follow_path(label, path_ahead, end, room)
+            return self._follow_path(track.state, label, path_ahead, end, room)
         return False
 
-    def _follow_path(self, label: int, path_ahead: PathAhead, end: End, room: float) -> bool:
+    def _follow_path(self, state: State, label: int, path_ahead: PathAhead, end: End, room: float) -> bool:
         """Extrapolate an end that was passed, at its distance from the path; True if the curve has grown."""
         side = max(end.side, path.MIN_LATERAL)
         point = path_ahead.beside(path_ahead.driven - path.CARRIED_TO, SIDES[label] * side)
         distance = float(np.hypot(*(point - end.position)))
         if distance > room:
-            self._say_full(label)
+            self._full |= {label}
         if not path.MIN_CARRY <= distance <= room:
             return False
-        self._extend_through(label, end.position, point[None])
+        _extend_through(state, label, end.position, point[None])
         return True
 
-    def _extend_through(self, label: int, end: Array, points: Array) -> Array:
-        """Extend a curve from its end (2,) through points (k, 2); return their parameters (k,)."""
-        boundary, known = self._state.boundaries[label], self._state.control_points(label)
-        u = boundary.confirmed_end + path_lengths(np.concatenate([end[None], points]))[1:]
-        control_points = boundary.grow(known.copy(), u, points)
-        known[:] = control_points[: len(known)]
-        if len(control_points) > len(known):
-            self._state.extend(label, control_points[len(known) :])
-        return np.asarray(u)
-
-    def _take_back(self, label: int, kept: int) -> None:
+    def _take_back(self, smoother: CurveSmoother, label: int, kept: int) -> None:
         """Shorten a curve to its first `kept` cones; the other cones are tentative tracks again."""
-        boundary, detections = self._state.boundaries[label], self._map.detections
-        self.tentative[label].restore(boundary.observed[kept:], self._smoother.times[-1])
+        state, detections = smoother.map.state, smoother.map.detections
+        boundary = state.boundaries[label]
+        self.tentative[label].restore(boundary.observed[kept:], smoother.times[-1])
         boundary.take_back(kept)
-        self._smoother.remove_information(self._state.keys(label)[boundary.settled(boundary.size) :])
+        smoother.remove_information(state.keys(label)[boundary.settled(boundary.size) :])
         rows = detections.used_on(label)
         detections.release(rows[detections.u[rows] > boundary.trusted])
 
-    def _consume(self, label: int, found: Candidates, u: Array) -> None:
+    def _consume(self, track: CurveMap, label: int, found: Candidates, u: Array) -> None:
         """Make candidates part of the curve at u (k,), and put the window's detections of them into use."""
-        detections, boundary = self._map.detections, self._state.boundaries[label]
+        detections, boundary = track.detections, track.state.boundaries[label]
         boundary.add_cones(found.points, u)
         self.tentative[label].remove(found.indices)
         rows = detections.pending(label)
-        points, radius = detections.points_map(rows, self._map.variables), self.settings.merge_radius
+        points, radius = detections.points_map(rows, track.variables), self.settings.merge_radius
         _, near = nearest_within(points, found.points, radius)
         rows, points = rows[near], points[near]
         low = np.full(len(rows), u[0] - radius)
         high = boundary.within_trusted(np.full(len(rows), np.inf))
-        detections.take(rows, label, boundary.find(self._state.control_points(label), points, low, high).u)
-
-    def _relocate_poses(self, label: int, from_u: float) -> None:
-        """Find the poses' parameters again on a curve that was changed from `from_u` on."""
-        boundary, pose_u = self._state.boundaries[label], self._state.pose_u[label].copy()
-        late = pose_u >= from_u
-        poses = self._state.poses[late, :2]
-        low, high = np.full(len(poses), from_u), np.full(len(poses), boundary.confirmed_end)
-        pose_u[late] = boundary.find(self._state.control_points(label), poses, low, high).u
-        self._state.locate(label, pose_u)
+        detections.take(rows, label, boundary.find(track.state.control_points(label), points, low, high).u)
 
     # --- what it grows through ---------------------------------------------------------------------------
 
-    def _candidates(self, label: int, path_ahead: PathAhead, end: End | None) -> Candidates:
+    def _candidates(self, track: CurveMap, label: int, path_ahead: PathAhead, end: End | None) -> Candidates:
         """Return the chain of confirmed tracks within reach, from the end of the curve if there is one."""
         settings, tracks = self.settings, self.tentative[label]
         indices = tracks.confirmed()
@@ -175,11 +168,11 @@ class Growth:
         found = Candidates(points, indices, stations, sides).where(possible)
         if len(found.points) == 0:
             return found
-        found = found.where(undisputed(self._map, label, found.points, settings.merge_radius))
+        found = found.where(undisputed(track, label, found.points, settings.merge_radius))
         found = found.where(np.argsort(found.stations))
         found = found.where(chain(found, end))
         found = found.where(self._certain(label, path_ahead, found))
-        return found if end is None else found.where(self._uncrossed(label, path_ahead, end, found))
+        return found if end is None else found.where(_uncrossed(track.state, label, path_ahead, end, found))
 
     def _certain(self, label: int, path_ahead: PathAhead, found: Candidates) -> IntArray:
         """Return the candidates, by index, up to the first one ahead that is not known well enough.
@@ -192,58 +185,81 @@ class Growth:
         last = int(waiting[0]) if len(waiting) else len(known)
         return np.flatnonzero(known[:last])
 
-    def _uncrossed(self, label: int, path_ahead: PathAhead, end: End, found: Candidates) -> IntArray:
-        """Return the candidates, by index, up to the first that is reached only across a line.
-
-        Lines are the newest stretches of the path driven and of both boundaries, which in a second lap of an
-        open loop run along their first ones.
-        """
-        way = newest(path_ahead, end.station)
-        lines = [way.points[way.stations <= way.driven]]
-        for other, boundary in self._state.boundaries.items():
-            begin = boundary.confirmed_end - RECALL
-            first = int(boundary.cone_parameters.searchsorted(begin))
-            lines.append(boundary.observed[first : -1 if other == label else None])
-        before = end.position
-        for k, point in enumerate(found.points):
-            if any(len(line) > 1 and crosses(before, point[None], line)[0] for line in lines):
-                return np.arange(k)
-            before = point
-        return np.arange(len(found.points))
-
-    def end(self, label: int, path_ahead: PathAhead, behind: float) -> End:
-        """Return the confirmed end of a curve, located on the path from `behind` (m) behind the vehicle on.
-
-        Its distance from the path is the median with the newest cones', so that one wrong cone leads nowhere.
-        """
-        boundary = self._state.boundaries[label]
-        u = np.array([boundary.confirmed_end])
-        position = boundary.evaluate(self._state.control_points(label), u)
-        station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position)
-        side = SIDES[label] * float(lateral[0])
-        if len(boundary.observed) >= NEWEST:
-            _, beside = path_ahead.locate(boundary.observed[-NEWEST:])
-            side = median([*(SIDES[label] * beside).tolist(), side])
-        return End(position[0], float(station[0]), side)
-
-    def _is_full(self, label: int, path_ahead: PathAhead) -> bool:
-        boundary, longest = self._state.boundaries[label], LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
+    def _is_full(self, track: CurveMap, label: int, path_ahead: PathAhead) -> bool:
+        boundary = track.state.boundaries[label]
+        longest = LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
         is_full = boundary.size >= self.settings.max_size or boundary.confirmed_end >= longest
         if is_full:
-            self._say_full(label)
+            self._full |= {label}
         return is_full
 
-    def _say_full(self, label: int) -> None:
-        if label not in self._full:
-            self._full.add(label)
-            boundary = self._state.boundaries[label]
-            notice = Text(
-                "the open {name} boundary grows no further, with {size} control points on {length:.3g} m",
-                name=NAMES[label],
-                size=boundary.size,
-                length=Length(boundary.confirmed_end),
-            )
-            self.notice = joined([self.notice, notice])
+
+def _extend_through(state: State, label: int, end: Array, points: Array) -> Array:
+    """Extend a curve from its end (2,) through points (k, 2); return their parameters (k,)."""
+    boundary, known = state.boundaries[label], state.control_points(label)
+    u = boundary.confirmed_end + path_lengths(np.concatenate([end[None], points]))[1:]
+    control_points = boundary.grow(known.copy(), u, points)
+    known[:] = control_points[: len(known)]
+    if len(control_points) > len(known):
+        state.extend(label, control_points[len(known) :])
+    return np.asarray(u)
+
+
+def _relocate_poses(state: State, label: int, from_u: float) -> None:
+    """Find the poses' parameters again on a curve that was changed from `from_u` on."""
+    boundary, pose_u = state.boundaries[label], state.pose_u[label].copy()
+    late = pose_u >= from_u
+    poses = state.poses[late, :2]
+    low, high = np.full(len(poses), from_u), np.full(len(poses), boundary.confirmed_end)
+    pose_u[late] = boundary.find(state.control_points(label), poses, low, high).u
+    state.locate(label, pose_u)
+
+
+def _uncrossed(state: State, label: int, path_ahead: PathAhead, end: End, found: Candidates) -> IntArray:
+    """Return the candidates, by index, up to the first that is reached only across a line.
+
+    Lines are the newest stretches of the path driven and of both boundaries, which in a second lap of an
+    open loop run along their first ones.
+    """
+    way = newest(path_ahead, end.station)
+    lines = [way.points[way.stations <= way.driven]]
+    for other, boundary in state.boundaries.items():
+        begin = boundary.confirmed_end - RECALL
+        first = int(boundary.cone_parameters.searchsorted(begin))
+        lines.append(boundary.observed[first : -1 if other == label else None])
+    before = end.position
+    for k, point in enumerate(found.points):
+        if any(len(line) > 1 and crosses(before, point[None], line)[0] for line in lines):
+            return np.arange(k)
+        before = point
+    return np.arange(len(found.points))
+
+
+def end_of(state: State, label: int, path_ahead: PathAhead, behind: float) -> End:
+    """Return the confirmed end of a curve, located on the path from `behind` (m) behind the vehicle on.
+
+    Its distance from the path is the median with the newest cones', so that one wrong cone leads nowhere.
+    """
+    boundary = state.boundaries[label]
+    u = np.array([boundary.confirmed_end])
+    position = boundary.evaluate(state.control_points(label), u)
+    station, lateral = path_ahead.since(path_ahead.driven - behind).locate(position)
+    side = SIDES[label] * float(lateral[0])
+    if len(boundary.observed) >= NEWEST:
+        _, beside = path_ahead.locate(boundary.observed[-NEWEST:])
+        side = median([*(SIDES[label] * beside).tolist(), side])
+    return End(position[0], float(station[0]), side)
+
+
+def _stopped(track: CurveMap, label: int) -> Text:
+    """Return the notice of a boundary that has just stopped growing."""
+    boundary = track.state.boundaries[label]
+    return Text(
+        "the open {name} boundary grows no further, with {size} control points on {length:.3g} m",
+        name=NAMES[label],
+        size=boundary.size,
+        length=Length(boundary.confirmed_end),
+    )
 
 
 def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> BoolArray:

@@ -1,0 +1,452 @@
+"""Compiled functions of arrays (`kernels.cpp`); `tests/oracles` has each in numpy, to which tests hold it.
+
+Arrays of shapes that don't fit each other raise ValueError. Limits are tuples, in the order that is told.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Final, Protocol
+
+from .arrays import Array, BoolArray, IntArray
+from .bspline import Spans
+
+COMPILER: Final[str]
+"""Name and version of the compiler that built them."""
+
+class _Layout(Protocol):
+    """What is read of `graph.variables:Layout`."""
+
+    @property
+    def keys(self) -> IntArray: ...
+    @property
+    def widths(self) -> IntArray: ...
+    @property
+    def starts(self) -> IntArray: ...
+    @property
+    def size(self) -> int: ...
+    @property
+    def turning(self) -> IntArray: ...
+    @property
+    def headings(self) -> IntArray: ...
+
+class _Rows(Protocol):
+    """What is read of `graph.rows:Rows`."""
+
+    @property
+    def keys(self) -> IntArray: ...
+    @property
+    def jacobian(self) -> Array: ...
+    @property
+    def residual(self) -> Array: ...
+    @property
+    def owner(self) -> IntArray: ...
+    @property
+    def widths(self) -> tuple[int, ...]: ...
+
+class _Link(Protocol):
+    """What is read of `graph.inactive:Link`."""
+
+    @property
+    def leaving(self) -> _Layout: ...
+    @property
+    def others(self) -> _Layout: ...
+    @property
+    def gain(self) -> Array: ...
+    @property
+    def offset(self) -> Array: ...
+    @property
+    def noise(self) -> Array: ...
+
+_Parts = tuple[IntArray, Array, Array, IntArray]
+"""The fields of `graph.rows:Rows`."""
+_FootPoints = tuple[Array, Array, Array, Array, Array, BoolArray, Array, IntArray, IntArray]
+"""The fields of `factors.footpoint:FootPoints`."""
+_Followed = tuple[Array, IntArray, Array, Array, IntArray]
+"""Place (k, 2) of each cone that is followed, its label (k,), least range, latest stamp and number."""
+_Tracks = tuple[Array, Array, IntArray, Array]
+"""Points (n, 2), information (n, 2, 2), counts of detections (n,) and latest stamps (n,) of tracks."""
+_Cones = tuple[Array, Array, IntArray]
+"""Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
+
+# --- foot points -----------------------------------------------------------------------------------------
+def searched(
+    spans: Spans,
+    control_points: Array,
+    points: Array,
+    curve: IntArray,
+    u_low: Array,
+    u_high: Array,
+    coarse_step: float,
+    iterations: int,
+    tolerances: tuple[float, ...],
+) -> _FootPoints:
+    """Return `footpoint:joint_foot_points`; the tolerances are `TOLERANCES`."""
+
+def refined(
+    spans: Spans,
+    control_points: Array,
+    points: Array,
+    curve: IntArray,
+    u_start: Array,
+    u_low: Array,
+    u_high: Array,
+    iterations: int,
+    safeguarded: int,
+    tolerances: tuple[float, ...],
+) -> _FootPoints:
+    """Return `footpoint:refine_joint_foot_points`; a row that a step leads farther away is searched for.
+
+    Such a search takes `safeguarded` steps at most. The tolerances are `TOLERANCES`.
+    """
+
+# --- detections and odometry -----------------------------------------------------------------------------
+def to_map(points_vehicle: Array, poses: Array) -> Array:
+    """Return `p = R z + t` (m, 2), map frame: points z (m, 2) in the vehicle frames of poses (m, 3)."""
+
+def by_sensor(points_vehicle: Array, twists: Array) -> Array:
+    """Return the derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b.
+
+    z are points_vehicle (m, 2) as measured, in m, and twists (m, 3) are those at their stamps (m/s, m/s,
+    rad/s). With J the quarter turn and `v + wz J z` the motion relative to a point at rest, the columns are
+
+        J z (yaw),   (0, 1) (lateral),   -(v + wz J z) (latency),   -z (range scale),   -z / |z| (range bias)
+
+    The second order is left out: a yaw of 2 degrees shifts a detection at 15 m by 9 mm beside that.
+    """
+
+def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
+    """Return `z + C b` (m, 2) of detections z (m, 2), with C of `by_sensor` and a calibration b (5,)."""
+
+def detection_rows(
+    points_map: Array,
+    covariances: Array,
+    poses: Array,
+    normals: Array,
+    distances: Array,
+    basis: Array,
+    measured: Array,
+    twists: Array,
+    sensor: Array,
+    sigma_model: float,
+) -> tuple[Array, Array, Array]:
+    """Return `r = n . (p - S(u))` (m,) with u the foot point of p, their sigmas (m,), and derivatives.
+
+    normals n (m, 2), distances r (m,) and basis beta (m, p + 1) are of the foot points, and sigmas those of
+    `residuals:sigma_across`. At an interior foot point every term through u vanishes, so with J the quarter
+    turn and a = p - t the arm from the pose,
+
+        dr/dt = n,   dr/dtheta = n . (J a),   dr/dc_j = -beta_j(u) n
+
+    Residuals and derivatives (m, 3 + 5 + 2 p + 2), by [pose | sensor | controls], are multiplied by the
+    factor of `sensor:sensor_rows`, where the detections were measured at (m, 2), vehicle frame, with twists
+    (m, 3), and the sensor's calibration (5,) is not empty.
+    """
+
+def station_rows(
+    points_map: Array,
+    covariances: Array,
+    poses: Array,
+    value: Array,
+    slope: Array,
+    control: Array,
+    measured: Array,
+    twists: Array,
+    sensor: Array,
+    sigma_station: Array,
+) -> tuple[Array, Array, Array]:
+    """Return `r = t . (p - S(u))` (m,) along the tangent t at stations u, their sigmas (m,), and derivatives.
+
+    A station is the parameter of a cone on its curve. value and slope (m, p + 1) are the basis and its
+    derivative there, control (m, p + 1, 2) the control points that they weigh, and sigma_station (m,) the
+    standard deviations of the cones along the curve, in m. With the normal n and the speed |S'|,
+
+        dr/dp = t,   dr/dc_j = -beta_j(u) t + n . (p - S) beta'_j(u) / |S'| n
+
+    The rest is as in `detection_rows`.
+    """
+
+def integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, Array, Array]:
+    """Return end pose (3,), covariance (3, 3) and calibration derivative (3, 2) of `integrate_twists`."""
+
+def whitener(covariance: Array, least: float) -> Array:
+    """Return lower triangular W (3, 3) with `W' W` the inverse of a covariance (3, 3) plus `least^2`."""
+
+def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> tuple[Array, Array, Array]:
+    """Return `r = Log(delta^-1 start^-1 end)` (m, 3), and its Jacobians (m, 3, 3) by start and end.
+
+    It is the residual of GTSAM's BetweenFactorPose2, a tangent in the frame of the end (m, m, rad). Poses
+    (m, 3) are in the map frame, deltas (m, 3) in the frame of the start. The Jacobians are by (x, y, theta)
+    in the map frame.
+    """
+
+def whitened_odometry(
+    poses_start: Array,
+    poses_end: Array,
+    deltas: Array,
+    whiteners: Array,
+    by_calibration: Array,
+    calibration: Array,
+) -> tuple[Array, Array]:
+    """Return `W (r + G b)` (m, 3) with r of `odometry_residuals`, and its derivatives (m, 3, 8).
+
+    W (m, 3, 3) are whiteners, and G (m, 3, 2) derivatives by the calibration b (2,). The result's
+    derivatives are by [b | start | end].
+    """
+
+# --- layouts and rows ------------------------------------------------------------------------------------
+def laid_out(
+    keys: IntArray, sensor_key: int, first_pose: int, sizes: tuple[int, int, int], bounds: IntArray
+) -> tuple[IntArray, IntArray, int, list[int]]:
+    """Return the widths (k,) and the first columns (k,) of variables, and their number of columns.
+
+    The sizes are those of a point, of the sensor's calibration, and of a pose. The last result has the column
+    from which on the variables have keys of at least each of the bounds.
+    """
+
+def spread(starts: IntArray, widths: IntArray) -> IntArray:
+    """Return the columns (n,) of blocks (k,) with these first columns and widths, one after the other."""
+
+def columns_of(layout: _Layout, rows: _Rows) -> IntArray:
+    """Return the column (m, n) of each derivative of rows, which is -1 where a key is not in the layout."""
+
+def moved_residual(layout: _Layout, rows: _Rows, change: Array) -> Array:
+    """Return `r - J c` (m,) with c the change (n,) of a layout's variables; ValueError for rows on others."""
+
+def block_of(layout: _Layout, groups: Sequence[_Rows]) -> tuple[IntArray, Array]:
+    """Return the places (h,) of the variables that rows hold, and `[J -r]` (m, n + 1) on them, by columns.
+
+    ValueError where rows hold variables that the layout does not.
+    """
+
+def owners_holding(rows: _Rows, ascending: IntArray) -> IntArray:
+    """Return the owners of rows that hold any of some ascending keys."""
+
+def parted(rows: _Rows, gone: IntArray) -> tuple[_Parts, _Parts]:
+    """Return the parts of rows without those of some ascending owners, and the parts of the latter."""
+
+def replaced(rows: _Rows, gone: IntArray, fresh: _Rows, layout: _Layout, change: Array) -> _Parts:
+    """Return the parts of rows without those of some ascending owners, and then those of fresh rows.
+
+    The fresh ones are linearized where a layout's unknowns are `change` (n,). ValueError for rows on others.
+    """
+
+def summed(
+    layout: _Layout, factors: list[tuple[IntArray, Array]], groups: Sequence[_Rows], change: Array
+) -> tuple[Array, Array]:
+    """Return the lower triangle of H (n, n), by columns, and the negative gradient (n,), at `change` (n,).
+
+    They are sums over factors with `[[L, g], [g', f]]` and over rows `J d + r`, on variables of a layout.
+    """
+
+# --- frames of poses -------------------------------------------------------------------------------------
+def relative_block(
+    root: Array, right: Array, local: Array, values: Array, change: Array, keys: _Layout
+) -> Array:
+    """Return `[J | J d - r]` (r, q + 4), by columns, with derivatives J and residuals r of a relative factor.
+
+    The values (q + 3,) and the unknowns d, which are `change` (q + 3,) now, are those of its variables and
+    then of the frame.
+    """
+
+def link_means(
+    values: Array, links: Sequence[_Link], frames: IntArray, leaving: IntArray, others: IntArray
+) -> Array:
+    """Return all values (n,), with the inactive variables at their conditional means, newest link first.
+
+    The columns are those of `InactiveChain._columns`.
+    """
+
+def origin_by_active(
+    values: Array, links: Sequence[_Link], frames: IntArray, leaving: IntArray, others: IntArray, origin: int
+) -> tuple[Array, Array]:
+    """Return the derivative (3, n) of the origin's pose by the active variables, and its covariance (3, 3).
+
+    Each link, oldest first, replaces its variables y by `from(G to(z, f) + e + N w, f)` in its frame f, with
+    w of unit covariance. The covariance is given the active variables; `origin` is the column of its pose.
+    """
+
+# --- front end -------------------------------------------------------------------------------------------
+def usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tuple[BoolArray, BoolArray]:
+    """Return which points (m, 2) are where a sensor sees, and which covariances (m, 2, 2) are possible.
+
+    The limits are those of the range, MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA and MAX_SIGMA.
+    """
+
+def followed(
+    begins: IntArray,
+    stamps: Array,
+    places: Array,
+    points: Array,
+    labels: IntArray,
+    ranges: Array,
+    along: Array,
+    across: Array,
+    cones: _Followed,
+    count: int,
+    limits: tuple[float, float, float],
+) -> tuple[IntArray, _Followed, int]:
+    """Return the number (m,) of the cone of each detection, or -1, the cones then, and their count so far.
+
+    Detections at points (m, 2) have gates along and across their rays (m,), and begin at `begins` (c + 1,) in
+    cycles at times (c,) and places (c, 2). The limits are `MAX_AGE` and `FOLLOWING`.
+    """
+
+def matched(
+    recent: Array,
+    points_vehicle: Array,
+    variances: Array,
+    start: Array,
+    reaches: Sequence[float],
+    limits: tuple[float, ...],
+) -> tuple[Array, Array, BoolArray, float]:
+    """Return the pose (3,) of `match`, and information (3, 3), matches (m,) and cost of its last step."""
+
+def weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
+    """Return means (m, 2) of recent points by `exp(-d^2 / 2 reach^2)`, and the sums of weights."""
+
+def off_prediction(
+    pose: Array, information: Array, excess: float, predicted: Array, covariance: Array
+) -> tuple[Array, Array]:
+    """Return how far a match, of variance times `excess`, is off a prediction, and its covariance."""
+
+def squared(off: Array, covariance: Array, shifts: Array, errors: Array) -> float:
+    """Return `d' (K + S P S')^-1 d` of an offset d (3,) with K (3, 3), S (3, 2) and P (2, 2)."""
+
+def learned(
+    mean: Array, errors: Array, drift: Array, off: Array, covariance: Array, shifts: Array, share: float
+) -> tuple[Array, Array]:
+    """Return mean (2,) and covariance (2, 2) of the errors after a measurement that counts by a share."""
+
+def by_constants(
+    seen: Array, twists: Array, poses: Array, by_bias: Array, first: IntArray, bends_from: float
+) -> Array:
+    """Return the derivatives (n, 2, 7) of sightings at points (n, 2), vehicle frame, in the map frame.
+
+    They are by the constants (`PRIOR`). The bias of the yaw rate counts from each cone's first sighting, at
+    rows (n,): before, it turns all of the cone's alike.
+    """
+
+def centred(
+    begins: IntArray, information: Array, columns: Array, points: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return columns A (n, 2, 7) and points p (n, 2) less each cone's weighted mean, and its sums.
+
+    Those are `A' W A` (c, 7, 7) and `A' W p` (c, 7), with information W (n, 2, 2) of the sightings of cones
+    that begin at rows (c,).
+    """
+
+def references(
+    cone: IntArray, t: Array, ranges: Array, weight: Array, values: Array, sought: tuple[float, float]
+) -> tuple[IntArray, IntArray, Array]:
+    """Return the rows (k,) of sightings with two references or more, their counts, and means (k, 1 + q).
+
+    References of a sighting (n,) are those of its cone within a share of its range and a time of it (s). The
+    weighted means over them are of the time to them and of values (n, q).
+    """
+
+# --- curves ----------------------------------------------------------------------------------------------
+def placed(
+    rows: IntArray,
+    cycles: IntArray,
+    measured: Array,
+    twists: Array,
+    poses: Array,
+    first_cycle: int,
+    sensor: Array,
+) -> Array:
+    """Return `DetectionColumns.points_map` of some rows, by the poses (P, 3) from `first_cycle` on."""
+
+def open_rows(
+    labels: IntArray, since: IntArray, label: IntArray, boundary: IntArray, used: BoolArray, unknown: int
+) -> tuple[IntArray, IntArray]:
+    """Return `DetectionTable.open_to` for a table with these columns."""
+
+def in_view(
+    spans: Spans,
+    control_points: Array,
+    trusted: Array,
+    points: Array,
+    curve: IntArray,
+    slot: IntArray,
+    pose_u: list[Array],
+    pose: Array,
+    rooms: tuple[float, float, float, float],
+    step: float,
+    iterations: int,
+    tolerances: tuple[float, ...],
+) -> tuple[_FootPoints, list[tuple[float, float, float]]]:
+    """Return the foot points of detections at points (m, 2), each on its curve (m,) beside its pose (m,).
+
+    The poses have parameters (P,) on each of the curves. The second result has, for each curve, the parameter
+    of the newest pose (3,), the cosine of its angle with the curve, and its distance; it is near the pose
+    before it. The rooms are those behind and ahead of a detection's pose, and of the newest one.
+    """
+
+def gated(
+    rows: IntArray,
+    cycle: IntArray,
+    label: IntArray,
+    covariances: Array,
+    poses: Array,
+    first_cycle: int,
+    foot: tuple[Array, Array, BoolArray],
+    limits: tuple[float, float, float, float, float, int],
+) -> tuple[Array, BoolArray, BoolArray]:
+    """Return the variance (m,) of each detection by row, whether its curve accepts it, or else may do so.
+
+    The foot points have normals (m, 2), distances (m,) and whether they are interior (m,). The limits are
+    the sigma of the model, the least sigma, the largest distance, both gates in sigmas, and `UNKNOWN`.
+    """
+
+def curve_rows(
+    spans: Spans,
+    curves: tuple[Array, IntArray, IntArray, Array, Array],
+    table: tuple[Any, ...],
+    cycles: IntArray,
+    poses: Array,
+    first_cycle: int,
+    sensor: Array,
+    limits: tuple[float, int, int, float, float],
+    names: tuple[int, int],
+    tolerances: tuple[float, ...],
+) -> tuple[IntArray, Array, bool, _Parts]:
+    """Return detections by row, their refined parameters (m,), and the parts of `CurveMap.rows`.
+
+    The third result says whether one has slid to where a curve is inactive. Curves have control points
+    (n, 2), labels (k,), keys (n,), and parameters (k,) up to which and from which on they may be used. The
+    table has the columns of `DetectionTable.associated`.
+    """
+
+def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array, Array]:
+    """Return the station (m,) and signed distance (m,), left positive, of points (m, 2) beside a polyline.
+
+    The polyline has at least two positions (n, 2) with stations (n,). Beyond the last position the station
+    continues along the last segment.
+    """
+
+# --- cones -----------------------------------------------------------------------------------------------
+def merged(
+    known: _Tracks, points: Array, covariances: Array, t: float, gate: tuple[float, float, float]
+) -> _Tracks:
+    """Return the columns of tracks with detections added as `TentativeTracks.add` does.
+
+    The gate is a radius (m), its multiple within which smeared detections are tested, and their sigmas.
+    """
+
+def merged_in_turn(points: Array, covariances: Array, gate: tuple[float, float, float]) -> _Tracks:
+    """Return the columns of tracks to which detections (m, 2) are added one after another."""
+
+def laid(
+    seen: _Cones,
+    known: _Cones,
+    views: Array,
+    mean: Array,
+    prior: Array,
+    reach: tuple[float, float],
+    limits: tuple[float, ...],
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the places where seen cones may lie, as `constellation:lay` compares them.
+
+    They are poses (m, 3), the information (m, 3, 3) about each from the cones that lie on others, the sum
+    (m,) of the capped squares of the cones in view, their number (m,), and the square (m,) of the way from
+    the mean.
+    """

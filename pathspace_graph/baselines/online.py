@@ -1,0 +1,64 @@
+"""What the online baselines share: the front end that the mapper has too, the scale, and the map's metres."""
+
+from abc import abstractmethod
+from typing import Self
+
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.front_end.front_end import FrontEnd, Reading
+from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.io.map import Map
+from pathspace_graph.io.results import RunNoise
+from pathspace_graph.lengths import scaled
+from pathspace_graph.mapping.motion import known_noise
+from pathspace_graph.run import CycleResult, Stopwatch
+from pathspace_graph.settings.mapper import MapperSettings, known_settings
+
+
+class OnlineBaseline:
+    """Online estimator whose subclass maps the readings of the front end, at scale 1.
+
+    `odometry_sigma` (3,) is the standard deviation of a twist reading (m/s, m/s, rad/s).
+    """
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        self.settings = known_settings(settings)
+        self.scale = self.settings.scale or 1.0
+        self.front_end = FrontEnd(self.settings, known_noise(odometry_sigma, self.scale), self.scale)
+        self._begin()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Make what only this estimator has."""
+
+    def copy(self) -> Self:
+        """Return an estimator that goes on independently; what is only ever replaced is shared."""
+        other = shallow(self)
+        other.front_end = self.front_end.copy()
+        return other
+
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        watch = Stopwatch()
+        cycle = self.front_end.admit(odometry, detections)
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
+        return cycle.counted(self._process(reading, watch))
+
+    @abstractmethod
+    def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
+        """Map a cycle."""
+
+    @abstractmethod
+    def _map(self, with_covariance: bool) -> Map:
+        """Return a copy of the map at scale 1."""
+
+    def map(self) -> Map:
+        return scaled(self._map(True), self.scale)
+
+    def outline(self) -> Map:
+        return scaled(self._map(False), self.scale)
+
+    def noise_used(self) -> RunNoise:
+        return scaled(self.front_end.noise_used, self.scale)

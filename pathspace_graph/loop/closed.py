@@ -1,0 +1,111 @@
+"""The closed map: it is localized on, refined, and repaired where cones contradict it."""
+
+from collections.abc import Mapping
+from typing import Self
+
+from pathspace_graph.copies import shallow
+from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.health import DEGRADED, GOOD, LOST, Health
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.road import Classified, Road
+from pathspace_graph.mapping.state import SAMPLE
+from pathspace_graph.spline.boundary import boundaries_cross
+from pathspace_graph.spline.bspline import BSpline
+
+from .closing import hold_gauge
+from .drive import Drive, Phase, Step
+from .known_loop import KnownLoop, evidence_of
+from .lap_solver import Outcome
+from .lost import Lost
+from .map_repair import MapRepair
+from .worker import Unsolved
+
+
+class Closed:
+    """A closed map, and what may have to be done about it."""
+
+    uses_detections = True
+
+    def __init__(self, road: Road, drive: Drive) -> None:
+        """Begin where the curves have just been closed."""
+        self.map_repair = MapRepair(road.settings)
+        self.known_loop = KnownLoop()
+        self._boundaries_cross = _crosses(road, drive)
+        self._settled = road.path.length  # path (m) when the map was last replaced
+        road.growth.clear()
+
+    def copy(self) -> Self:
+        """Return a phase that can go on independently."""
+        other = shallow(self)
+        other.map_repair = self.map_repair.copy()
+        other.known_loop = shallow(self.known_loop)
+        return other
+
+    def judge(
+        self, road: Road, drive: Drive, classified: Classified, reading: Reading
+    ) -> tuple[Phase, Health]:
+        """Judge the estimate and the map by the tested detections; a vehicle may be lost from here on."""
+        smoother, is_whole = road.smoother, set(road.boundaries) == set(BOUNDARIES)
+        known = self.known_loop if is_whole else None
+        health = drive.monitor.update(evidence_of(smoother, classified.tested, known, reading))
+        if health.condition == GOOD and self._boundaries_cross:
+            health = Health(DEGRADED, "the two boundaries of the map cross")
+        if is_whole and drive.record.unsolvable is None:
+            loop = self.known_loop.of(smoother)
+            self.map_repair.contradictions.observe(smoother.map, loop, classified.new, reading.detections.t)
+        if health.condition != LOST or not is_whole or drive.solver.is_busy:
+            return self, health
+        smoother.map.detections.release_all()  # the map stays as it was before
+        self.map_repair.contradictions.clear()
+        drive.record.give_up("the vehicle was lost")
+        return Lost(self, road, health), health
+
+    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
+        """Hold the gauge after enough laps, repair the map, and go on from the batch of the repair."""
+        drive.record.estimated(road)
+        if drive.rests(road):
+            return Step(self)
+        if drive.solver.is_busy:
+            outcome = drive.outcome(road, spent)
+            return Step(self) if outcome is None else self.take(road, drive, outcome)
+        self._hold_gauge(road)
+        self._repair(road, drive, reading)
+        return Step(self)
+
+    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
+        """Go on from a repaired map that explains the contradictions, and is no worse otherwise."""
+        solved = None if isinstance(outcome, Unsolved) else outcome
+        notice = self.map_repair.end(solved)
+        if solved is None or not notice or _crosses(road, drive, solved.splines) > self._boundaries_cross:
+            return Step(self)
+        jump = drive.go_on_from(road, solved)
+        self._boundaries_cross = _crosses(road, drive)
+        self._settled = road.path.length
+        return Step(self, jump, notice)
+
+    def _repair(self, road: Road, drive: Drive, reading: Reading) -> None:
+        """Send the drive to a batch where cones contradict the map."""
+        is_whole = set(road.boundaries) == set(BOUNDARIES)
+        if not is_whole or drive.record.unsolvable is not None:
+            return
+        t, driven = reading.detections.t, road.path.length
+        if self.map_repair.is_due(self.known_loop, road.smoother, t, driven):
+            drive.begin_batch(road, reading, self.map_repair.begin(road.smoother, drive.record.poses))
+
+    def _hold_gauge(self, road: Road) -> None:
+        """Hold the gauge of the map after enough laps, unless factors of the user's may tell it."""
+        smoother = road.smoother
+        if smoother.user_factors.given or smoother.held is not None:
+            return
+        longest = max(boundary.length for boundary in road.boundaries.values())
+        if road.path.length > self._settled + road.settings.closing.gauge_laps * longest:
+            hold_gauge(smoother)
+
+
+def _crosses(road: Road, drive: Drive, splines: Mapping[int, BSpline] | None = None) -> bool:
+    """Return whether both boundaries cross beside the path driven, by default those of the road."""
+    if splines is None:
+        road.smoother.refresh()
+        splines = road.smoother.map.state.splines
+    driven = drive.record.poses[:, :2]
+    return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE, driven)

@@ -1,0 +1,137 @@
+"""The drive: what its phases have in common, and what a phase makes of a cycle."""
+
+from dataclasses import dataclass
+from functools import partial
+from math import nan
+from typing import Final, Protocol, Self
+
+import numpy as np
+
+from pathspace_graph.batch.lap import ClosedMap, LapMarginal
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.health import Health, HealthMonitor
+from pathspace_graph.mapping.motion import inflate_priors
+from pathspace_graph.mapping.road import Classified, Road
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .closing import go_on_from
+from .drive_record import DriveRecord
+from .lap_solver import LapSolver, Outcome
+
+REST: Final = 10.0  # distance for which only the road is mapped after a failure (m)
+LEARNED: Final = "the drive contradicts the calibration, which is learned"
+"""Notice of the cycle in which the priors of the calibrations are first doubted."""
+
+
+class Drive:
+    """The record of a drive, the batches of it, the health of its estimate, and its priors."""
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self.settings = settings
+        self.priors = settings
+        """The settings with the priors of the calibrations as they are now."""
+        self.record = DriveRecord(settings)
+        self.solver = LapSolver(settings)
+        self.monitor = HealthMonitor()
+        self.revisits: tuple[Revisit, ...] = ()
+        """Poses measured in the frame of earlier ones, by which the open map was optimized."""
+        self.closed_by: Revisit | None = None
+        """Return that began the batch which has closed the loop."""
+        self.lap_seconds = nan
+        """Wall time (s) of the newest batch that the map is of."""
+        self._rests_until = 0.0  # path (m)
+
+    def copy(self) -> Self:
+        """Return a drive that can go on independently; a batch that is under way is of both."""
+        other = shallow(self)
+        other.record = self.record.copy()
+        other.solver = self.solver.copy()
+        other.monitor = self.monitor.copy()
+        return other
+
+    # --- priors and health -------------------------------------------------------------------------------
+
+    def inflate_priors(self, road: Road, reading: Reading) -> str:
+        """Widen the priors of calibrations that an open drive contradicts; return a notice once."""
+        before = self.priors
+        doubted, measured = reading.sensor_doubted, reading.measured
+        self.priors = inflate_priors(road.smoother, before, doubted, measured)
+        contradicted = doubted or measured is None
+        is_new = before == self.settings != self.priors and contradicted
+        return LEARNED if is_new else ""
+
+    # --- rest after a failure ----------------------------------------------------------------------------
+
+    def rest(self, road: Road) -> None:
+        """Give up the batch that is under way, and rest for `REST` metres."""
+        self._rests_until = road.path.length + REST
+        self.solver.give_up(road.next_cycle)
+
+    def rests(self, road: Road) -> bool:
+        return road.path.length < self._rests_until
+
+    def resume(self) -> None:
+        """Go on with the batch that was under way when a snapshot was taken."""
+        self.solver.resume(prepares=self.record.unsolvable is None)
+
+    # --- batches -----------------------------------------------------------------------------------------
+
+    def begin_batch(self, road: Road, reading: Reading, start: ClosedMap | Revisit) -> None:
+        """Send the drive to its batch, which begins at a map, or at odometry and a revisit."""
+        window = road.smoother.first_cycle, road.next_cycle - 1
+        lap = partial(self.record.lap, start=start, settings=self.priors, noise=reading.noise)
+        self.solver.begin(lap, window, reading.detections.t)
+
+    def outcome(self, road: Road, spent: float) -> Outcome | None:
+        """Return the result of the batch where it is due in this cycle, which has taken `spent` (s)."""
+        smoother = road.smoother
+        return self.solver.outcome(road.next_cycle - 1, smoother.times, smoother.first_cycle, spent)
+
+    def go_on_from(self, road: Road, solved: LapMarginal) -> Array:
+        """Replace map and prior of a road by a batch's; return the jump (3,) of the newest pose."""
+        jump = go_on_from(road.smoother, solved)
+        self.lap_seconds = solved.seconds
+        self.replace_poses(road, np.concatenate([solved.poses[: solved.first_kept], road.poses]))
+        return jump
+
+    def replace_poses(self, road: Road, poses: Array) -> None:
+        """Replace the poses (P, 3) of all cycles, and place by them what is only seen from poses."""
+        self.record.replaced(poses)
+        road.place_orange(self.record.corrected)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What a phase has made of a cycle."""
+
+    phase: "Phase"  # of the next cycle
+    jump: Array | None = None  # (3,) of the newest pose, where the map or its place was replaced
+    notice: str = ""
+    health: Health | None = None  # where it has changed
+
+
+class Phase(Protocol):
+    """What a cycle does beside mapping: on an open road, on a closed map, and where the vehicle is lost."""
+
+    uses_detections: bool
+    """Whether detections may change the road."""
+
+    def copy(self) -> Self:
+        """Return a phase that can go on independently."""
+
+    def judge(
+        self, road: Road, drive: Drive, classified: Classified, reading: Reading
+    ) -> tuple["Phase", Health]:
+        """Judge the estimate before its update; return the phase of this cycle, and the health."""
+
+    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
+        """Do what the phase does after the update of a cycle, which has taken `spent` (s) so far.
+
+        A drive that rests is left alone.
+        """
+
+    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
+        """Go on from the result of a batch."""

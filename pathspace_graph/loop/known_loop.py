@@ -1,0 +1,191 @@
+"""The closed map as detections are compared with it, and what they say about the estimate."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.bspline import SpanPolynomials
+from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.graph.gaussian import half_solve
+from pathspace_graph.graph.variables import POSE
+from pathspace_graph.health import SHARE_DEGRADED, Evidence
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.registration import worst_sigma
+from pathspace_graph.mapping.smoother import CurveSmoother, Gating
+from pathspace_graph.mapping.state import SAMPLE
+
+MIDDLE_STEP: Final = 2.0  # distance of the places along the loop (m)
+BESIDE_CURVE: Final = 1.0  # distance from the closed curve within which an unused detection is explained (m)
+GAP_RATIO: Final = 3.0  # least distance of neighbouring cones with a gap between them, over the median
+_POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors that choose a pose's position
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A closed map as the search needs it."""
+
+    middle: Array  # (n, 2) points on the middle of the track in driving order, in m, map frame
+    stations: Array  # (n,) length along the middle up to each of them (m)
+    length: float  # length of the middle (m)
+    beside: Mapping[int, Array]  # (n,) parameters beside the points of the middle on each boundary (m)
+    curves: Mapping[int, KDTree]  # densely sampled points of each boundary
+    mapped: Mapping[int, BoolArray]  # whether each of these lies between detected cones (`is_mapped`)
+
+    begins: Mapping[int, float]  # parameter of the first of them (m)
+
+    constant: ClassVar[bool] = True
+
+    def at(self, stations: Array) -> Array:
+        """Return the points of the middle at stations of any shape, as complex numbers x + i y."""
+        x, y = (np.interp(stations, self.stations, axis, period=self.length) for axis in self.middle.T)
+        return np.asarray(x + 1j * y)
+
+    def distances(self, labels: IntArray, points: Array, most: float) -> Array:
+        """Return the distance (..., m) of points (..., m, 2) from their curve (m,), in m, at most `most`."""
+        found = np.full(points.shape[:-1], most)
+        for label, curve in self.curves.items():
+            of_label = labels == label
+            distance, _ = curve.query(points[..., of_label, :], distance_upper_bound=most)
+            found[..., of_label] = np.minimum(distance, most)
+        return found
+
+    def with_gaps(self) -> list[int]:
+        """Return the boundaries whose curves have gaps."""
+        return [label for label, mapped in self.mapped.items() if not mapped.all()]
+
+    def is_mapped(self, label: int, u: Array) -> BoolArray:
+        """Return which parameters (m,) of a boundary lie between detected cones, to the nearest sample."""
+        nearest = np.rint((u - self.begins[label]) / SAMPLE).astype(np.intp)
+        return self.mapped[label].take(nearest, mode="wrap")
+
+    def beside_gaps(self, labels: IntArray, points: Array) -> BoolArray:
+        """Return which points (m, 2) are nearest to a gap of their curve (m,), where no cone is mapped."""
+        found = np.zeros(len(points), bool)
+        for label, curve in self.curves.items():
+            of_label = np.flatnonzero(labels == label)
+            if len(of_label):
+                found[of_label] = ~self.mapped[label][curve.query(points[of_label])[1]]
+        return found
+
+    def compared(self, labels: IntArray, points: Array) -> tuple[BoolArray, BoolArray, BoolArray]:
+        """Return which points (m, 2) with labels (m,) lie on their curve, and which beside a gap of it.
+
+        The third result is false for those that say nothing: they lie on the curve of the other colour alone.
+        """
+        on_curve = self.distances(labels, points, BESIDE_CURVE) < BESIDE_CURVE
+        beside_gap = ~on_curve & self.beside_gaps(labels, points)
+        on_other = self.distances(LEFT + RIGHT - labels, points, BESIDE_CURVE) < BESIDE_CURVE
+        return on_curve, beside_gap, on_curve | ~on_other
+
+
+def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) -> BoolArray:
+    """Return which parameters (m,) of a closed curve lie between neighbouring cones at parameters (k,), in m.
+
+    The others lie in a gap, longer than `gap` times the median distance of neighbours, and farther than the
+    margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
+    """
+    if len(cones) < 2:
+        return np.ones(len(u), bool)
+    places = np.unique(np.mod(cones, length))
+    steps = np.diff(places, append=places[0] + length)
+    before = np.searchsorted(places, np.mod(u, length)) - 1
+    past = np.mod(u - places[before], length)
+    near_end = np.minimum(past, steps[before] - past) < margin
+    return np.asarray(near_end | (steps <= gap * np.median(steps))[before])
+
+
+def lay_out_loop(track: CurveMap) -> Loop:
+    """Return the loop between two closed curves."""
+    u, points, mapped, begins, margin = {}, {}, {}, {}, track.settings.growth.merge_radius
+    for label, boundary in track.state.boundaries.items():
+        u[label] = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
+        points[label] = boundary.evaluate(track.state.control_points(label), u[label])
+        begins[label] = boundary.tables.low
+        cones = track.cones.get(label, np.zeros(0))
+        mapped[label] = is_mapped(u[label], cones, boundary.length, GAP_RATIO, margin)
+    curves = {label: KDTree(curve) for label, curve in points.items()}
+    every = max(int(MIDDLE_STEP / SAMPLE), 1)
+    left = points[LEFT][::every]
+    opposite = curves[RIGHT].query(left)[1]
+    middle = 0.5 * (left + points[RIGHT][opposite])
+    steps = np.hypot(*np.diff(middle, axis=0, append=middle[:1]).T)
+    stations = np.concatenate([[0.0], steps.cumsum()[:-1]])
+    beside = {LEFT: u[LEFT][::every], RIGHT: u[RIGHT][opposite]}
+    return Loop(middle, stations, float(steps.sum()), beside, curves, mapped, begins)
+
+
+class KnownLoop:
+    """The closed map, laid out when it is asked for, and again once its curves were replaced by others."""
+
+    def __init__(self) -> None:
+        self._laid_out: tuple[list[SpanPolynomials], Loop] | None = None
+
+    def of(self, smoother: CurveSmoother) -> Loop:
+        """Return the loop as it was when it was laid out, which changes no variable."""
+        state = smoother.map.state
+        tables = [boundary.tables for boundary in state.boundaries.values()]
+        if self._laid_out is None or self._laid_out[0] != tables:
+            values = state.variables.values.copy()
+            smoother.refresh()
+            self._laid_out = tables, lay_out_loop(smoother.map)
+            state.variables.values[:] = values
+        return self._laid_out[1]
+
+
+def evidence_of(
+    smoother: CurveSmoother, tested: Gating | None, known: KnownLoop | None, reading: Reading
+) -> Evidence:
+    """Return what the tested detections say about the newest pose, before the update.
+
+    On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
+    for on the whole of their curve, where the loop is `known`: they may be of a stretch across the infield.
+    Three kinds say nothing about the vehicle: those not seen again of all detections of the cycle, those on
+    the curve of the other colour, and those beside a gap of the map.
+    """
+    motion, seen_again = reading.motion, reading.seen_again
+    if tested is None:
+        return Evidence(reading.detections.t, rests=motion.rests, odometry=motion.fault)
+    detections, closed = smoother.map.detections, smoother.map.state.closed
+    labels, used = detections.label[tested.rows], detections.used[tested.rows]
+    again = seen_again[tested.rows - (len(detections) - len(seen_again))]
+    judged = used | ((tested.in_view | closed) & again)
+    explained, unmapped = used.copy(), np.zeros(len(used), bool)
+    if known is not None and used.sum() < SHARE_DEGRADED * judged.sum():
+        others = np.flatnonzero(judged & ~used)
+        points = detections.points_map(tested.rows[others], smoother.variables)
+        on_curve, beside_gap, says = known.of(smoother).compared(labels[others], points)
+        explained[others], unmapped[others], judged[others] = on_curve, beside_gap & says, says
+    offered = judged & ~unmapped
+    return Evidence(
+        t=reading.detections.t,
+        offered=int(offered.sum()),
+        explained=int(explained.sum()),
+        used=int(used.sum()),
+        innovations=float(tested.innovation[used] @ tested.innovation[used]),
+        closed=closed,
+        sigma=_sigma_of_position(smoother) if closed else np.nan,
+        offered_by=_by_boundary(labels[offered]),
+        explained_by=_by_boundary(labels[explained]),
+        unmapped=_by_boundary(labels[unmapped]),
+        rests=motion.rests,
+        odometry=motion.fault,
+    )
+
+
+def _sigma_of_position(smoother: CurveSmoother) -> float:
+    """Return the standard deviation (m) of the newest position in its worst direction, by the last step."""
+    last = smoother.last_step
+    if last is None:
+        return np.nan
+    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose is the last block
+    return worst_sigma(half.T @ half)
+
+
+def _by_boundary(labels: IntArray) -> tuple[int, int]:
+    left, right = np.bincount(labels, minlength=len(BOUNDARIES)).tolist()
+    return left, right

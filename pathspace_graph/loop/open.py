@@ -1,0 +1,135 @@
+"""The open road: its map grows, until a return to its beginning starts the batch that closes the loop."""
+
+from dataclasses import replace
+from typing import Final, Self
+
+from pathspace_graph.copies import shallow
+from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.health import Health
+from pathspace_graph.lengths import joined
+from pathspace_graph.mapping.registration import RefinedMotion
+from pathspace_graph.mapping.road import Classified, Road
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .closed import Closed
+from .closing import SIGMA_STEP, apply_correspondences, simplify
+from .drive import Drive, Phase, Step
+from .known_loop import evidence_of
+from .lap_solver import Outcome
+from .returns import ReturnFinder
+from .revisit import Revisits, lay_on
+from .worker import Unsolved
+
+OWN_PRIOR: Final = "the map goes on from the window's own prior"  # begins the notice where no batch came
+STAYS_OPEN: Final = "the loop stays open"  # begins the notice where a batch did not agree
+REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
+"""Notice of the first cycle with a revisit."""
+
+
+class Open:
+    """The search for a return, and for road that is met again on the way."""
+
+    uses_detections = True
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self.settings = settings
+        self.returns = ReturnFinder(settings.closing)
+        self.revisits = Revisits(settings)
+        self.returned_by: Revisit | None = None  # return that began the newest batch
+
+    def copy(self) -> Self:
+        """Return a phase that can go on independently."""
+        other = shallow(self)
+        other.returns = self.returns.copy()
+        other.revisits = shallow(self.revisits)
+        return other
+
+    def judge(
+        self, road: Road, drive: Drive, classified: Classified, reading: Reading
+    ) -> tuple[Phase, Health]:
+        """Judge the estimate by the tested detections."""
+        evidence = evidence_of(road.smoother, classified.tested, None, reading)
+        return self, drive.monitor.update(evidence)
+
+    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
+        """Look for a return, which begins a batch, and go on from the batch or from road met again."""
+        learned = drive.inflate_priors(road, reading)
+        rests = drive.rests(road)
+        looks = road.boundaries and not (rests or drive.solver.is_busy)
+        found = self.returns.by_curves(road) if looks else None
+        drive.record.estimated(road)  # after the search, which may have moved the open map
+        step = Step(self) if rests else self._step(road, drive, reading, found, spent)
+        return replace(step, notice=joined([step.notice, learned]))
+
+    def _step(
+        self, road: Road, drive: Drive, reading: Reading, found: RefinedMotion | None, spent: float
+    ) -> Step:
+        if found is not None and not self._is_solvable(road, drive):
+            return self._close_by_prior(road, drive, found)
+        if not drive.solver.is_busy:
+            self._begin_batch(road, drive, reading, found)
+        if drive.solver.is_busy:
+            outcome = drive.outcome(road, spent)
+            return Step(self) if outcome is None else self.take(road, drive, outcome)
+        revisit = self.revisits.find(road, drive.record, reading.noise)
+        return Step(self) if revisit is None else self._lay_on(road, drive, revisit)
+
+    def _begin_batch(self, road: Road, drive: Drive, reading: Reading, found: RefinedMotion | None) -> None:
+        """Send the lap to a batch where the newest detections, cones or curves lie on earlier ones.
+
+        It closes the loop later, if it agrees; until then the map stays open.
+        """
+        record, returns = drive.record, self.returns
+        if road.path.length <= self.settings.closing.min_path or not self._is_solvable(road, drive):
+            return
+        drive.solver.prepare()
+        if found is not None:
+            revisit: Revisit | None = returns.revisit_of(road, record, found)
+        else:
+            revisit = returns.by_cones(road, record, reading.noise) or returns.by_shape(road, record)
+        if revisit is not None:
+            returns.rest(road, self.settings.open_lap.retry)
+            self.returned_by = revisit
+            drive.begin_batch(road, reading, revisit)
+
+    def _is_solvable(self, road: Road, drive: Drive) -> bool:
+        """Return whether the lap can be solved as a batch; a lap of too many cones is given up."""
+        cones = sum(len(boundary.cone_parameters) for boundary in road.boundaries.values())
+        if cones > self.settings.open_lap.max_cones:
+            drive.record.give_up("the lap has too many cones for a batch")
+        return drive.record.unsolvable is None
+
+    def _lay_on(self, road: Road, drive: Drive, revisit: Revisit) -> Step:
+        """Lay the open map on an earlier pass; the notice says so once."""
+        jump, is_first = lay_on(road, drive.record, revisit), not drive.revisits
+        drive.revisits = (*drive.revisits, revisit)
+        road.place_orange(drive.record.corrected)
+        return Step(self, jump, REVISITED if is_first else "")
+
+    # --- closing -----------------------------------------------------------------------------------------
+
+    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
+        """Close the loop by a batch that agrees; else it stays open, and the notice says why."""
+        if isinstance(outcome, Unsolved):
+            if outcome.is_final:
+                drive.record.give_up(outcome.reason)
+                self.returns.rest(road, 0.0)  # a registration may close the loop at once
+            return Step(self, notice=joined([STAYS_OPEN, outcome.reason], ": "))
+        if outcome.objection:
+            return Step(self, notice=joined([STAYS_OPEN, outcome.objection], ": "))
+        road.smoother.settle()
+        jump = drive.go_on_from(road, outcome)
+        drive.closed_by = self.returned_by
+        return Step(Closed(road, drive), jump)
+
+    def _close_by_prior(self, road: Road, drive: Drive, found: RefinedMotion) -> Step:
+        """Close the loop by the window's own prior, since no batch can come."""
+        smoother = road.smoother
+        apply_correspondences(smoother, found)
+        keyframes = smoother.solve_loop(self.settings.closing.iterations, SIGMA_STEP)
+        drive.record.bent(keyframes, road)
+        simplify(smoother)
+        smoother.settle()
+        drive.record.replaced(drive.record.with_window(road))
+        return Step(Closed(road, drive), notice=f"{OWN_PRIOR}: {drive.record.unsolvable}")

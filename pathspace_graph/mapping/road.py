@@ -1,0 +1,142 @@
+"""The road: all that is estimated, and the steps of the paper that change it.
+
+The order of a cycle is that of the paper: predict, classify, expand, update, and at its end marginalize.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import gtsam
+
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.log import Detections
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import Boundary
+
+from .growth import Growth
+from .motion import MeasuredMotion, predict
+from .orange import OrangeCones, Sighting
+from .path import DrivenPath
+from .smoother import CurveSmoother, Gating
+
+
+@dataclass(frozen=True, eq=False)
+class Classified:
+    """The detections of a cycle after their association."""
+
+    new: slice  # their rows in the table of detections
+    tested: Gating | None  # the coloured ones, as they were tested; None without any curve
+
+
+class Road:
+    """Window and prior, both curves, tentative and orange cones, and the path driven.
+
+    `copy` returns a road that goes on independently: it is what a failed cycle goes back to.
+    """
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self.settings = settings
+        self.smoother = CurveSmoother(settings)
+        """Variables, factors of the window, and the prior."""
+        self.path = DrivenPath()
+        self.growth = Growth(settings.growth)
+        """Tentative tracks, through which the open curves grow."""
+        self.orange = OrangeCones(settings.growth, settings.spline.sigma_shape)
+        """Orange cones, which are points of the map."""
+        self.grown: frozenset[int] = frozenset()
+        """Curves that have grown in the newest cycle: the next one tests all of the window for them."""
+        self._attach()
+
+    def copy(self) -> Self:
+        """Return a road that can go on independently; what is only ever replaced is shared."""
+        other = shallow(self)
+        other.smoother = self.smoother.copy()
+        other.path = self.path.copy()
+        other.growth = self.growth.copy()
+        other.orange = self.orange.copy()
+        other._attach()
+        return other
+
+    def _attach(self) -> None:
+        self.smoother.attached = [self.smoother.map, self.path, self.growth, self.orange]
+
+    # --- the steps of a cycle ----------------------------------------------------------------------------
+
+    def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
+        """Add the user's factors, after their check."""
+        self.smoother.add_factors(factors)
+
+    def predict(self, motion: MeasuredMotion, orange: Detections) -> None:
+        """Add the pose of a cycle by the calibrated odometry, extend the path, and place the orange cones."""
+        predict(self.smoother, self.path, motion, orange.t)
+        cycle, pose = self.smoother.next_cycle - 1, self.poses[-1].copy()
+        seen = Sighting(cycle, pose, motion.odometry.twist, orange)
+        self.orange.add(seen, self.smoother.variables.sensor)
+
+    def classify(self, detections: Detections, twist: Array, *, use: bool = True) -> Classified:
+        """Add the detections of the newest pose, and put those into use that a curve explains.
+
+        Others may expand an open curve later. Without `use`, none is put into use.
+        """
+        track, cycle = self.smoother.map, self.smoother.next_cycle - 1
+        new = track.detections.append(detections, cycle, twist)
+        tested = self.smoother.associate(self.grown, use) if self.boundaries else None
+        if not self.closed:
+            self.growth.observe(track, new, detections.t)
+        return Classified(new, tested)
+
+    def expand(self) -> str:
+        """Let open curves grow, and leave the part of the map behind inactive; return a notice."""
+        self.grown, notice = frozenset(), ""
+        if not self.closed:
+            path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
+            self.grown, notice = self.growth.expand(self.smoother, path_ahead)
+        self.smoother.deactivate_distant()
+        return notice
+
+    def update(self) -> None:
+        """Take the Gauss-Newton steps of a cycle, each relinearized at the current estimate."""
+        for _ in range(self.settings.steps_grown if self.grown else self.settings.steps):
+            self.smoother.step(self.settings.sigma_step)
+
+    def marginalize(self, held_from: int | None = None) -> None:
+        """Marginalize poses older than the lag; the cycles from `held_from` on stay."""
+        self.smoother.marginalize(held_from)
+
+    # --- the estimate ------------------------------------------------------------------------------------
+
+    @property
+    def closed(self) -> bool:
+        """Return whether the curves are closed: the map has its final size."""
+        return self.smoother.map.state.closed
+
+    @property
+    def boundaries(self) -> dict[int, Boundary]:
+        """Return the curves by label."""
+        return self.smoother.map.state.boundaries
+
+    @property
+    def poses(self) -> Array:
+        """Return a view of the poses (P, 3) in the window, the oldest first, map frame."""
+        return self.smoother.variables.poses
+
+    @property
+    def next_cycle(self) -> int:
+        return self.smoother.next_cycle
+
+    def used_in_newest(self) -> int:
+        """Return the number of the newest cycle's detections that are in use."""
+        detections = self.smoother.map.detections
+        return int(detections.used[detections.cycle.searchsorted(self.next_cycle - 1) :].sum())
+
+    def place_orange(self, corrected: Array) -> None:
+        """Place the orange cones anew by the corrected poses (k, 3) of the first cycles and the window's."""
+        window = self.smoother.first_cycle, self.poses
+        self.orange.place_again(self.smoother.variables.sensor, (0, corrected), window)
+
+    def move(self, motion: Array) -> None:
+        """Move what is not a variable by a rigid motion (3,) of the map frame."""
+        for one in self.smoother.attached:
+            one.move(motion)

@@ -1,0 +1,143 @@
+"""Rows of cones: both boundaries of the road ahead, followed from cone to cone.
+
+Where colours tell which row a cone is of, the rows are extended in turn (`extend_rows`). Cones without a
+colour are dealt out to both rows, as long as it is clear which comes next (`deal_out`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.se2 import path_lengths
+
+from .path import along_and_across, crosses
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a row from one cone to the next, whose cost is `distance (1 + turn_cost turn^2)`."""
+
+    gap: float  # largest distance of neighbours (m)
+    turn: float  # largest turn from one cone to the next where both coincide (rad)
+    turn_rate: float  # decrease of that turn with the distance to the next cone (rad/m)
+    turn_cost: float  # cost of a turn (rad^-2)
+    width: float  # least distance from the other row (m)
+
+
+EXTENDED: Final = Limits(gap=11.0, turn=2.0, turn_rate=0.1, turn_cost=1.0, width=1.5)
+"""Limits of rows of known colours: two regular gaps, as one cone may be missed."""
+DEALT_OUT: Final = Limits(gap=8.0, turn=1.3, turn_rate=0.0, turn_cost=2.0, width=1.8)
+WIDTH_RATIO: Final = 1.8  # largest ratio of successive cones' distances from the other boundary
+WIDTH_SLACK: Final = 1.0  # further growth allowed of that distance (m)
+CLEAR: Final = 1.3  # least cost of the next cone of a row in the other row, by its own cost
+
+
+@dataclass(eq=False)
+class ConeRow:
+    """One boundary as far as it is known, and the cones that may continue it."""
+
+    side: float  # sign of the signed distance from the other row (left positive)
+    line: Array  # (n, 2) points of the row in driving order (m)
+    direction: Array  # (2,) unit vector in which the row leads on from its last point
+    candidates: Array  # (k, 2) cones that may continue the row (m)
+    chosen: list[int] = field(default_factory=list)  # candidates taken, in order
+    ended: bool = False  # whether no candidate continues the row, wherever the other one leads
+
+    @property
+    def end(self) -> Array:
+        return np.asarray(self.line[-1])
+
+    @property
+    def cones(self) -> Array:
+        """Return the candidates (c, 2) that the row leads through."""
+        return self.candidates[self.chosen]
+
+    @property
+    def lengths(self) -> Array:
+        """Return the lengths (c,) in m along the row from the known end to the cones that continue it."""
+        return path_lengths(self.line[-len(self.chosen) - 1 :])[1:]
+
+    def choose(self, index: int) -> None:
+        """Continue the row through a candidate."""
+        step = self.candidates[index] - self.end
+        self.direction = step / np.hypot(*step)
+        self.line = np.concatenate([self.line, self.candidates[index, None]])
+        self.chosen.append(index)
+
+    def costs(self, indices: IntArray, limits: Limits) -> tuple[Array, Array]:
+        """Return distances (m) of candidates (k,) and their costs, infinite for too large a turn."""
+        step = self.candidates[indices] - self.end
+        distance, (cos, sin) = np.hypot(step[:, 0], step[:, 1]), self.direction
+        turn = np.abs(np.arctan2(cos * step[:, 1] - sin * step[:, 0], step @ self.direction))
+        cost = distance * (1.0 + limits.turn_cost * turn**2)
+        return distance, np.where(turn < limits.turn - limits.turn_rate * distance, cost, np.inf)
+
+
+def extend_rows(left: ConeRow, right: ConeRow, driven: Array, threshold: float) -> None:
+    """Continue both rows through their candidates, each time the one that lags behind.
+
+    A row stays on its side of the other, at about the width of the track, and does not cross the driven path
+    (n, 2). A cone nearer to a row's end than `threshold` (m) is passed over.
+    """
+    waiting = [left, right]
+    while waiting:
+        ahead = left.direction + right.direction
+        row = min(waiting, key=lambda row: float(row.end @ ahead))
+        index = _next(row, right if row is left else left, driven, threshold)
+        if index is None:
+            waiting = [other for other in waiting if other is not row]
+        else:
+            row.choose(index)
+            waiting = [other for other in (left, right) if not other.ended]
+
+
+def _next(row: ConeRow, other: ConeRow, driven: Array, threshold: float) -> int | None:
+    """Return the index of the candidate that continues a row, or None."""
+    distance, cost = row.costs(np.arange(len(row.candidates)), EXTENDED)
+    possible = (distance > threshold) & (distance < EXTENDED.gap) & np.isfinite(cost)
+    possible[row.chosen] = False
+    indices = np.flatnonzero(possible)
+    indices = indices[np.argsort(cost[indices])]
+    if len(indices) == 0:
+        row.ended = True
+        return None
+    points = row.candidates[indices]
+    fits = _has_width(row, other, points)
+    fits &= ~crosses(row.end, points, driven) & ~crosses(row.end, points, other.line)
+    return int(indices[fits.argmax()]) if fits.any() else None
+
+
+def _has_width(row: ConeRow, other: ConeRow, points: Array) -> BoolArray:
+    """Return whether points (k, 2) are about as far from the other row as the end of their own row."""
+    stations = path_lengths(other.line)
+    station, width = along_and_across(np.concatenate([row.end[None], points]), other.line, stations)
+    width, beyond = row.side * width, station[1:] > stations[-1]
+    widest = WIDTH_RATIO * abs(width[0]) + WIDTH_SLACK
+    return np.asarray((width[1:] > EXTENDED.width) & (beyond | (width[1:] < widest)))
+
+
+def deal_out(rows: Sequence[ConeRow], free: IntArray, may_be: BoolArray) -> None:
+    """Lead two rows on through free cones (k,), as long as it is clear which cone comes next.
+
+    The next one, of those that a row may have by `may_be` (2, k), costs its row least, and the other one far
+    more. Both rows have the same candidates.
+    """
+    while len(free):
+        ways = [row.costs(free, DEALT_OUT) for row in rows]
+        apart = np.array([_distances(row.candidates[free], other.cones) for row, other in (rows, rows[::-1])])
+        costs = np.where(may_be & (apart > DEALT_OUT.width), [cost for _, cost in ways], np.inf)
+        within = np.where([distance < DEALT_OUT.gap for distance, _ in ways], costs, np.inf)
+        own, best = divmod(int(within.argmin()), len(free))
+        if np.isinf(within[own, best]) or costs[1 - own, best] < CLEAR * within[own, best]:
+            return
+        rows[own].choose(int(free[best]))
+        free, may_be = np.delete(free, best), np.delete(may_be, best, axis=1)
+
+
+def _distances(points: Array, cones: Array) -> Array:
+    """Return the distance (k,) of each point (k, 2) from the nearest of cones (n, 2), infinite for none."""
+    off = points[:, None] - cones[None]
+    return np.asarray(np.hypot(off[..., 0], off[..., 1]).min(axis=1, initial=np.inf))

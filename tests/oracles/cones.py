@@ -1,0 +1,163 @@
+"""Tentative tracks and constellations of cones in numpy."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.se2 import left_of, rotation, wrap_angle
+from pathspace_graph.mapping.constellation import Cones
+from pathspace_graph.mapping.tentative import nearest_within
+
+Tracks = tuple[Array, Array, IntArray, Array]
+GATES: Final = (4.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # factors of the cap in the steps of the refinement
+
+
+def merged(
+    known: Tracks, points: Array, covariances: Array, t: float, gate: tuple[float, float, float]
+) -> Tracks:
+    """Return the columns of tracks with detections added as `TentativeTracks.add` does."""
+    radius, most, chi = gate
+    places, inform, counts, last_t = known[0].copy(), known[1].copy(), known[2].copy(), known[3].copy()
+    information = np.linalg.inv(covariances)
+    nearest, near = nearest_within(points, places, radius)
+    offset = points[:, None] - places
+    i, j = np.nonzero(~near[:, None] & ((offset**2).sum(axis=2) < (most * radius) ** 2))
+    if len(i):
+        square, off = np.full(offset.shape[:2], np.inf), offset[i, j]
+        joint = covariances[i] + np.linalg.inv(inform[j])
+        square[i, j] = (off * np.linalg.solve(joint, off[:, :, None])[:, :, 0]).sum(axis=1)
+        smeared = square.min(axis=1) < chi**2
+        nearest[smeared], near[smeared] = square.argmin(axis=1)[smeared], True
+    for row in np.flatnonzero(near):
+        track, weight = nearest[row], information[row]
+        inform[track] += weight
+        places[track] += np.linalg.solve(inform[track], weight @ (points[row] - places[track]))
+        counts[track] += 1
+        last_t[track] = max(last_t[track], t)  # a late detection makes no track older
+    new = int((~near).sum())
+    return (
+        np.concatenate([places, points[~near]]),
+        np.concatenate([inform, information[~near]]),
+        np.concatenate([counts, np.ones(new, np.intp)]),
+        np.concatenate([last_t, np.full(new, t)]),
+    )
+
+
+def merged_in_turn(points: Array, covariances: Array, gate: tuple[float, float, float]) -> Tracks:
+    """Return the columns of tracks to which detections (m, 2) are added one after another."""
+    tracks: Tracks = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp), np.zeros(0))
+    for k in range(len(points)):
+        tracks = merged(tracks, points[k : k + 1], covariances[k : k + 1], 0.0, gate)
+    return tracks
+
+
+REGULAR: Final = (1e-2, 1e-2, 1.0)  # information added in a step, so that few cones still give one
+
+
+def laid(
+    seen: Cones,
+    known: Cones,
+    views: Array,
+    mean: Array,
+    prior: Array,
+    reach: tuple[float, float],
+    limits: tuple[float, ...],
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the places where seen cones may lie, as `lay` compares them."""
+    apart, places = limits[4], int(limits[5])
+    tried, found = list[Array](), []
+    for start in _starts(seen, known, mean, prior, reach, limits):
+        off = [(np.hypot(*(start - other)[:2]), abs(start[2] - other[2])) for other in tried]
+        if any(distance < apart and turn < 1.5 * limits[3] for distance, turn in off):
+            continue
+        tried.append(start)
+        found.append(_refined(seen, known, views, start, mean, prior, limits))
+        if len(tried) == 3 * places:
+            break
+    poses, information, squares, counts, away = (np.array(column) for column in zip(*found, strict=True))
+    return poses, information, squares, counts, away
+
+
+def _starts(
+    seen: Cones,
+    known: Cones,
+    mean: Array,
+    prior: Array,
+    reach: tuple[float, float],
+    limits: tuple[float, ...],
+) -> list[Array]:
+    """Return poses (3,): the mean, as few cones may have been met again, and those that may cost least.
+
+    Each pair of cones votes for a cell and the eight around it, against the distance from the mean.
+    """
+    size, step, places, gain, failed = limits[2], limits[3], int(limits[5]), limits[6], limits[7]
+    i, j = np.nonzero(seen[2][:, None] == known[2])
+    half, turns = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step))
+    starts = list[tuple[float, Array]]()
+    for turn in range(-turns, turns + 1):
+        heading = mean[2] + turn * step
+        c, s = np.cos(heading), np.sin(heading)
+        x, y = seen[0][i].T
+        move = np.column_stack([c * x - s * y, s * x + c * y])
+        cell = np.floor((known[0][j] - move - mean[:2]) / size + 0.5).astype(np.intp) + half
+        cell = cell[((cell > 0) & (cell < 2 * half)).all(axis=1)]
+        votes = np.zeros((2 * half + 1, 2 * half + 1), np.intp)
+        for a in (-1, 0, 1):
+            for b in (-1, 0, 1):
+                np.add.at(votes, (cell[:, 0] + a, cell[:, 1] + b), 1)
+        at = np.argwhere(votes)
+        off = np.column_stack([(at - half) * size, np.full(len(at), turn * step)])
+        score = gain * votes[at[:, 0], at[:, 1]] - np.minimum(
+            np.einsum("ka,ab,kb->k", off, prior, off), failed
+        )
+        best = np.argsort(-score, kind="stable")[:places]
+        starts += zip(score[best].tolist(), mean + off[best], strict=True)
+    return [mean, *(start for _, start in sorted(starts, key=lambda one: -one[0]))]
+
+
+def _refined(
+    seen: Cones,
+    known: Cones,
+    views: Array,
+    start: Array,
+    mean: Array,
+    prior: Array,
+    limits: tuple[float, ...],
+) -> tuple[Array, Array, float, float, float]:
+    """Return a row of `laid` after Gauss-Newton steps from a pose (3,)."""
+    sigma, gate, pose = limits[0], limits[1], start
+    for factor in (*GATES, None):
+        turn, limit = rotation(pose[2]), gate * (factor or 1.0)
+        arm = seen[0] @ turn.T
+        off = (arm + pose[:2])[:, None] - known[0]
+        weight = np.linalg.inv((turn @ seen[1] @ turn.T)[:, None] + known[1] + sigma**2 * np.eye(2))
+        square = np.einsum("mni,mnij,mnj->mn", off, weight, off)
+        square[seen[2][:, None] != known[2]] = np.inf
+        rows, j = np.arange(len(arm)), square.argmin(axis=1)
+        square, on = square[rows, j], square[rows, j] < limit
+        weight, off = weight[rows, j][on], off[rows, j][on]
+        by = np.zeros((on.sum(), 2, 3))
+        by[:, 0, 0] = by[:, 1, 1] = 1.0
+        by[:, :, 2] = left_of(arm[on])
+        if factor is None:
+            break
+        weight = weight * ((1.0 - square[on] / limit) ** 2)[:, None, None]
+        hessian = np.einsum("mia,mij,mjb->ab", by, weight, by) + np.diag(REGULAR)
+        pose = pose - np.linalg.solve(hessian, np.einsum("mia,mij,mj->a", by, weight, off))
+    away = pose - mean
+    away[2] = wrap_angle(away[2])
+    asked = on | _in_view(arm + pose[:2], views)
+    information = np.einsum("mia,mij,mjb->ab", by, weight, by)
+    square = np.minimum(square[asked], gate)
+    return pose, information, float(square.sum()), float(len(square)), float(away @ prior @ away)
+
+
+def _in_view(points: Array, views: Array) -> BoolArray:
+    """Return which of the points (m, 2) one of the views (k, 5) has within its range and bearing."""
+    off = points[:, None] - views[:, :2]
+    bearing = np.abs(wrap_angle(np.arctan2(off[:, :, 1], off[:, :, 0]) - views[:, 2]))
+    in_view = (np.hypot(off[:, :, 0], off[:, :, 1]) < views[:, 3]) & (bearing < views[:, 4])
+    return np.asarray(in_view.any(axis=1))
