@@ -154,7 +154,7 @@ def test_matches_are_coloured_detections_beside_their_own_curve() -> None:
 
 
 def test_only_the_newest_seconds_are_registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registration, "WINDOW", 1.0)
+    monkeypatch.setattr(registration, "REGISTERED_AGE", 1.0)
     scene = window()
     found = scene.register(sigma_max=1.0)
     assert found is not None
