@@ -13,7 +13,7 @@ from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, in_front_row
+from pathspace_graph.mapping.path import LATERAL_GAP, ROW_BESIDE, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
@@ -252,7 +252,7 @@ def along_drive(cones: Cones, lap: Array, own: BoolArray, label: int) -> Cones:
     nearest = np.add(square, DIRECTION_PENALTY**2, out=square, where=~own).argmin(axis=1)
     ahead, left = to_vehicle(cones.points, lap[nearest]).T
     station, side = path_lengths(lap)[nearest] + ahead, SIDES[label] * left
-    front = in_front_row(station, side, BESIDE, LATERAL_GAP)
+    front = in_front_row(station, side, ROW_BESIDE, LATERAL_GAP)
     order = np.argsort(station, kind="stable")
     return cones.where(order[front[order]])
 

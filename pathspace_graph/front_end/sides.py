@@ -16,7 +16,7 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.cone_rows import ConeRow, deal_out
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, DrivenPath, PathAhead, in_front_row
+from pathspace_graph.mapping.path import LATERAL_GAP, ROW_BESIDE, SIDES, DrivenPath, PathAhead, in_front_row
 from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.online import SidesSettings
 
@@ -134,7 +134,7 @@ class SideJudge:
         beside = (side > NEAREST_SIDE) & (side < FARTHEST_SIDE)
         beside &= (stations > path.driven - BEHIND) & (stations < path.driven + PATH_TELLS)
         order = np.flatnonzero(beside)[np.argsort(stations[beside])]
-        cones = seen[order[in_front_row(stations[order], side[order], BESIDE, LATERAL_GAP)]]
+        cones = seen[order[in_front_row(stations[order], side[order], ROW_BESIDE, LATERAL_GAP)]]
         candidates, ahead = self._cones.points, np.array([np.cos(pose[2]), np.sin(pose[2])])
         line = candidates[cones]
         if len(cones) == 0:
