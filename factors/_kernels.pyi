@@ -117,7 +117,12 @@ def detection_rows(
     sensor: Array,
     sigma_model: float,
 ) -> tuple[Array, Array, Array]:
-    """Return residuals (m,) and sigmas (m,) of `project`, and derivatives by [pose | sensor | controls]."""
+    """Return residuals (m,) and sigmas (m,) of `project`, and derivatives by [pose | sensor | controls].
+
+    normals (m, 2), distances (m,) and basis (m, p + 1) are of the foot points. Residuals and derivatives
+    (m, 3 + 5 + 2 p + 2) are multiplied by the factor of `sensor:sensor_rows`, where the detections were
+    measured at (m, 2), vehicle frame, with twists (m, 3), and the sensor's calibration (5,) is not empty.
+    """
 
 def station_rows(
     points_map: Array,
@@ -139,9 +144,7 @@ def station_rows(
 
         dr/dp = t,   dr/dc_j = -beta_j(u) t + n . (p - S) beta'_j(u) / |S'| n
 
-    Residuals and derivatives (m, 3 + 5 + 2 p + 2), by [pose | sensor | controls], are multiplied by the
-    factor of `sensor:sensor_rows`, where the detections were measured at (m, 2), vehicle frame, with twists
-    (m, 3), and the sensor's calibration (5,) is not empty.
+    The rest is as in `detection_rows`.
     """
 
 def integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, Array, Array]:
