@@ -3,13 +3,11 @@
 All five are estimated along with the map. They are small, so a detection is corrected linearly in them.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from . import _kernels as kernels
 from .arrays import Array
-from .se2 import in_vehicle, left_of
+from .se2 import left_of
 
 SENSOR = ("yaw", "lateral", "latency", "range_scale", "range_bias")
 """Entries of the calibration b: yaw (rad) and lateral offset (m), positive to the left, age of detections at
@@ -70,48 +68,6 @@ def by_range(points_vehicle: Array) -> Array:
     rates[:, 0] = np.eye(2)
     rates[:, 1] = (np.eye(2) - unit[:, :, None] * unit[:, None, :]) / distance[:, None, None]
     return rates
-
-
-@dataclass(frozen=True)
-class SensorRows:
-    """Dependence of residuals of corrected detections on the sensor's calibration."""
-
-    factor: Array  # (m,) by which residuals and all their derivatives become those of measured detections
-    by_sensor: Array  # (m, 5) derivatives of the multiplied residuals, or (m, 0) if nothing is estimated
-
-
-def range_rates(directions: Array, poses: Array, measured: Array) -> Array:
-    """Return the derivatives (m, 2) of `SensorRows.factor` by the range scale and the range bias.
-
-    They are `d' R (d M^-1) R' d` along unit vectors d (m, 2), map frame (see `by_range`), for detections
-    measured at (m, 2), vehicle frame, from poses (m, 3) with rotations R.
-    """
-    along = in_vehicle(directions, poses)
-    return np.asarray(np.einsum("mi,mkij,mj->mk", along, by_range(measured), along))
-
-
-def sensor_rows(
-    directions: Array,
-    residual: Array,
-    poses: Array,
-    measured: Array,
-    twists: Array,
-    sensor: Array,
-) -> SensorRows:
-    """Return factors `f = 1 + rates b` and derivatives `f d' R C + r rates` of residuals `r = d . (p - q)`.
-
-    d (m, 2) are unit vectors in the map frame and p corrected detections, measured at (m, 2), vehicle frame,
-    from poses (m, 3) with twists (m, 3). C is `by_sensor`, b the sensor's calibration (5,) or empty, and
-    `rates` (m, 2) are `range_rates`, whose change with the direction has no derivative.
-    """
-    if len(sensor) == 0:
-        return SensorRows(np.ones(len(residual)), np.zeros((len(residual), 0)))
-    rates = range_rates(directions, poses, measured)
-    factor = 1.0 + rates @ sensor[RANGE]
-    jacobian = np.einsum("mi,mik->mk", in_vehicle(directions, poses), by_sensor(measured, twists))
-    jacobian *= factor[:, None]
-    jacobian[:, RANGE] += residual[:, None] * rates
-    return SensorRows(factor, jacobian)
 
 
 def restored(residual: Array, measured: Array, twists: Array, sensor: Array) -> tuple[Array, Array]:

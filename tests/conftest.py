@@ -20,8 +20,8 @@ from pathspace_graph import FixedLagMapper
 from pathspace_graph.loop import worker
 from pathspace_graph.run import CycleResult
 
-from .scenes import laps
-from .scenes.session import FOLDER
+from .shared import laps
+from .shared.session import FOLDER
 
 
 def pytest_configure(config: pytest.Config) -> None:

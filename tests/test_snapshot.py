@@ -1,9 +1,15 @@
-"""Snapshots of estimators: the table of classes, foreign types, the file, and what is no estimator."""
+"""Snapshots of estimators: what comes back, and every file that is refused."""
 
 from __future__ import annotations
 
-import json
+import os
+import pickle
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -14,10 +20,11 @@ from scipy.spatial import KDTree
 from pathspace_graph import FixedLagMapper, MapperSettings
 from pathspace_graph.baselines.filters import CkfMapper, LandmarkCkf
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
-from pathspace_graph.errors import InputError
-from pathspace_graph.graph.variables import Layout, pose_keys
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.graph.variables import pose_keys
+from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.run import split_odometry
-from pathspace_graph.snapshot import Decoder, Encoder, archive, known_classes, read, restore, save, write
+from pathspace_graph.snapshot import SNAPSHOT, array_of, new, restore, save
 
 from .scenes.digest import digest
 from .scenes.drives import ODOMETRY_SIGMA, ahead, corridor, exact_log
@@ -26,17 +33,21 @@ from .scenes.kills import kills, leftovers
 Estimator = LandmarkFixedLag | CkfMapper | LandmarkCkf
 
 
-def test_the_table_has_the_classes_of_estimators_and_no_others() -> None:
-    known = known_classes()
-    assert known["online.fixed_lag.FixedLagMapper"] is FixedLagMapper
-    assert known["settings.mapper.MapperSettings"] is MapperSettings
-    assert known["graph.variables.Layout"] is Layout
-    rooms = {name.split(".")[0] for name in known}
-    assert not rooms & {"commands", "eval", "sim", "errors", "run"}
-    assert all(name.startswith("io.log.") for name in known if name.startswith("io."))
+def holder(**held: Any) -> DrivenPath:
+    """Return one of our objects, which holds these things."""
+    found = DrivenPath()
+    vars(found).clear()
+    vars(found).update(held)
+    return found
 
 
-def test_foreign_types_come_back() -> None:
+def back(one: DrivenPath, folder: Path) -> Any:
+    """Return an object that was saved and restored."""
+    save(one, folder / "one.snap")
+    return restore(folder / "one.snap", DrivenPath, id)
+
+
+def test_foreign_types_come_back(tmp_path: Path) -> None:
     keys, widths = pose_keys(np.arange(2)), [3, 3]
     blocks = np.asfortranarray(np.random.default_rng(0).normal(size=(7, 7)))
     conditional = gtsam.GaussianConditional(
@@ -48,16 +59,36 @@ def test_foreign_types_come_back() -> None:
     graph.push_back(gtsam.HessianFactor(graph))
     net.push_back(conditional)
     tree = KDTree(np.random.default_rng(1).normal(size=(50, 2)))
-    structure, numbers = Encoder({}).encode([graph, net, tree, Future(), conditional])
-    found, found_net, found_tree, future, alone = Decoder({}).decode(structure, numbers)
-    assert [type(found.at(k)) for k in range(4)] == [type(graph.at(k)) for k in range(4)]
+    ring = deque([1, 2], maxlen=2)
+    held = holder(graph=graph, net=net, tree=tree, future=Future(), alone=conditional, ring=ring)
+    found = back(held, tmp_path)
+    assert [type(found.graph.at(k)) for k in range(4)] == [type(graph.at(k)) for k in range(4)]
     for k in range(4):
-        one, other = found.at(k).augmentedInformation(), graph.at(k).augmentedInformation()
+        one, other = found.graph.at(k).augmentedInformation(), graph.at(k).augmentedInformation()
         np.testing.assert_array_equal(one, other)
-    np.testing.assert_array_equal(found_net.at(0).R(), conditional.R())
-    np.testing.assert_array_equal(alone.augmentedJacobian(), blocks)
-    np.testing.assert_array_equal(found_tree.query(np.ones((3, 2)))[1], tree.query(np.ones((3, 2)))[1])
-    assert future is None
+    np.testing.assert_array_equal(found.net.at(0).R(), conditional.R())
+    np.testing.assert_array_equal(found.alone.augmentedJacobian(), blocks)
+    np.testing.assert_array_equal(found.tree.query(np.ones((3, 2)))[1], tree.query(np.ones((3, 2)))[1])
+    assert found.future is None
+    assert found.ring == ring and found.ring.maxlen == 2
+
+
+def test_arrays_come_back_with_their_layout_and_whether_they_may_be_written(tmp_path: Path) -> None:
+    fixed = np.arange(6.0).reshape(2, 3)
+    fixed.flags.writeable = False
+    held = [np.zeros((2, 3), order="F"), fixed, np.array([True]), np.zeros((0, 2)), np.array([-0.0, np.nan])]
+    for one, other in zip(back(holder(held=held), tmp_path).held, held, strict=True):
+        assert one.tobytes() == other.tobytes() and (one.shape, one.dtype) == (other.shape, other.dtype)
+        assert one.flags.f_contiguous == other.flags.f_contiguous
+        assert one.flags.writeable == other.flags.writeable
+
+
+def test_what_is_held_twice_is_held_twice_and_may_hold_itself(tmp_path: Path) -> None:
+    array, one = np.zeros(2), holder()
+    vars(one).update(array=array, same=array, me=one, number=np.float64(0.1))
+    found = back(one, tmp_path)
+    assert found.array is found.same and found.me is found
+    assert type(found.number) is np.float64 and found.number == 0.1
 
 
 def test_another_estimator_is_not_restored_as_a_mapper(tmp_path: Path) -> None:
@@ -91,80 +122,132 @@ def test_the_other_online_estimators_go_on_to_the_same_state(kind: type[Estimato
     assert digest(restored) == digest(estimator)
 
 
-# --- the file --------------------------------------------------------------------------------------------
-
-STRUCTURE = {"root": [0], "text": "ä\n", "numbers": [1, -0.0, 5e-324, 1.7976931348623157e308]}
+# --- what cannot be saved --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("data", [b"", b"\n", b"\0\xff\n" * 5])
-def test_what_was_written_is_read(data: bytes, tmp_path: Path) -> None:
-    write(tmp_path / "a.snap", STRUCTURE, np.frombuffer(data, np.uint8))
-    structure, numbers = read(tmp_path / "a.snap")
-    assert structure == {"format": "pathspace-snapshot/2", **STRUCTURE}
-    assert numbers.tobytes() == data
+@dataclass
+class Foreign:
+    number: int = 0
 
 
-def test_it_is_an_archive_that_numpy_reads(tmp_path: Path) -> None:
-    save(CkfMapper(None, ODOMETRY_SIGMA), tmp_path / "a.snap")
-    with np.load(tmp_path / "a.snap", allow_pickle=False) as archive:
-        structure = json.loads(archive["structure"].tobytes())
-    assert structure["format"] == "pathspace-snapshot/2"
+@pytest.mark.parametrize(
+    ("held", "found"),
+    [
+        (Foreign(), "found a Foreign"),
+        (print, "found a builtin_function_or_method"),
+        (MapperSettings, "found a type"),
+        (np.array([{}]), "found one of object"),
+        (np.array(["text"]), "found one of <U4"),
+    ],
+)
+def test_what_cannot_be_saved_is_refused_and_leaves_no_file(held: Any, found: str, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=found):
+        save(holder(held=held), tmp_path / "one.snap")
+    assert not [*tmp_path.iterdir()]
+
+
+# --- what is refused -------------------------------------------------------------------------------------
+
+
+class Calls:
+    """Something whose pickle calls a function when it is read."""
+
+    def __init__(self, call: Callable[..., Any], *arguments: Any) -> None:
+        self.call, self.arguments = call, arguments
+
+    def __reduce__(self) -> Any:
+        return self.call, self.arguments
+
+
+def write(file: Path, content: bytes, head: str = SNAPSHOT) -> None:
+    """Write a snapshot with the digest that belongs to its content."""
+    file.write_bytes(b"\n".join([head.encode(), sha256(content).hexdigest().encode(), content]))
+
+
+OWN = "pathspace_graph.mapping.path"
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (Calls(os.system, "touch called"), f"found {os.name}.system"),
+        (Calls(eval, "print()"), "found builtins.eval"),
+        (Calls(getattr, "text", "upper"), "found builtins.getattr"),
+        (Calls(DrivenPath), f"found {OWN}.DrivenPath"),
+        (Calls(MapperSettings), "found pathspace_graph.settings.mapper.MapperSettings"),
+        (Calls(new, "os", "system"), "found 'os.system'"),
+        (Calls(new, "pathspace_graph.io.files", "Path"), "found 'pathspace_graph.io.files.Path'"),
+        (Calls(new, OWN, "np"), f"found '{OWN}.np'"),
+        (Calls(new, OWN, "Text"), f"found '{OWN}.Text'"),
+        (Calls(new, OWN, "DrivenPath.copy"), f"found '{OWN}.DrivenPath.copy'"),
+        (Calls(array_of, b"\0" * 8, "|O", (1,), "C", True), "expected one of the types"),
+        (Calls(array_of, b"\0" * 8, "<f8", (2,), "C", True), "cannot reshape"),
+        (Calls(array_of, b"\0" * 7, "<f8", (1,), "C", True), "buffer size"),
+        (Calls(array_of, b"", "<f8", (-1, 0, 10**18), "C", True), "ValueError"),
+        (np.array([{}]), "found numpy"),
+        ({"root": 1}, "found a dict"),
+        (None, "found a NoneType"),
+    ],
+)
+def test_a_file_calls_nothing_but_the_makers(
+    content: Any, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "a.snap", pickle.dumps(content))
+    with pytest.raises(InputError, match=r"a\.snap: expected a DrivenPath") as caught:
+        restore(tmp_path / "a.snap", DrivenPath, id)
+    assert told in str(caught.value) and "\n" not in str(caught.value)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.snap"]
+
+
+@pytest.mark.parametrize("content", [b"", b".", b"\x80\x05.", b"garos\nsystem\n.", b"\x80\xff."])
+def test_what_is_no_pickle_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    write(tmp_path / "a.snap", content)
+    with pytest.raises(InputError, match=r"a\.snap: expected a DrivenPath") as caught:
+        restore(tmp_path / "a.snap", DrivenPath, id)
+    assert "\n" not in str(caught.value)
 
 
 def test_no_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.snap", tmp_path):
         with pytest.raises(InputError, match="expected a snapshot, found"):
-            read(path)
+            restore(path, DrivenPath, id)
 
 
-def test_the_format_before_is_refused_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "a.snap").write_bytes(b"pathspace-snapshot/1\n" + b"0" * 64 + b"\n2\n{}\n\x80\x04\x95")
-    expected = r"a\.snap: expected pathspace-snapshot/2, found 'pathspace-snapshot/1'"
-    with pytest.raises(InputError, match=f"{expected}$"):
-        restore(tmp_path / "a.snap", CkfMapper, id)
-
-
-def test_a_pickle_is_never_read(tmp_path: Path) -> None:
-    file = tmp_path / "a.snap"
-    file.write_bytes(archive(b"", np.array([STRUCTURE], dtype=object)))
-    with pytest.raises(InputError, match="found another content"):
-        read(file)
-    with np.load(file, allow_pickle=True) as members:
-        assert members["numbers"][0] == STRUCTURE
+@pytest.mark.parametrize("head", ["pathspace-snapshot/2", f"{SNAPSHOT}.1", "", SNAPSHOT[:-1]])
+def test_another_format_or_version_is_refused_in_one_line(head: str, tmp_path: Path) -> None:
+    write(tmp_path / "a.snap", pickle.dumps(None), head)
+    with pytest.raises(InputError) as caught:
+        restore(tmp_path / "a.snap", DrivenPath, id)
+    assert str(caught.value).endswith(f"a.snap: expected {SNAPSHOT}, found {head!r}")
 
 
 def test_every_flipped_bit_and_every_cut_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "a.snap"
-    write(file, STRUCTURE, np.arange(3, dtype=np.uint8))
+    save(holder(array=np.zeros(1)), file)
     good = file.read_bytes()
     for at in range(len(good)):
         for damaged in (good[:at], good[:at] + bytes([good[at] ^ 1 << at % 8]) + good[at + 1 :]):
             file.write_bytes(damaged)
             with pytest.raises(InputError, match=r"a\.snap: expected") as caught:
-                read(file)
+                restore(file, DrivenPath, id)
             assert "\n" not in str(caught.value)
     file.write_bytes(good + b"\0")
     with pytest.raises(InputError, match="another content"):
-        read(file)
-
-
-def test_a_number_that_json_does_not_have_is_no_structure(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="Out of range float"):
-        write(tmp_path / "a.snap", {"root": float("nan")}, np.zeros(0, np.uint8))
-    assert not [*tmp_path.iterdir()]
+        restore(file, DrivenPath, id)
 
 
 def test_a_kill_at_any_step_leaves_the_old_file_or_the_new_one(tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
     file = folder / "a.snap"
-    write(file, {"root": "old"}, np.zeros(1, np.uint8))
+    save(holder(name="old"), file)
     steps = 0
-    for killed in kills(lambda: write(file, {"root": "new"}, np.zeros(1, np.uint8)), folder):
+    for killed in kills(lambda: save(holder(name="new"), file), folder):
         steps += killed
-        assert read(file)[0]["root"] in ("old", "new")
-        assert all(read(backup) for backup in folder.glob("a.snap.~*"))
-        write(file, {"root": "new"}, np.zeros(1, np.uint8))
+        assert restore(file, DrivenPath, id).name in ("old", "new")  # type: ignore[attr-defined]
+        assert all(restore(backup, DrivenPath, id) for backup in folder.glob("a.snap.~*"))
+        save(holder(name="new"), file)
         assert leftovers(folder) == []
     assert steps > 3
     assert {path.name for path in folder.iterdir()} == {"a.snap", "a.snap.~1~", "a.snap.~2~"}

@@ -107,7 +107,7 @@ class CkfMapper(_Filter):
         if self.closed:
             return
         recent = [*self._recent, (state.pose.copy(), detections)]
-        self._recent = [cycle for cycle in recent if cycle[1].t > detections.t - registration.WINDOW]
+        self._recent = [cycle for cycle in recent if cycle[1].t > detections.t - registration.REGISTERED_AGE]
         too_soon = self.path.length - self._last_check < settings.check_interval
         if too_soon or not state.curves or not near_start(self.path, state.pose, settings):
             return

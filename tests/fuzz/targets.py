@@ -6,14 +6,11 @@ Bytes before the first section are the content of the target's first file. The r
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
-
-import numpy as np
 
 from pathspace_graph.eval.experiment.study import read_study
 from pathspace_graph.io.log import read_log
@@ -22,7 +19,7 @@ from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.sim.track_files import read_track
-from pathspace_graph.snapshot import FORMAT, archive
+from pathspace_graph.snapshot import SNAPSHOT
 
 SECTION = re.compile(rb"(?:\A|(?<=\n))=== ([a-z_]+\.[a-z]+)\n")
 
@@ -62,19 +59,12 @@ def read_tracks(folder: Path) -> None:
 
 
 def read_snapshots(folder: Path) -> None:
-    """Reads a snapshot as it is, or of a structure and numbers, with the digest that belongs to them."""
-    structure = folder / "structure.json"
-    if structure.exists():
-        text, numbers = structure.read_bytes(), np.fromfile(folder / "numbers.bin", np.uint8)
-        (folder / "mapper.snap").write_bytes(archive(with_format(text), numbers))
+    """Reads a snapshot as it is, or of a pickle, with the format and the digest that belong to it."""
+    if (folder / "content.pickle").exists():
+        content = (folder / "content.pickle").read_bytes()
+        head = SNAPSHOT.encode(), sha256(content).hexdigest().encode()
+        (folder / "mapper.snap").write_bytes(b"\n".join([*head, content]))
     FixedLagMapper.restore(folder / "mapper.snap")
-
-
-def with_format(text: bytes) -> bytes:
-    """The structure with the format of now, unless it has another."""
-    with suppress(ValueError, TypeError, RecursionError):  # no structure at all is an input as well
-        return json.dumps({"format": FORMAT, **json.loads(text)}).encode()
-    return text
 
 
 LOG = {
@@ -91,6 +81,6 @@ TARGETS = {
     "trajectory": Target({"trajectory.tum": ""}, lambda folder: read_trajectory(folder / "trajectory.tum")),
     "track": Target({"track.yaml": "", "track.csv": ""}, read_tracks),
     "study": Target({"study.toml": ""}, lambda folder: read_study(folder / "study.toml")),
-    "snapshot": Target({"mapper.snap": "", "structure.json": "", "numbers.bin": "\0" * 64}, read_snapshots),
+    "snapshot": Target({"mapper.snap": "", "content.pickle": ""}, read_snapshots),
     "manifest": Target({"manifest.json": "", "odometry.csv": LOG["odometry.csv"]}, verify_all),
 }

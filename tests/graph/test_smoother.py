@@ -371,7 +371,7 @@ def test_a_reading_that_goes_in_or_out_of_use_makes_its_cycle_stale(into_use: bo
 def test_the_steps_system_is_that_of_the_graph_at_the_estimate() -> None:
     """Everything is linearized again here: no factor is stale, missing or counted twice."""
     settings = MapperSettings(relinearize=RelinearizeSettings(1e-12, 1e-12))
-    smoother = drive_bean(settings, 25).smoother
+    smoother = drive_bean(settings, 25).road.smoother
     assert len(smoother.inactive) == 0
     smoother.factorize()
     assert smoother.last_step is not None
@@ -411,7 +411,8 @@ def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(to
     """The newest pose was not in the step: its odometry predicts it and adds noise."""
     mapper = drive_bean(MapperSettings(), 59)
     smoother, odometry = mapper.road.smoother, list(split_odometry(lap_log(bean_track(), 0.0)))[59]
-    mapper._predict(mapper.front_end.update(*odometry))
+    reading = mapper.front_end.update(*odometry)
+    mapper.road.predict(reading.motion, reading.orange)
     step = smoother.last_step
     assert step is not None
     lower = np.tril(step.factor)
@@ -444,7 +445,7 @@ def test_predicted_is_that_of_the_dense_joint_covariance_with_the_newest_pose(to
 
 
 def test_covariance_is_the_dense_inverse_of_the_graph_at_the_estimate() -> None:
-    smoother = drive_bean(MapperSettings(), 60).smoother
+    smoother = drive_bean(MapperSettings(), 60).road.smoother
     smoother.refresh()
     hessian, _ = normal_equations(smoother.linear_graph(), smoother.layout)
     keys = np.append(pose_keys(np.array([59, 45])), smoother.layout.keys[[3, 0]])

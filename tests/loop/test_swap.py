@@ -30,7 +30,6 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes import laps
 from ..scenes.drives import (
     Mapped,
     bean_track,
@@ -44,6 +43,7 @@ from ..scenes.drives import (
 )
 from ..scenes.drives import noisy_lap as log
 from ..scenes.graph import columns_of, dense_rows
+from ..shared import laps
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -8,8 +8,8 @@ from scipy.linalg import lapack
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.residuals import sigma_across
-from pathspace_graph.factors.se2 import compose, left_of, se2_exp, wrap_angle
-from pathspace_graph.factors.sensor import by_sensor, sensor_rows
+from pathspace_graph.factors.se2 import compose, in_vehicle, left_of, se2_exp, wrap_angle
+from pathspace_graph.factors.sensor import RANGE, by_range, by_sensor
 
 
 def to_map(points_vehicle: Array, poses: Array) -> Array:
@@ -22,6 +22,20 @@ def to_map(points_vehicle: Array, poses: Array) -> Array:
 def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
     """Return `z + C b` (m, 2) of detections z (m, 2), with C of `by_sensor` and a calibration b (5,)."""
     return np.asarray(measured + by_sensor(measured, twists) @ sensor)
+
+
+def sensor_terms(
+    directions: Array, residual: Array, poses: Array, measured: Array, twists: Array, sensor: Array
+) -> tuple[Array, Array]:
+    """Return factors `f = 1 + rates b` (m,) and derivatives `f d' R C + r rates` (m, 5) by b."""
+    if len(sensor) == 0:
+        return np.ones(len(residual)), np.zeros((len(residual), 0))
+    along = in_vehicle(directions, poses)
+    rates = np.einsum("mi,mkij,mj->mk", along, by_range(measured), along)
+    factor = 1.0 + rates @ sensor[RANGE]
+    jacobian = np.einsum("mi,mik->mk", along, by_sensor(measured, twists)) * factor[:, None]
+    jacobian[:, RANGE] += residual[:, None] * rates
+    return factor, jacobian
 
 
 def detection_rows(
@@ -39,12 +53,12 @@ def detection_rows(
     """Return residuals (m,) and sigmas (m,) of `project`, and derivatives by [pose | sensor | controls]."""
     arm = points_map - poses[:, :2]
     by_theta = normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1]
-    by = sensor_rows(normals, distances, poses, measured, twists, sensor)
+    factors, by_calibration = sensor_terms(normals, distances, poses, measured, twists, sensor)
     by_pose = np.concatenate([normals, by_theta[:, None]], axis=1)
     by_control = (-basis[:, :, None] * normals[:, None, :]).reshape(len(basis), 2 * basis.shape[1])
-    factor = by.factor[:, None]
-    jacobian = np.concatenate([factor * by_pose, by.by_sensor, factor * by_control], axis=1)
-    return by.factor * distances, sigma_across(normals, covariances, poses, sigma_model), jacobian
+    factor = factors[:, None]
+    jacobian = np.concatenate([factor * by_pose, by_calibration, factor * by_control], axis=1)
+    return factors * distances, sigma_across(normals, covariances, poses, sigma_model), jacobian
 
 
 def station_rows(

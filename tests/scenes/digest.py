@@ -15,7 +15,10 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.front_end.gate import Gate
 
-NOT_ESTIMATED = ("lap_seconds", "late_cycles", "failures", "_unused", "_first_pose")
+NOT_ESTIMATED = (
+    *("lap_seconds", "late_cycles", "failures", "_unused"),
+    *("_first_pose", "_curves", "_whole_curves"),
+)
 """These attributes are times of the machine, what is kept for a failure, and caches."""
 
 

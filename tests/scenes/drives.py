@@ -23,7 +23,7 @@ from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate
 from pathspace_graph.sim.vehicle import VehicleSettings, drive, integrate
 
 from ..oracles.copied import copied
-from .session import once, pickled, unpickled
+from ..shared.session import once, pickled, unpickled
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from .scenes import session
-from .scenes.session import FOLDER, once
+from . import session
+from .session import FOLDER, once
 
 OTHER_WORKER = """
 import runpy, sys

@@ -1,0 +1,213 @@
+"""Copies of a mapper, which a failed cycle goes back to: they stay as they are, and go on as it does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pathspace_graph import FixedLagMapper
+from pathspace_graph.front_end.front_end import FrontEnd
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.labels import LEFT
+from pathspace_graph.loop.closed import Closed
+from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.lost import Lost
+from pathspace_graph.loop.map_repair import REPAIRED
+from pathspace_graph.loop.open import Open
+from pathspace_graph.mapping.road import Road
+from pathspace_graph.online.fixed_lag import _Before
+from pathspace_graph.run import split_odometry
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track import skidpad
+
+from .oracles.copied import copied
+from .scenes.digest import digest
+from .scenes.drives import beginning, map_beginning, noisy_lap, replay
+from .scenes.holes import unseen
+from .scenes.kidnapped import laps_log, pear_track, put_down
+
+EVERY = 23
+"""Cycles from one pair of copies to the next: no multiple of the periods at which things are done."""
+GOES_ON = 50
+"""Cycles of the original after which its copies are looked at."""
+PARTS = "front_end", "road", "drive", "phase", "health"
+"""Attributes of a mapper that a cycle changes."""
+
+
+def closing() -> Log:
+    """Return a lap and 40 m more: open, with a batch under way, and closed."""
+    return noisy_lap()
+
+
+def revisiting() -> Log:
+    """Return both rounds to the right of a skidpad, the second of which is a revisit."""
+    return beginning(simulate(skidpad(), SimulationSettings(), seed=2), 180)
+
+
+def repairing() -> Log:
+    """Return laps with a hole in the first one, which is repaired in the second."""
+    log = unseen(laps_log(pear_track()), [LEFT], 6.0, 11.0)
+    return replace(log, cycles=log.cycles[:350])
+
+
+def losing() -> Log:
+    """Return laps of a vehicle that is put down elsewhere in the second one."""
+    log = put_down(laps_log(pear_track()), 20.0, 30.0)
+    return replace(log, cycles=log.cycles[:300])
+
+
+DRIVES = [
+    closing,
+    revisiting,
+    pytest.param(repairing, marks=pytest.mark.slow),
+    pytest.param(losing, marks=pytest.mark.slow),
+]
+
+
+def state_of(held: _Before | FixedLagMapper) -> str:
+    """Return the digest of what a cycle changes, of a mapper or of a copy of it."""
+    return digest({name: getattr(held, name) for name in PARTS})
+
+
+@cache
+def ended(log: Log) -> tuple[str, list[str]]:
+    """Return the digest of a mapper after a drive, and the names of its phases and of what was met."""
+    mapper, met = FixedLagMapper(None, log.odometry_sigma), []
+    for cycle in split_odometry(log):
+        result = replay(mapper, *cycle)
+        busy = "batch" if mapper.drive.solver.is_busy else ""
+        repaired = "repaired" if result.notice.startswith(REPAIRED) else ""
+        new_road = "new road" if isinstance(mapper.phase, Lost) and mapper.phase.new_road else ""
+        met += [type(mapper.phase).__name__, busy, repaired, new_road]
+        met += ["revisit"] if mapper.revisits else []
+    return state_of(mapper), sorted({*met} - {""})
+
+
+@cache
+def log_of(make: Any) -> Log:
+    log: Log = make()
+    return log
+
+
+@pytest.mark.parametrize(
+    ("make", "met"),
+    [
+        (closing, ["Closed", "Open", "batch"]),
+        (revisiting, ["Open", "revisit"]),
+        pytest.param(repairing, ["Closed", "Open", "batch", "repaired"], marks=pytest.mark.slow),
+        pytest.param(losing, ["Closed", "Lost", "Open", "batch", "new road"], marks=pytest.mark.slow),
+    ],
+)
+def test_the_drives_meet_what_they_are_for(make: Any, met: list[str]) -> None:
+    assert set(ended(log_of(make))[1]) >= set(met)
+
+
+@pytest.mark.parametrize("make", DRIVES)
+def test_a_mapper_that_is_given_back_in_every_cycle_ends_with_the_same_bits(make: Any) -> None:
+    log = log_of(make)
+    mapper = FixedLagMapper(None, log.odometry_sigma)
+    for cycle in split_odometry(log):
+        _Before.of(mapper).give_back(mapper)
+        replay(mapper, *cycle)
+    assert state_of(mapper) == ended(log)[0]
+
+
+@pytest.mark.parametrize("make", DRIVES)
+def test_a_copy_stays_as_it_is_whatever_the_original_does(make: Any) -> None:
+    """It is held against a deep copy of that moment, and goes on as the original has done."""
+    log, copies = log_of(make), {}
+    mapper = FixedLagMapper(None, log.odometry_sigma)
+    for k, cycle in enumerate(split_odometry(log)):
+        if k % EVERY == 0:
+            copies[k] = _Before.of(mapper), digest(copied({name: getattr(mapper, name) for name in PARTS}))
+        before, known = copies.get(k - GOES_ON, (None, ""))
+        if before is not None:
+            assert state_of(before) == known
+        replay(mapper, *cycle)
+    assert len(copies) > 5
+    for before, known in copies.values():
+        assert state_of(before) == known
+    _, (before, _) = list(copies.items())[-2]
+    other = FixedLagMapper(None, log.odometry_sigma)
+    before.give_back(other)
+    for k, cycle in enumerate(split_odometry(log)):
+        if k >= [*copies][-2]:
+            replay(other, *cycle)
+    assert state_of(other) == state_of(mapper)
+
+
+# --- a step that fails -----------------------------------------------------------------------------------
+
+STAGES = [
+    (FrontEnd, "update"),
+    *((Road, name) for name in ("predict", "classify", "expand", "update", "marginalize")),
+    *((DriveRecord, name) for name in ("measured", "estimated")),
+    *((Open, name) for name in ("judge", "step")),
+]
+"""Methods that a cycle of an open road calls."""
+CLOSED = [(Closed, "judge"), (Closed, "step"), (Road, "update"), (Road, "marginalize")]
+
+
+@contextmanager
+def failing(stage: tuple[type, str], times: int) -> Iterator[None]:
+    """Let a method fail so many times, when its work is done."""
+    owner, name = stage
+    works, left = getattr(owner, name), [times]
+
+    def fails(*arguments: Any, **options: Any) -> Any:
+        found = works(*arguments, **options)
+        if left[0] > 0:
+            left[0] -= 1
+            raise np.linalg.LinAlgError("no convergence")
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(owner, name, fails)
+        yield
+
+
+def at_cycle(log: Log, cycle: int) -> tuple[FixedLagMapper, list[tuple[Odometry, Detections]]]:
+    """Return a mapper of its own after the first cycles, and the ten that follow."""
+    mapper, _ = map_beginning(log, cycle)
+    return mapper, [*islice(split_odometry(log), cycle, cycle + 10)]
+
+
+@pytest.mark.failing
+@pytest.mark.parametrize(
+    ("stage", "cycle"), [*((stage, 40) for stage in STAGES), *((stage, 165) for stage in CLOSED)]
+)
+def test_a_cycle_that_fails_leaves_no_trace(stage: tuple[type, str], cycle: int) -> None:
+    mapper, (first, *rest) = at_cycle(log_of(closing), cycle)
+    assert mapper.closed == (cycle == 165)
+    before, rested = digest(mapper), copied(mapper)
+    with failing(stage, 1), pytest.raises(np.linalg.LinAlgError, match="no convergence"):
+        mapper.update(*first, strict=True)
+    assert digest(mapper) == before and mapper.failures == 0
+    with failing(stage, 1):
+        notice = mapper.update(*first).notice
+    assert notice.startswith("an update failed: LinAlgError: no convergence; the loop is left as it is")
+    rested.drive.rest(rested.road)
+    rested.update(*first)
+    for one in (mapper, rested):
+        for later in rest:
+            replay(one, *later)
+    assert digest(mapper) == digest(rested) and mapper.failures == 1
+
+
+@pytest.mark.failing
+def test_a_cycle_in_which_every_attempt_fails_is_left_out() -> None:
+    mapper, (first, second, *_) = at_cycle(log_of(closing), 40)
+    before, other = digest(mapper), copied(mapper)
+    with failing((Road, "update"), 3):
+        result = mapper.update(*first)
+    assert digest(mapper) == before and result.notice.endswith("the cycle is not used")
+    mapper.update(*second)
+    other.update(first[0].followed_by(second[0]), second[1])  # its twists are not lost
+    assert digest(mapper) == digest(other)
