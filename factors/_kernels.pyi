@@ -117,11 +117,19 @@ def detection_rows(
     sensor: Array,
     sigma_model: float,
 ) -> tuple[Array, Array, Array]:
-    """Return residuals (m,) and sigmas (m,) of `project`, and derivatives by [pose | sensor | controls].
+    """Return `r = n . (p - S(u))` (m,) with u the foot point of p, their sigmas (m,), and derivatives.
 
-    normals (m, 2), distances (m,) and basis (m, p + 1) are of the foot points. Residuals and derivatives
-    (m, 3 + 5 + 2 p + 2) are multiplied by the factor of `sensor:sensor_rows`, where the detections were
-    measured at (m, 2), vehicle frame, with twists (m, 3), and the sensor's calibration (5,) is not empty.
+    normals n (m, 2), distances r (m,) and basis beta (m, p + 1) are of the foot points, and sigmas those of
+    `residuals:sigma_across`. At an interior foot point every term through u vanishes, so with J the quarter
+    turn and a = p - t the arm from the pose,
+
+        dr/dt = n,   dr/dtheta = n . (J a),   dr/dc_j = -beta_j(u) n
+
+    Derivatives (m, 3 + 5 + 2 p + 2) are by [pose | sensor | controls]. Where the sensor's calibration b (5,)
+    is not empty, residuals and derivatives are multiplied by `f = 1 + rates b`, with `rates = n' R (d M^-1)
+    R' n` of `sensor:by_range`, since noise is stated for measured detections. Those by b are `f n' R C + r
+    rates`, with C of `sensor:by_sensor`: the detections were measured at (m, 2), vehicle frame, with twists
+    (m, 3).
     """
 
 def station_rows(
