@@ -176,7 +176,6 @@ ASSIGNED = {
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "eval.view.animation": {"writer.fig"},  # of matplotlib
-    "front_end.motion": {"self._rest.sigma"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
     "baselines.landmark_association": {"detections.landmark"},
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},

@@ -5,6 +5,7 @@ from typing import ClassVar, Final, Self
 import numpy as np
 from scipy.linalg import block_diag
 
+from pathspace_graph.baselines.ckf_belief import HEAD, Belief, point_columns
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import left_of, to_map
 from pathspace_graph.front_end.front_end import Reading
@@ -16,7 +17,6 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.loop.closing import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping import registration
-from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import Motion, near_start

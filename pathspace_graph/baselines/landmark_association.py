@@ -9,6 +9,7 @@ import scipy  # which imports its modules when they are used
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
 from pathspace_graph.factors.sensor import by_sensor
+from pathspace_graph.graph.changes import merge_points
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.tentative import nearest_within
@@ -172,6 +173,6 @@ def compatible_pairs(newer: IntArray, older: IntArray, offset: Array, covariance
 def merge(smoother: LandmarkSmoother, gone: IntArray, kept: IntArray) -> None:
     """Merge the landmarks at positions `gone` (k,) into those at `kept` (k,), and make one step."""
     keys = smoother.map.state.keys
-    smoother.merge(keys[gone], keys[kept])
+    merge_points(smoother, keys[gone], keys[kept])
     smoother.map.merge(gone, kept)
     smoother.step()

@@ -11,6 +11,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile
 from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.graph.changes import solve_loop
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.map import Map
@@ -252,4 +253,4 @@ def detect_loop(
 def optimize_loop(smoother: LandmarkSmoother, recent: IntArray, old: IntArray) -> None:
     """Solve the whole loop with pairs (k,) held together; merge them later."""
     smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([recent, old])]
-    smoother.solve_loop(smoother.map.settings.closing.iterations, None)
+    solve_loop(smoother, smoother.map.settings.closing.iterations, None)

@@ -16,8 +16,10 @@ import numpy as np
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import left_of, rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
 
 ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
@@ -40,6 +42,14 @@ HUBER: Final = 2.5  # whitened distance beyond which the Huber loss reduces the 
 SIGMA_CONE: Final = 0.05  # added to a detection's, m, since one side of a cone is seen
 LEAST_SHARE: Final = 1e-6  # least det of a pose's information by the product of its diagonal
 MOST_MISFIT: Final = 9.0  # largest whitened square in a misfit that is compared with another
+MIN_DOUBTING: Final = 4  # least number of matched detections of a contradiction
+MISFIT: Final = 1.5  # mean-square misfit beyond which its excess scales the detections' covariances
+MISFIT_GAIN: Final = 0.02  # smoothing gain of the mean-square misfit
+MAX_MISFIT: Final = 3.0  # largest misfit of a motion: 1 where the vehicle moved, 4 where it was put down
+MISFIT_ODOMETRY: Final = 2.0  # least misfit at the odometry's own pose in a contradiction
+MISFIT_RATIO: Final = 1.3  # least ratio of that misfit to the one of the match
+Seen = tuple[Array, Array]
+"""Corrected detections (m, 2), vehicle frame, and variances (m,) of a coordinate."""
 _TINY: Final = float(np.finfo(float).tiny)
 
 
@@ -210,3 +220,74 @@ class SensorErrors:
         """Learn from a match that agrees, dt (s) after the last; it counts by its share of memory."""
         measured = difference.off, difference.covariance, difference.shifts, min(dt / MEMORY, 1.0)
         self.mean, self.covariance = kernels.learned(self.mean, self.covariance, dt * self._drift, *measured)
+
+
+# --- matches of each cycle -------------------------------------------------------------------------------
+
+
+class ScanMatcher:
+    """Matches of each cycle with the newest ones, and what they show of the sensor and its noise."""
+
+    def __init__(self, settings: MotionSettings) -> None:
+        self._settings = settings
+        self._misfit = 1.0  # mean of those of the matches that agreed, the newest counting most
+        self.forget()
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other.recent, other.errors = self.recent.copy(), self.errors.copy()
+        return other
+
+    def forget(self) -> None:
+        """Forget the newest cycles, and what was learned of the sensor."""
+        self.recent, self.errors = RecentDetections(), SensorErrors(self._settings)
+
+    @property
+    def excess(self) -> float:
+        """Factor by which the variance of detections is larger than they claim; at least 1."""
+        return max(self._misfit / MISFIT, 1.0)
+
+    def corrected(self, detections: Detections, twist: Array) -> Seen:
+        """Return a cycle's detections by the errors of the sensor, and correct the remembered ones."""
+        measured, covariances = detections.points_vehicle, detections.covariances
+        self.recent.forget(detections.t)
+        self.recent.correct(self.errors.mean)
+        points = measured + by_errors(measured, twist) @ self.errors.mean
+        return points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
+
+    def remember(self, detections: Detections, twist: Array, pose: Array) -> None:
+        """Remember a cycle that was seen from a pose (3,), in motion by a twist (3,)."""
+        measured = detections.points_vehicle
+        self.recent.add(detections.t, measured, by_errors(measured, twist), pose)
+
+    def match(self, seen: Seen, start: Array, reaches: Sequence[float]) -> Match | None:
+        """Return the match of detections from a pose (3,), unless it leaves the pose open."""
+        matched = match(self.recent, *seen, start, reaches)
+        return matched if matched.matched >= MIN_MATCHED and matched.is_certain else None
+
+    def difference(self, matched: Match, odometry: IntegratedOdometry, predicted: Array) -> Difference:
+        """Return how far a match is from the pose (3,) that odometry predicts, in the vehicle's frame."""
+        known = matched.pose, matched.information, self.excess, predicted, odometry.covariance
+        way = rotation(predicted[2]).T @ (predicted[:2] - self.recent.seen_from)
+        return Difference(*kernels.off_prediction(*known), self.errors.shifts(way, odometry.twist))
+
+    def denies(self, matched: Match, difference: Difference, limit: float) -> bool:
+        """Return whether a match is more than `limit` sigmas off the odometry."""
+        return matched.matched >= MIN_DOUBTING and self.errors.square_of(difference) > limit**2
+
+    def agree(self, matched: Match, difference: Difference, dt: float) -> None:
+        """Learn from a match that agrees with the odometry, dt (s) after the cycle before."""
+        self._misfit += MISFIT_GAIN * (matched.misfit - self._misfit)
+        self.errors.update(difference, dt)
+
+    def fits(self, matched: Match) -> bool:
+        """Return whether the misfit of a match is that of a motion."""
+        return matched.misfit < MAX_MISFIT * self.excess
+
+    def fits_better(self, matched: Match, predicted: Array, seen: Seen) -> bool:
+        """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
+        points, variances = (column[matched.is_matched] for column in seen)
+        at_odometry = misfit_at(self.recent, points, variances, predicted)
+        at_match = misfit_at(self.recent, points, variances, matched.pose)
+        return at_odometry > max(MISFIT_ODOMETRY, MISFIT_RATIO * at_match)

@@ -13,10 +13,10 @@ import numpy as np
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.front_end.cone_rows import ConeRow, deal_out
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.path import SIDES, DrivenPath, PathAhead, in_front_row
-from pathspace_graph.mapping.rows import ConeRow, deal_out
+from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, DrivenPath, PathAhead, in_front_row
 from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.online import SidesSettings
 
@@ -34,8 +34,6 @@ MAX_CONES: Final = 2000  # largest number of cones that are remembered, the ones
 SIGHTINGS: Final = 2  # detections from which a cone has a side
 BEHIND: Final = 8.0  # length behind the vehicle at which the rows begin, m along the path
 SURE: Final = 3.0  # length ahead of it up to which the path tells sides, m; beyond, the rows do
-BESIDE: Final = 2.0  # distance along the path within which cones stand beside each other, m
-LATERAL_GAP: Final = 0.8  # distance from a nearer cone beside it beyond which a cone is of another stretch, m
 HALF_WIDTH: Final = 1.5  # distance beside the vehicle at which a row without any cone begins, m
 
 

@@ -27,19 +27,16 @@ from .gaussian import (
     factorize,
     graph_of,
     marginalize,
-    merge_variables,
     remove_information,
     solve,
     sparse_marginal,
-    substitute_points,
 )
 from .inactive import Attached, InactiveChain, InactiveMap
-from .relative import RelativeFactor, Submaps
+from .relative import Submaps
 from .rows import Rows, calibrated_delta, newton_system, predicted_covariance
-from .variables import CALIBRATION_KEY, POINT, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys
+from .variables import CALIBRATION_KEY, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys
 from .window import M_co, SmootherSettings, UserFactors, WindowFactors, check_factors
 
-STIFFNESS: Final = 1e4  # information about a gauge that is held, by that from measurements
 TIME_TOLERANCE: Final = 1e-9  # by which a pose must be older than the lag (s), since stamps have round-off
 
 
@@ -91,7 +88,8 @@ class FixedLagSmoother(Generic[M_co]):
         return [key - pose_key(0) for key in self.submaps.keyframes] if self.submaps is not None else []
 
     @property
-    def _cycles(self) -> IntArray:
+    def cycles(self) -> IntArray:
+        """Return the cycles (P,) whose poses are in the window."""
         return np.arange(self.first_cycle, self.next_cycle)
 
     @property
@@ -193,7 +191,7 @@ class FixedLagSmoother(Generic[M_co]):
 
         SingularSystemError where the system is not positive definite.
         """
-        while not self.window.relinearize(self._cycles, self.inactive.keys) and len(self.inactive):
+        while not self.window.relinearize(self.cycles, self.inactive.keys) and len(self.inactive):
             self.activate(self.inactive.newest)  # rare: a detection has moved to where the map is inactive
         user = self.user_factors.linearized(self.variables)
         layout, entries = self.inactive.active(self.variables.layout)
@@ -218,7 +216,7 @@ class FixedLagSmoother(Generic[M_co]):
             prior = self.chain.joint(self.prior, self.variables)
         else:
             prior = self.inactive.joint_prior(self.prior)
-        fresh = self.window.fresh(self._cycles, whole and self.chain is None)
+        fresh = self.window.fresh(self.cycles, whole and self.chain is None)
         return graph_of(prior, *fresh, *self.user_factors.linearized(self.variables, whole))
 
     def absolute_prior(self) -> gtsam.GaussianFactorGraph:
@@ -254,7 +252,7 @@ class FixedLagSmoother(Generic[M_co]):
         if whole:
             return factorize(self.linear_graph(whole), self.variables.layout).covariance(keys)
         graph = graph_of(self.absolute_prior(), *self.user_factors.linearized(self.variables))
-        layout, rows = self.layout, self.window.fresh_rows(self._cycles)
+        layout, rows = self.layout, self.window.fresh_rows(self.cycles)
         hessian, _ = newton_system(graph, rows, layout, np.zeros(layout.size))
         return FactoredSystem(layout, cholesky(hessian)).covariance(keys)
 
@@ -286,9 +284,10 @@ class FixedLagSmoother(Generic[M_co]):
         if key not in self.inactive.anchors:
             self.prior = marginalize(self.prior, np.array([key]))
             self.variables.remove(np.array([key]))
-        self._drop_oldest(cycle)
+        self.drop_oldest(cycle)
 
-    def _drop_oldest(self, cycle: int) -> None:
+    def drop_oldest(self, cycle: int) -> None:
+        """Drop what the window holds of the oldest pose, that of a cycle."""
         self.times.pop(0)
         self.window.odometry.drop_first()
         self.map.drop_cycle(cycle)
@@ -323,7 +322,7 @@ class FixedLagSmoother(Generic[M_co]):
             return
         self._finish_submap()
         self.prior = self.chain.transform_to_origin(self.prior, self.variables, self.attached)
-        self.window.relinearize(self._cycles, self.inactive.keys)
+        self.window.relinearize(self.cycles, self.inactive.keys)
 
     def refresh(self) -> None:
         self.inactive.refresh(self.variables)
@@ -362,7 +361,7 @@ class FixedLagSmoother(Generic[M_co]):
         self.inactive = InactiveMap()
         self.user_factors.reactivate()
         if with_prior:
-            self._marginalize_keyframes()
+            self.marginalize_keyframes()
         self.map.activate_all()
 
     def _place_keyframes(self, chain: InactiveChain) -> None:
@@ -371,126 +370,16 @@ class FixedLagSmoother(Generic[M_co]):
             active = {int(key): self.variables.of(np.array([key])) for key in anchors}
             self.submaps.place_attached(chain.poses | active)
 
-    def _marginalize_keyframes(self) -> None:
+    def marginalize_keyframes(self) -> None:
+        """Marginalize the poses that are older than the window."""
         keyframes = self.variables.keyframes
         self.prior = marginalize(self.prior, keyframes)
         self.variables.remove(keyframes)
 
-    # --- what happens once: closing, other variables, another prior --------------------------------------
-
-    def revisit(
-        self, measured: RelativeFactor, iterations: int, sigma_step: float | None
-    ) -> dict[int, Array]:
-        """Optimize an open map with the window's oldest pose measured in the frame of a keyframe.
-
-        The measurement is one of the submaps from now on. Return the poses (3,) of the keyframes by cycle.
-        """
-        assert self.submaps is not None
-        submaps = self.submaps
-        submaps.finish(self.variables)
-        submaps.finished.append(measured)
-        keyframes = self.solve_loop(iterations, sigma_step)
-        self.submaps = submaps
-        return keyframes
-
-    def solve_loop(self, iterations: int, sigma_step: float | None) -> dict[int, Array]:
-        """Optimize the whole loop on its submaps, each relinearized in its own frame.
-
-        Return the poses (3,) of the keyframes by cycle. Without submaps, since a user's factors are absolute,
-        the prior keeps its linearization point, and there are no keyframes.
-        """
-        self.reactivate(with_prior=self.submaps is None)
-        submaps, self.submaps = self.submaps, None
-        if submaps is not None:
-            submaps.finish(self.variables)
-            submaps.insert_keyframes(self.variables)
-        for _ in range(iterations):
-            if submaps is not None:
-                self.prior = submaps.graph(self.variables)
-            self.step(sigma_step)
-        keyframes = submaps.place(self.variables) if submaps is not None else {}
-        self._marginalize_keyframes()
-        return keyframes
-
-    def substitute(self, old: IntArray, new: IntArray, points: Array, change: Array, sigma: float) -> None:
-        """Replace map points `old` (n,) by `new` (k,) at `points` (k, 2): `c_old = E c_new + N(0, sigma^2)`.
-
-        E is `change` (n, k). The prior of the old points is carried over, reduced by a shift of sigma (m).
-        """
-        user = self.user_factors.remove(old, self.variables)
-        reference = self.variables.reference[self.variables.layout.entries(old)]
-        offset = np.kron(change, np.eye(POINT)) @ points.ravel() - reference
-        self.prior = substitute_points(graph_of(self.prior, *user), old, new, change, offset, sigma)
-        self.variables.remove(old)
-        self.variables.insert(new, points.ravel())
-        self.window.clear()
-
-    def merge(self, removed: IntArray, kept: IntArray) -> None:
-        """Merge map points `removed` (k,) into points `kept` (k,), which keep their values.
-
-        Submaps do not follow, so the loop must be closed. The map's rows must be on the kept keys afterwards.
-        """
-        user, layout = self.user_factors.remove(removed, self.variables), self.variables.layout
-        reference = self.variables.reference
-        offset = reference[layout.entries(kept)] - reference[layout.entries(removed)]
-        self.prior = merge_variables(graph_of(self.prior, *user), removed, kept, offset)
-        self.variables.remove(removed)
-        self.window.clear()
-
     def remove_information(self, keys: IntArray) -> None:
+        """Remove what the prior says about map points (k,), which become active."""
         self.activate(keys)
         now = self.variables.change(self.variables.layout.entries(keys))
         self.prior = remove_information(self.prior, Layout(keys), now)
         if self.submaps is not None:
             self.submaps.remove_information(keys, self.variables)
-
-    def hold_gauge(self, keys: IntArray, across: Array) -> None:
-        """Hold where a closed map as a whole is, and go on to estimate its shape.
-
-        The rows C `across` (3, 2k) give the rigid motion (x, y, theta) by `C dx`, for moves dx of the points
-        (k,), ascending.
-        """
-        self.reactivate()
-        known = self.covariance(keys)
-        information = STIFFNESS * np.linalg.inv(across @ known @ across.T)
-        root = np.linalg.cholesky(information).T @ across
-        self.prior = graph_of(self.prior, absolute_factor(keys, root, self.variables))
-        self.held = HeldMap(keys, known)
-
-    def forget_poses(self, first_cycle: int) -> None:
-        """Remove the poses before `first_cycle`, and all prior information about where the poses are.
-
-        The later poses keep their odometry, and one of them must be given a prior by `add_pose_prior`.
-        """
-        self.reactivate()
-        self.submaps = None
-        leaving = pose_keys(np.arange(self.first_cycle, first_cycle))
-        user = self.user_factors.remove(leaving, self.variables)
-        self.prior = marginalize(graph_of(self.prior, *user), pose_keys(self._cycles))
-        self._drop_before(first_cycle)
-
-    def restart(self, first_cycle: int, removed: IntArray, added: IntArray, points: Array) -> None:
-        """Replace map points `removed` (n,) by `added` (k,) at `points` (k, 2), and drop the prior.
-
-        Poses before `first_cycle` leave the window. A new prior must be set, on all that remains.
-        """
-        self.submaps, self.inactive = None, InactiveMap()
-        self.held, self.prior = None, gtsam.GaussianFactorGraph()
-        self.variables.remove(np.append(self.variables.keyframes, removed))
-        self._drop_before(first_cycle)
-        self.variables.insert(added, points.ravel())
-
-    def _drop_before(self, first_cycle: int) -> None:
-        """Remove the poses before a cycle, and all factors of the window."""
-        leaving = np.arange(self.first_cycle, first_cycle)
-        for cycle in leaving.tolist():
-            self._drop_oldest(cycle)
-        self.variables.first_cycle = first_cycle
-        self.variables.remove(pose_keys(leaving))
-        self.window.clear()
-
-    def set_prior(self, keys: IntArray, mean: Array, information: Array) -> None:
-        """Set the prior to a Gaussian of ascending keys (k,), with mean (n,) and information (n, n)."""
-        root = np.asarray(np.linalg.cholesky(information).T, np.float64)
-        prior = absolute_factor(keys, root, self.variables, mean)
-        self.prior = graph_of(gtsam.HessianFactor(graph_of(prior)))

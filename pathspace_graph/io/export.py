@@ -222,7 +222,7 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
 
     left, right = (boundary.spline for boundary in track.curves("lanelet2"))
     closed = left.periodic
-    line = find_line(left, right, closed)
+    line = find_line(left, right)
     cuts = np.linspace(*line.ribbon.domain, _PIECES + 1)[: _PIECES if closed else 0]
     ways = []
     for spline, crossing in zip((left, right), line.crossings(cuts), strict=True):

@@ -145,7 +145,7 @@ class Map:
         """
         left, right = self.curves("a centre line")
         covariance = self.covariance_of(left, right)
-        return centre_line(left.spline, right.spline, covariance, left.spline.periodic, step)
+        return centre_line(left.spline, right.spline, covariance, step)
 
     @property
     def splines(self) -> dict[int, BSpline]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.spline.centre_line import RIBBON_SPACING, Ribbon, find_line
+from pathspace_graph.spline.centre_line import Ribbon, find_line
 
 from .map import NO_COVARIANCE, Map, SplineBoundary
 
@@ -28,7 +28,7 @@ def ribbon_of(track: Map) -> tuple[Ribbon, Array | None, dict[int, float]]:
     curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
     P = track.covariance_of(*curves.values())
     left, right = (curve.spline for curve in curves.values())
-    line, until = find_line(left, right, left.periodic, RIBBON_SPACING), {}
+    line, until = find_line(left, right), {}
     for side, (label, curve) in enumerate(curves.items()):
         if not left.periodic:
             end = np.array([min(curve.confirmed_until, curve.spline.domain[1])])

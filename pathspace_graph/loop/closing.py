@@ -2,7 +2,7 @@
 
 `mapping.registration.register` finds the correspondences between the newest detections and the beginning of
 the curves. `apply_correspondences` moves the window there and associates the detections with the oldest
-control points, `FixedLagSmoother.solve_loop` solves the whole loop, and `simplify` makes the curves periodic.
+control points, `graph.changes:solve_loop` solves the whole loop, and `simplify` makes the curves periodic.
 """
 
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, left_of, relative
+from pathspace_graph.graph.changes import hold_motion, replace_points, restart, set_prior
 from pathspace_graph.graph.variables import control_keys, pose_keys
 from pathspace_graph.mapping.registration import BEGINNING, RefinedMotion
 from pathspace_graph.mapping.smoother import CurveSmoother
@@ -136,7 +137,8 @@ def substitute(smoother: CurveSmoother, periodic: dict[int, PeriodicCurve]) -> N
     """Change the variables, `C_old = E C_new`, in the graph, the detections and the poses' parameters."""
     state, detections = smoother.map.state, smoother.map.detections
     closed = {label: state.boundaries[label].closed(new.knots) for label, new in periodic.items()}
-    smoother.substitute(
+    replace_points(
+        smoother,
         np.concatenate([state.keys(label) for label in periodic]),
         np.concatenate([control_keys(label, boundary.numbers) for label, boundary in closed.items()]),
         np.concatenate([new.points for new in periodic.values()]),
@@ -167,13 +169,13 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
         state.close(label, state.boundaries[label].closed(spline.knots))
     added = np.concatenate([state.keys(label) for label in marginal.splines])
     points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
-    smoother.restart(first, removed, added, points)
+    restart(smoother, first, removed, added, points)
     smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.stations)
     _move_poses(state.poses, marginal.poses[first:])
     state.variables.calibrations[:] = marginal.calibration
     locate_poses(state)
     keys = np.concatenate([state.variables.calibration_keys, added, pose_keys(np.array([first]))])
-    smoother.set_prior(keys, marginal.mean, marginal.information)
+    set_prior(smoother, keys, marginal.mean, marginal.information)
     smoother.reassociate()
     for _ in range(settings.closing.iterations):
         smoother.step(SIGMA_STEP)
@@ -200,7 +202,7 @@ def hold_gauge(smoother: CurveSmoother) -> None:
     tangents = [state.spline(label).tangent_unit(b.abscissae) for label, b in state.boundaries.items()]
     keys, normals = state.map_keys, left_of(np.concatenate(tangents))
     order = np.argsort(keys)
-    smoother.hold_gauge(keys[order], motion_across(state.map_points[order], normals[order]))
+    hold_motion(smoother, keys[order], motion_across(state.map_points[order], normals[order]))
 
 
 def motion_across(points: Array, normals: Array) -> Array:

@@ -5,6 +5,7 @@ from typing import Final, Self
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.graph.changes import solve_loop
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.health import Health
 from pathspace_graph.lengths import joined
@@ -127,7 +128,7 @@ class Open:
         """Close the loop by the window's own prior, since no batch can come."""
         smoother = road.smoother
         apply_correspondences(smoother, found)
-        keyframes = smoother.solve_loop(self.settings.closing.iterations, SIGMA_STEP)
+        keyframes = solve_loop(smoother, self.settings.closing.iterations, SIGMA_STEP)
         drive.record.bent(keyframes, road)
         simplify(smoother)
         smoother.settle()

@@ -14,6 +14,7 @@ from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, wrap_angle
+from pathspace_graph.graph.changes import forget_poses
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.registration import Motion, RefinedMotion, Registration, Sightings, worst_sigma
@@ -196,7 +197,7 @@ def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) 
     poses is replaced by the covariance of the registration.
     """
     state, settings = smoother.map.state, smoother.map.settings
-    smoother.forget_poses(first_cycle)
+    forget_poses(smoother, first_cycle)
     before = state.poses[-1].copy()
     found.motion.move(state.poses)
     smoother.add_pose_prior(smoother.next_cycle - 1, found.covariance * WIDENING**2)

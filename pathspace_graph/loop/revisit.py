@@ -27,6 +27,7 @@ from pathspace_graph.factors.se2 import (
     wrap_angle,
 )
 from pathspace_graph.front_end.noise import NoiseLearner
+from pathspace_graph.graph.changes import solve_revisit
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.constellation import NEARBY, SeenIn, lay_newest, revisit_of
@@ -98,7 +99,7 @@ def lay_on(road: Road, record: DriveRecord, revisit: Revisit) -> Array:
     """Optimize an open map with a revisit, and return the jump (3,) of the newest pose."""
     before = road.poses[-1].copy()
     iterations = road.settings.closing.iterations
-    keyframes = road.smoother.revisit(revisit.factor(), iterations, SIGMA_STEP)
+    keyframes = solve_revisit(road.smoother, revisit.factor(), iterations, SIGMA_STEP)
     after = road.poses[-1].copy()
     road.move(compose(after, inverse(before)))
     record.bent(keyframes, road)

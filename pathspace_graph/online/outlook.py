@@ -12,12 +12,12 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.front_end.cone_rows import ConeRow, extend_rows
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.growth import newest, undisputed
 from pathspace_graph.mapping.path import SIDES, DrivenPath
-from pathspace_graph.mapping.rows import ConeRow, extend_rows
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead

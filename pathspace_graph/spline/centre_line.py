@@ -3,7 +3,7 @@
 It is kept as a ribbon, one B-spline of the centre line and half the width.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, Literal
 
@@ -191,7 +191,7 @@ class Crossing:
         return sparse_rows(entries, 2 * (columns + first)[:, :, None] + np.arange(2), 2 * size)
 
 
-def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = RIBBON_SPACING) -> CentreCurve:
+def find_line(left: BSpline, right: BSpline, spacing: float = RIBBON_SPACING) -> CentreCurve:
     """Return the line between two boundaries, on knots about `spacing` (m) apart.
 
     Samples of both are paired along the strip between them, always over the shorter diagonal. A ribbon is
@@ -203,24 +203,19 @@ def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = RIBB
         raise SettingsError(
             f"expected boundaries of at most {MOST_SAMPLES * SAMPLE_STEP:g} m, found {longest:.6g} m"
         )
-    sides = (left, right)
-    samples = [_samples(spline, closed) for spline in sides]
-    points = [spline.evaluate(u) for spline, u in zip(sides, samples, strict=True)]
-    i, j = _paired(sides, samples, points, closed)
-    _check_apart(points[0], points[1], i, j, closed)
-    a, b = points[0][i % len(points[0])], points[1][j % len(points[1])]
-    paired = []
-    for u, k, (low, high) in zip(samples, (i, j), (left.domain, right.domain), strict=True):
-        paired.append(u[k % len(u)] + (high - low) * (k // len(u)))  # indices go on past the end of a loop
+    sides, closed = (_Sampled(left), _Sampled(right)), left.periodic
+    i, j = _paired(*sides)
+    _check_apart(sides[0].points, sides[1].points, i, j, closed)
+    (a, first), (b, second) = sides[0].at(i), sides[1].at(j)
     values = np.column_stack([0.5 * (a + b), 0.5 * np.hypot(*(a - b).T)])
     lengths = path_lengths(values)
     blank = Ribbon.even(0.0, lengths[-1], max(round(lengths[-1] / spacing), _FEWEST_SPANS), closed)
     count = max(int(np.ceil(lengths[-1] / SAMPLE_STEP)), RIBBON * (len(blank.breaks) - 1))
     u = np.linspace(0.0, lengths[-1], count + 1)[: count if closed else None]
     middles = np.column_stack([np.interp(u, lengths, column) for column in values.T])
-    beside = np.interp(u, lengths, paired[0]), np.interp(u, lengths, paired[1])
+    beside = np.interp(u, lengths, first), np.interp(u, lengths, second)
     fit = _Fit(blank, u)
-    line = CentreCurve(blank.with_points(fit.solve(middles)), u, sides, beside)
+    line = CentreCurve(blank.with_points(fit.solve(middles)), u, (left, right), beside)
     for _ in range(_RIBBON_ROUNDS):  # to the middle between its normals' crossings, where they cross both
         one, other = line.crossings(u)
         good = one.good & other.good
@@ -228,7 +223,7 @@ def find_line(left: BSpline, right: BSpline, closed: bool, spacing: float = RIBB
         half = 0.5 * (one.offset - other.offset)
         values = np.where(good[:, None], np.column_stack([middle, half]), middles)
         beside = np.where(good, one.u, line.beside[0]), np.where(good, other.u, line.beside[1])
-        line = CentreCurve(blank.with_points(fit.solve(values)), u, sides, beside)
+        line = replace(line, ribbon=blank.with_points(fit.solve(values)), beside=beside)
     return line
 
 
@@ -255,47 +250,57 @@ def sparse_rows(values: Array, columns: IntArray, size: int) -> csr_array:
 # --- pairs along the strip -------------------------------------------------------------------------------
 
 
-def _samples(spline: BSpline, closed: bool) -> Array:
-    length = spline.length()
-    count = max(int(np.ceil(length / SAMPLE_STEP)), _FEWEST_SPANS)
-    return spline.parameters_at(np.linspace(0.0, length, count + 1)[: count if closed else None])
+class _Sampled:
+    """A boundary at places about `SAMPLE_STEP` apart; those of a loop end before its beginning."""
+
+    def __init__(self, spline: BSpline) -> None:
+        self.spline, self.length = spline, spline.length()
+        count = max(int(np.ceil(self.length / SAMPLE_STEP)), _FEWEST_SPANS)
+        ends = np.linspace(0.0, self.length, count + 1)[: count if spline.periodic else None]
+        self.u = spline.parameters_at(ends)
+        self.points = spline.evaluate(self.u)
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def at(self, indices: IntArray) -> tuple[Array, Array]:
+        """Return points (k, 2) and parameters (k,) of samples, whose indices go on past the end of a loop."""
+        low, high = self.spline.domain
+        around, own = np.divmod(indices, len(self))
+        return self.points[own], self.u[own] + (high - low) * around
 
 
-def _paired(
-    sides: tuple[BSpline, BSpline], samples: list[Array], points: list[Array], closed: bool
-) -> tuple[IntArray, IntArray]:
+def _paired(one: _Sampled, other: _Sampled) -> tuple[IntArray, IntArray]:
     """Return the samples of both boundaries that face each other, in the direction of travel."""
-    i, j = _first_pair(sides, samples, points, closed)
-    lefts, rights = ([tuple(point) for point in side.tolist()] for side in points)
-    if closed:
+    i, j = _first_pair(one, other)
+    lefts, rights = ([tuple(point) for point in side.points.tolist()] for side in (one, other))
+    if one.spline.periodic:
         lefts, rights = lefts[i:] + lefts[: i + 1], rights[j:] + rights[: j + 1]
         ahead = np.array(_march(lefts, rights, True))
         left, right = ahead[:, 0] + i, ahead[:, 1] + j
         # the line begins beside the beginning of the left boundary, whichever pair is the nearest
-        begin, (n, m) = int(np.argmax(left >= len(points[0]))), (len(points[0]), len(points[1]))
-        left = np.append(left[begin:-1] - n, left[: begin + 1])
-        right = np.append(right[begin:-1], right[: begin + 1] + m)
-        return left, right - m * (right[0] // m)
+        begin = int(np.argmax(left >= len(one)))
+        left = np.append(left[begin:-1] - len(one), left[: begin + 1])
+        right = np.append(right[begin:-1], right[: begin + 1] + len(other))
+        return left, right - len(other) * (right[0] // len(other))
     back = -np.array(_march(lefts[i::-1], rights[j::-1], False))[:0:-1]
     ahead = np.array(_march(lefts[i:], rights[j:], False))
     pairs = np.concatenate([back.reshape(-1, 2), ahead])
     return pairs[:, 0] + i, pairs[:, 1] + j
 
 
-def _first_pair(
-    sides: tuple[BSpline, BSpline], samples: list[Array], points: list[Array], closed: bool
-) -> tuple[int, int]:
+def _first_pair(one: _Sampled, other: _Sampled) -> tuple[int, int]:
     """Return the nearest pair of samples that face each other, the left one on the left."""
-    some = np.unique(np.linspace(0, len(samples[0]) - 1, _PAIR_STARTS).astype(int))
-    lengths = [np.linspace(0.0, spline.length(), len(u)) for spline, u in zip(sides, samples, strict=True)]
-    tangents = [spline.tangent_unit(u) for spline, u in zip(sides, samples, strict=True)]
+    some = np.unique(np.linspace(0, len(one) - 1, _PAIR_STARTS).astype(int))
+    points = one.points[some], other.points
+    tangents = one.spline.tangent_unit(one.u)[some], other.spline.tangent_unit(other.u)
+    lengths = np.linspace(0.0, one.length, len(one))[some], np.linspace(0.0, other.length, len(other))
     # an open map may overlap itself before its loop is closed
-    apart = np.inf if closed else 0.5 * min(spline.length() for spline in sides)
-    pairs = [(of[0][some], of[1]) for of in (points, tangents, lengths)]
-    i, j = points_across(pairs[0], pairs[1], pairs[2], apart)
+    apart = np.inf if one.spline.periodic else 0.5 * min(one.length, other.length)
+    i, j = points_across(points, tangents, lengths, apart)
     if not len(i):
         raise SettingsError("expected the left boundary to the left of the right one, found none such")
-    best = int(((points[0][some[i]] - points[1][j]) ** 2).sum(axis=1).argmin())
+    best = int(((points[0][i] - points[1][j]) ** 2).sum(axis=1).argmin())
     return int(some[i[best]]), int(j[best])
 
 

@@ -154,9 +154,7 @@ class CentreLine:
         return frame
 
 
-def centre_line(
-    left: BSpline, right: BSpline, covariance: Array | None, closed: bool, step: float
-) -> CentreLine:
+def centre_line(left: BSpline, right: BSpline, covariance: Array | None, step: float) -> CentreLine:
     """Return the centre line between two boundaries at points about `step` (m) apart, see `find_line`.
 
     The joint covariance of the control points of the left and then the right boundary, in the order x0, y0,
@@ -166,7 +164,7 @@ def centre_line(
     most, longest = MOST_POINTS * step, max(left.length(), right.length())
     if longest > most:
         raise SettingsError(f"expected boundaries of at most {most:g} m at this step, found {longest:.6g} m")
-    line = find_line(left, right, closed)
+    line, closed = find_line(left, right), left.periodic
     centre = line.ribbon.centre
     length = centre.length()
     count = max(round(length / step), _FEWEST_POINTS)

@@ -104,12 +104,12 @@ def test_means_are_weighted_by_information() -> None:
 
 
 def test_a_vehicle_that_creeps_is_not_at_rest() -> None:
-    rest, rng = Rest(SIGMA), np.random.default_rng(0)
+    rest, rng = Rest(), np.random.default_rng(0)
     told = []
     for k in range(40):
         t = 0.1 * k + 0.02 * np.arange(5)
         twist = np.array([0.3, 0.0, 0.0]) + SIGMA * rng.standard_normal((5, 3))
-        told.append(rest.update(Odometry(t, twist), 0.1 * (k + 1)))
+        told.append(rest.update(Odometry(t, twist), 0.1 * (k + 1), SIGMA))
     assert not any(told[12:])
 
 

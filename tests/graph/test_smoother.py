@@ -9,6 +9,7 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose
+from pathspace_graph.graph.changes import merge_points, replace_points, solve_loop
 from pathspace_graph.graph.gaussian import factorize, graph_of, keys_of, normal_equations
 from pathspace_graph.graph.rows import Rows, calibrated_delta
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -84,7 +85,7 @@ def test_merged_points_are_known_as_well_as_both_together() -> None:
     old = Layout(keys_of(smoother.prior))
     before, variables = normal_equations(smoother.prior, old), smoother.variables.copy()
     at_kept = variables.of(kept)
-    smoother.merge(gone, kept)
+    merge_points(smoother, gone, kept)
     assert (smoother.variables.layout.positions(gone) < 0).all()
     np.testing.assert_array_equal(smoother.variables.of(kept), at_kept)
     new = Layout(keys_of(smoother.prior))
@@ -291,7 +292,7 @@ def test_substituted_points_know_what_the_old_ones_did() -> None:
     information, vector = normal_equations(smoother.prior, layout)
     reference = smoother.variables.reference[smoother.variables.layout.entries(layout.keys)].copy()
     change, points = rng.normal(size=(3, 2)), rng.normal(size=(2, 2))
-    smoother.substitute(old, new, points, change, sigma)
+    replace_points(smoother, old, new, points, change, sigma)
     rest = np.setdiff1d(layout.keys, old)
     found_layout = Layout(np.sort(np.append(rest, new)))
     matrix = np.zeros((layout.size, found_layout.size))
@@ -462,7 +463,7 @@ def test_a_loop_is_solved_with_its_keyframes_and_without_them_afterwards() -> No
     keys = smoother.variables.keys
     stay = ~np.isin(keys, smoother.variables.keyframes)
     before = smoother.variables.of(keys[stay])
-    smoother.solve_loop(2, 10.0)
+    solve_loop(smoother, 2, 10.0)
     assert smoother.submaps is None and len(smoother.inactive) == 0
     np.testing.assert_array_equal(smoother.variables.keys, keys[stay])
     assert len(smoother.variables.keyframes) == 0

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pathspace_graph.graph.changes import restart
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop.closing import hold_gauge, motion_across
 from pathspace_graph.mapping.state import State
@@ -154,5 +155,5 @@ def test_a_map_that_replaces_another_has_a_gauge_of_its_own() -> None:
     smoother = run(0.1, mid()).smoother
     assert smoother.held is not None
     keys = smoother.map.state.map_keys
-    smoother.restart(smoother.first_cycle, keys, keys, smoother.variables.of(keys).reshape(-1, 2))
+    restart(smoother, smoother.first_cycle, keys, keys, smoother.variables.of(keys).reshape(-1, 2))
     assert smoother.held is None

@@ -15,6 +15,7 @@ from pathspace_graph.factors.arrays import BoolArray
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.se2 import compose, inverse, move_points, to_vehicle
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
+from pathspace_graph.graph.changes import forget_poses
 from pathspace_graph.graph.gaussian import factorize, marginalize
 from pathspace_graph.graph.variables import Layout, pose_keys
 from pathspace_graph.health import DEGRADED, GOOD, LOST
@@ -232,7 +233,7 @@ def test_forgetting_the_poses_keeps_all_that_the_prior_knows_of_the_map() -> Non
     others = np.setdiff1d(smoother.layout.keys, window)
     before = factorize(marginalize(smoother.prior, window), Layout(others)).covariance(others)
     first = smoother.next_cycle - 10
-    smoother.forget_poses(first)
+    forget_poses(smoother, first)
     assert smoother.first_cycle == first and len(smoother.times) == 10
     np.testing.assert_allclose(factorize(smoother.prior, Layout(others)).covariance(others), before)
     covariance = np.diag([0.04, 0.09, 0.01])

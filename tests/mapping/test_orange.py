@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.checkpoint import copied
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BIG_ORANGE, ORANGE
 from pathspace_graph.mapping.orange import OrangeCones, Sighting
 from pathspace_graph.settings.online import GrowthSettings
 
+from ..oracles.copied import copied
 from ..scenes.digest import digest
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def test_a_copy_of_orange_cones_stays_as_it_is_and_goes_on_as_the_original() -> 
         lambda cones: cones.place_again(np.zeros(0), (1, pose + np.zeros((1, 3)))),
         lambda cones: cones.add(seen_from(pose, 101), np.zeros(0)),
     ):
-        twin, expected = cones.copy(), copied(cones, {})
+        twin, expected = cones.copy(), copied(cones)
         happens(cones)
         assert digest(twin) == digest(expected)
         happens(twin)

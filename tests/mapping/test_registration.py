@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.variables import CALIBRATION_KEY, pose_keys
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping import path as path_module
@@ -357,13 +358,14 @@ def test_a_place_must_be_certain_and_less_so_after_a_long_stretch(
 def test_near_the_start_is_a_matter_of_place_and_direction(
     pose: tuple[float, ...], near: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After 80 m along x, on the first 20 m: within 8 m + 3 % of 80 m, and 0.8 rad."""
+    """After 80 m straight on, on the first 20 m: within 8 m + 3 % of 80 m, and 0.8 rad."""
     monkeypatch.setattr(path_module, "MEMORY", 20.0)
-    path = DrivenPath()
+    path, frame = DrivenPath(), np.array([3.0, -5.0, 0.7])
     for x in np.arange(0.0, 80.1, 0.5):
-        path.update(np.array([x, 0.0, 0.0]))
-    assert near_start(path, np.array(pose), ClosingSettings()) is near
-    assert not near_start(path, np.array(pose), ClosingSettings(min_path=100.0))
+        path.update(compose(frame, np.array([x, 0.0, 0.0])))
+    there = compose(frame, np.array(pose))
+    assert near_start(path, there, ClosingSettings()) is near
+    assert not near_start(path, there, ClosingSettings(min_path=100.0))
 
 
 @pytest.mark.parametrize(

@@ -53,10 +53,12 @@ def test_control_points_and_poses_are_views(state: State) -> None:
 
 
 def test_a_copy_changes_alone(state: State) -> None:
-    other = state.copy()
+    other, known = state.copy(), state.pose_u[RIGHT].copy()
     other.control_points(LEFT)[:] = 0.0
     other.replace_boundary(RIGHT, *boundary_through(straight_row(-3.0, 12.0)))
+    other.locate(RIGHT, known + 1.0)
     other.drop_oldest_pose_u()
+    np.testing.assert_array_equal(state.pose_u[RIGHT], known)
     assert state.control_points(LEFT)[0, 1] == pytest.approx(2.0, abs=1e-6)
     assert state.boundaries[RIGHT].size > other.boundaries[RIGHT].size
     assert (len(state.pose_u[LEFT]), len(other.pose_u[LEFT])) == (3, 2)

@@ -41,7 +41,7 @@ def _row(line: Array) -> Array:
     return np.column_stack([np.interp(at, s, axis) for axis in line.T])
 
 
-@pytest.mark.parametrize("cones", [4, 6, 8, 10, 12, 16])
+@pytest.mark.parametrize("cones", [4, 8, 16])
 def test_an_oval_is_mapped_online_and_as_a_batch(cones: int) -> None:
     log = simulate(oval(cones), SimulationSettings(laps=4), 0)
     runs = [

@@ -79,7 +79,7 @@ def where_it_crosses(line: CentreLine, base: CentreLine) -> dict[str, Array]:
 @pytest.mark.parametrize("step", [0.2, 1.0, 3.0])
 def test_between_concentric_circles(turn: float, step: float) -> None:
     left, right = (circle(20.0 - 2.0 * turn, turn=turn), circle(20.0 + 2.0 * turn, 150, turn))
-    line = centre_line(left, right, None, True, step)
+    line = centre_line(left, right, None, step)
     assert len(line.points) == round(40 * np.pi / step)
     assert np.hypot(*line.points.T) == pytest.approx(20.0, abs=1e-4)
     assert line.length == pytest.approx(40 * np.pi, abs=2e-4)
@@ -98,7 +98,7 @@ def test_along_a_straight_from_where_both_begin_to_where_both_end() -> None:
         right.evaluate(np.array([right.domain[0]]))[0, 0],
         left.evaluate(np.array([left.domain[1]]))[0, 0],
     )
-    line = centre_line(left, right, None, False, 0.5)
+    line = centre_line(left, right, None, 0.5)
     assert line.points[:, 1] == pytest.approx(-0.5, abs=1e-9)
     assert line.points[0, 0] == pytest.approx(low, abs=0.3)
     assert line.points[-1, 0] == pytest.approx(high, abs=0.3)
@@ -117,7 +117,7 @@ def test_sigmas_of_a_straight_by_hand() -> None:
     covariance = (
         np.outer(np.r_[a, zero], np.r_[a, zero]) * 0.3**2 + np.outer(np.r_[zero, b], np.r_[zero, b]) * 0.4**2
     )
-    line = centre_line(left, right, covariance, False, 1.0)
+    line = centre_line(left, right, covariance, 1.0)
     for sigma in (line.points_sigma, line.width_left_sigma, line.width_right_sigma):
         assert sigma == pytest.approx(0.25, abs=1e-9)
     for sigma in (line.heading_sigma, line.curvature_sigma, line.arc_length_sigma):
@@ -131,7 +131,7 @@ def test_sigmas_of_circles_by_hand() -> None:
         (spline.distinct_control_points / radius).ravel() for spline, radius in ((left, 18.0), (right, 22.0))
     ]
     change = np.r_[0.3 * outward[0], 0.1 * outward[1]]
-    line = centre_line(left, right, np.outer(change, change), True, 1.0)
+    line = centre_line(left, right, np.outer(change, change), 1.0)
     assert line.points_sigma == pytest.approx(0.2, abs=1e-6)
     assert line.width_left_sigma == pytest.approx(0.1, abs=1e-6)
     assert line.width_right_sigma == pytest.approx(0.1, abs=1e-6)
@@ -146,10 +146,10 @@ def test_each_sigma_is_the_numeric_derivative_along_a_random_change(closed: bool
     """With the covariance d d^T, a sigma is the size of the derivative in the direction d."""
     splines = wavy(18.0, 24, closed, 1), wavy(22.0, 27, closed, 2)
     d = np.random.default_rng(3).normal(size=2 * sum(spline.size for spline in splines))
-    base = centre_line(*splines, np.outer(d, d), closed, 1.0)
+    base = centre_line(*splines, np.outer(d, d), 1.0)
     step = 1e-5
     forth, back = (
-        where_it_crosses(centre_line(*moved(splines, e * d), None, closed, 0.25), base) for e in (step, -step)
+        where_it_crosses(centre_line(*moved(splines, e * d), None, 0.25), base) for e in (step, -step)
     )
     for name in QUANTITIES:
         sigma = getattr(base, f"{name}_sigma")[2:-2]
@@ -163,9 +163,9 @@ def test_sigmas_are_those_of_a_monte_carlo() -> None:
     rng = np.random.default_rng(6)
     size = 2 * sum(spline.size for spline in splines)
     root = rng.normal(size=(size, size)) * (0.01 / np.sqrt(size))
-    base = centre_line(*splines, root @ root.T, True, 4.0)
+    base = centre_line(*splines, root @ root.T, 4.0)
     runs = [
-        where_it_crosses(centre_line(*moved(splines, root @ rng.normal(size=size)), None, True, 0.5), base)
+        where_it_crosses(centre_line(*moved(splines, root @ rng.normal(size=size)), None, 0.5), base)
         for _ in range(80)
     ]
     for name in QUANTITIES:
@@ -177,7 +177,7 @@ def test_sigmas_are_those_of_a_monte_carlo() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_a_point_is_in_the_middle_where_its_normal_crosses_the_boundaries(seed: int) -> None:
     left, right = wavy(18.0, 24, True, 2 * seed), wavy(22.0, 27, True, 2 * seed + 1)
-    line = centre_line(left, right, None, True, 1.0)
+    line = centre_line(left, right, None, 1.0)
     normal = np.column_stack([-np.sin(line.heading), np.cos(line.heading)])
     for spline, width in ((left, line.width_left), (right, -line.width_right)):
         crossed = spline.foot_points(line.points + width[:, None] * normal)
@@ -191,7 +191,7 @@ def test_a_lap_that_overlaps_its_beginning_is_one_line() -> None:
     drift = 0.02 * angle[:, None]
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     left, right = (BSpline.clamped_from(np.arange(58.0), radius * ring + drift) for radius in (18.0, 22.0))
-    line = centre_line(left, right, None, False, 1.0)
+    line = centre_line(left, right, None, 1.0)
     assert line.length == pytest.approx(2.3 * np.pi * 20.0, rel=0.02)
     assert np.diff(np.unwrap(line.heading)).min() > 0.0
 
@@ -201,7 +201,7 @@ def test_boundaries_that_cross_are_refused_with_the_place() -> None:
     points = left.distinct_control_points.copy()
     points[9:12] *= 1.4  # at the top, beyond the right boundary
     with pytest.raises(SettingsError, match=r"do not cross, found them crossing near x = -?\d+\.\d m, y = "):
-        centre_line(left.with_points(points), circle(22.0), None, True, 1.0)
+        centre_line(left.with_points(points), circle(22.0), None, 1.0)
 
 
 def crossing_normals(line: CentreLine, horizon: int = 10) -> int:
@@ -239,7 +239,7 @@ def rough(seed: int, closed: bool) -> tuple[BSpline, BSpline]:
 def test_no_map_is_refused_and_no_normals_meet(seed: int, closed: bool) -> None:
     left, right = rough(seed, closed)
     assert not boundaries_cross({LEFT: left, RIGHT: right}, 0.05)
-    line = centre_line(left, right, None, closed, 1.0)
+    line = centre_line(left, right, None, 1.0)
     assert crossing_normals(line) == 0
     assert np.abs(np.diff(np.unwrap(line.heading))).max() < 0.6
     for spline, way in ((left, 1.0), (right, -1.0)):
@@ -277,7 +277,7 @@ def test_planners_of_tum_find_no_crossing_normals() -> None:
     helpers = pytest.importorskip("trajectory_planning_helpers")
     for seed in range(4):
         left, right = rough(seed, True)
-        line = centre_line(left, right, None, True, 1.0)
+        line = centre_line(left, right, None, 1.0)
         track = np.column_stack([line.points, line.width_right, line.width_left])
         path = np.concatenate([line.points, line.points[:1]])
         normal = helpers.calc_splines.calc_splines(path)[3]
@@ -286,9 +286,9 @@ def test_planners_of_tum_find_no_crossing_normals() -> None:
 
 def test_what_has_no_centre_line() -> None:
     with pytest.raises(SettingsError, match="the left boundary to the left of the right one"):
-        centre_line(circle(22.0), circle(18.0), None, True, 1.0)
+        centre_line(circle(22.0), circle(18.0), None, 1.0)
     for step in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(SettingsError, match="step: expected"):
-            centre_line(circle(18.0), circle(22.0), None, True, step)
+            centre_line(circle(18.0), circle(22.0), None, step)
     with pytest.raises(SettingsError, match="at most"):
-        centre_line(circle(1.8e5), circle(2.2e5), None, True, 1.0)
+        centre_line(circle(1.8e5), circle(2.2e5), None, 1.0)

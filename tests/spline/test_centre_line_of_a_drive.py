@@ -29,7 +29,7 @@ def test_it_is_near_the_true_one_and_within_its_sigmas() -> None:
     mapper, _ = map_log(noisy(lap_log(track, overrun=50.0), 0))
     line = mapper.map().centre_line()
     rows = to_map_frame(track).left, to_map_frame(track).right
-    true = centre_line(*map(through, rows), None, True, 0.05)
+    true = centre_line(*map(through, rows), None, 0.05)
     assert line.closed
     nearest = KDTree(true.points).query(line.points)[1]
     normal = np.column_stack([-np.sin(true.heading), np.cos(true.heading)])[nearest]

@@ -25,7 +25,7 @@ def line_of(kind: str, spacing: float = 3.0) -> CentreCurve:
         boundary = track.boundaries[label]
         assert isinstance(boundary, SplineBoundary)
         splines.append(boundary.spline)
-    return find_line(splines[0], splines[1], track.closed, spacing)
+    return find_line(splines[0], splines[1], spacing)
 
 
 def test_the_ribbon_between_two_circles() -> None:
@@ -91,4 +91,4 @@ def test_parameters_lead_from_a_boundary_to_the_place_beside_it(kind: str) -> No
 def test_boundaries_that_are_not_side_by_side_have_no_ribbon() -> None:
     line = BSpline.open_uniform(np.column_stack([np.arange(9.0), np.zeros(9)]))
     with pytest.raises(SettingsError, match="to the left of the right one"):
-        find_line(line, line, False, 3.0)
+        find_line(line, line, 3.0)

@@ -12,8 +12,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths
-
-from .path import along_and_across, crosses
+from pathspace_graph.mapping.path import along_and_across, crosses
 
 
 @dataclass(frozen=True)
