@@ -8,7 +8,7 @@ import numpy as np
 
 T = TypeVar("T")
 
-POSE: Final = (1, 1, 0)  # powers of the length in a pose, or in a twist
+POSE_LENGTHS: Final = (1, 1, 0)  # powers of the length in a pose, or in a twist
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.lengths import POSE, scaled, times
+from pathspace_graph.lengths import POSE_LENGTHS, scaled, times
 from pathspace_graph.mapping import motion as motions
 from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
@@ -161,7 +161,7 @@ class LandmarkFixedLag(OnlineBaseline):
         return point_map(state.landmarks, state.labels, None, self.closed)
 
     def window_poses(self) -> Array:
-        poses: Array = times(self.smoother.variables.poses.copy(), POSE, self.scale)
+        poses: Array = times(self.smoother.variables.poses.copy(), POSE_LENGTHS, self.scale)
         return poses
 
     def readings(self) -> Readings:

@@ -104,9 +104,7 @@ class FixedLagMapper(MapperEstimate):
         and takes it again with less, as the notice says, and `failures` counts.
         """
         factors = tuple(factors)
-        cycle, unused = self._admit(odometry, detections, factors), self._unused
-        if unused is not None:
-            cycle = replace(cycle, odometry=unused.followed_by(cycle.odometry))
+        cycle = self._admit(odometry, detections, factors)
         before = _Before.of(self)
         try:
             result = self._process(cycle, factors)
@@ -178,7 +176,8 @@ class FixedLagMapper(MapperEstimate):
         except SettingsError:
             self.front_end.gate.refuse()
             raise
-        return self.front_end.admit(odometry, detections)
+        cycle, unused = self.front_end.admit(odometry, detections), self._unused
+        return cycle if unused is None else replace(cycle, odometry=unused.followed_by(cycle.odometry))
 
     def finish(self) -> None:
         """Take the result of a batch that is under way, where the drive is over and no cycle follows.
