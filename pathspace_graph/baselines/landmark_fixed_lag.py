@@ -4,7 +4,7 @@ The loop closes where enough of the landmarks seen now are those of the beginnin
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
@@ -51,12 +51,6 @@ class LandmarkFixedLag(OnlineBaseline):
         self.closed = False
         self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
         self._last_check = 0.0
-
-    def copy(self) -> Self:
-        other = super().copy()
-        other.smoother, other.path = self.smoother.copy(), self.path.copy()
-        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
-        return other
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         motion, detections = reading.motion, reading.detections
