@@ -114,7 +114,7 @@ def test_a_mapper_that_is_given_back_in_every_cycle_ends_with_the_same_bits(make
     log = log_of(make)
     mapper = FixedLagMapper(None, log.odometry_sigma)
     for cycle in split_odometry(log):
-        _Before.of(mapper).give_back(mapper)
+        mapper._go_back(_Before.of(mapper))
         replay(mapper, *cycle)
     assert state_of(mapper) == ended(log)[0]
 
@@ -136,7 +136,7 @@ def test_a_copy_stays_as_it_is_whatever_the_original_does(make: Any) -> None:
         assert state_of(before) == known
     _, (before, _) = list(copies.items())[-2]
     other = FixedLagMapper(None, log.odometry_sigma)
-    before.give_back(other)
+    other._go_back(before)
     for k, cycle in enumerate(split_odometry(log)):
         if k >= [*copies][-2]:
             replay(other, *cycle)
