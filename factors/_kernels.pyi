@@ -128,7 +128,8 @@ def detection_rows(
     Derivatives (m, 3 + 5 + 2 p + 2) are by [pose | sensor | controls]. Where the sensor's calibration b (5,)
     is not empty, residuals and derivatives are multiplied by `f = 1 + rates b`, with `rates = n' R (d M^-1)
     R' n` of `sensor:by_range`, since noise is stated for measured detections. Those by b are `f n' R C + r
-    rates`, with C of `sensor:by_sensor`: the detections were measured at (m, 2), vehicle frame, with twists (m, 3).
+    rates`, with C of `sensor:by_sensor`: the detections were measured at (m, 2), vehicle frame, with twists
+    (m, 3).
     """
 
 def station_rows(
