@@ -102,19 +102,8 @@ def refined(
 def to_map(points_vehicle: Array, poses: Array) -> Array:
     """Return `p = R z + t` (m, 2), map frame: points z (m, 2) in the vehicle frames of poses (m, 3)."""
 
-def by_sensor(points_vehicle: Array, twists: Array) -> Array:
-    """Return the derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b.
-
-    z are points_vehicle (m, 2) as measured, in m, and twists (m, 3) are those at their stamps (m/s, m/s,
-    rad/s). With J the quarter turn and `v + wz J z` the motion relative to a point at rest, the columns are
-
-        J z (yaw),   (0, 1) (lateral),   -(v + wz J z) (latency),   -z (range scale),   -z / |z| (range bias)
-
-    The second order is left out: a yaw of 2 degrees shifts a detection at 15 m by 9 mm beside that.
-    """
-
 def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
-    """Return `z + C b` (m, 2) of detections z (m, 2), with C of `by_sensor` and a calibration b (5,)."""
+    """Return `z + C b` (m, 2) of detections z (m, 2): C of `sensor:by_sensor` and a calibration b (5,)."""
 
 def detection_rows(
     points_map: Array,
@@ -128,7 +117,20 @@ def detection_rows(
     sensor: Array,
     sigma_model: float,
 ) -> tuple[Array, Array, Array]:
-    """Return residuals (m,) and sigmas (m,) of `project`, and derivatives by [pose | sensor | controls]."""
+    """Return `r = n . (p - S(u))` (m,) with u the foot point of p, their sigmas (m,), and derivatives.
+
+    normals n (m, 2), distances r (m,) and basis beta (m, p + 1) are of the foot points, and sigmas those of
+    `residuals:sigma_across`. At an interior foot point every term through u vanishes, so with J the quarter
+    turn and a = p - t the arm from the pose,
+
+        dr/dt = n,   dr/dtheta = n . (J a),   dr/dc_j = -beta_j(u) n
+
+    Derivatives (m, 3 + 5 + 2 p + 2) are by [pose | sensor | controls]. Where the sensor's calibration b (5,)
+    is not empty, residuals and derivatives are multiplied by `f = 1 + rates b`, with `rates = n' R (d M^-1)
+    R' n` of `sensor:by_range`, since noise is stated for measured detections. Those by b are `f n' R C + r
+    rates`, with C of `sensor:by_sensor`: the detections were measured at (m, 2), vehicle frame, with twists
+    (m, 3).
+    """
 
 def station_rows(
     points_map: Array,
@@ -150,9 +152,7 @@ def station_rows(
 
         dr/dp = t,   dr/dc_j = -beta_j(u) t + n . (p - S) beta'_j(u) / |S'| n
 
-    Residuals and derivatives (m, 3 + 5 + 2 p + 2), by [pose | sensor | controls], are multiplied by the
-    factor of `sensor:sensor_rows`, where the detections were measured at (m, 2), vehicle frame, with twists
-    (m, 3), and the sensor's calibration (5,) is not empty.
+    The rest is as in `detection_rows`.
     """
 
 def integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, Array, Array]:

@@ -943,16 +943,6 @@ void sensor_columns(const double* z, const double* twist, double (*C)[kSensor]) 
   }
 }
 
-Array by_sensor(const Array& points, const Array& twists) {
-  const Index m = points.shape(0);
-  expect(points.size() == 2 * m && twists.size() == 3 * m);
-  Array columns(Shape{m, 2, kSensor});
-  for (Index i = 0; i < m; ++i)
-    sensor_columns(points.data() + 2 * i, twists.data() + 3 * i,
-                   reinterpret_cast<double(*)[kSensor]>(columns.mutable_data() + 2 * kSensor * i));
-  return columns;
-}
-
 Array shifted(const Array& points, const Array& twists, const Array& sensor) {
   const Index m = points.shape(0);
   expect(points.size() == 2 * m && twists.size() == 3 * m && sensor.size() == kSensor);
@@ -2122,7 +2112,6 @@ PYBIND11_MODULE(_kernels, module) {
   module.def("owners_holding", &owners_holding);
   module.def("laid_out", &laid_out);
   module.def("columns_of", &columns_of);
-  module.def("by_sensor", &by_sensor);
   module.def("shifted", &shifted);
   module.def("to_map", &to_map);
   module.def("detection_rows", &detection_rows);

@@ -73,7 +73,7 @@ def solving(what: str) -> Iterator[None]:
 
 
 LEAST_BEGIN: Final = 3  # number of letters from which a beginning may stand for a name
-NEAR: Final = 0.6  # least similarity (0 to 1) of a name that may have been meant
+NAME_SIMILARITY: Final = 0.6  # least similarity (0 to 1) of a name that may have been meant
 
 
 def check_name(name: Any, known: Iterable[str], expected: str) -> None:
@@ -82,7 +82,7 @@ def check_name(name: Any, known: Iterable[str], expected: str) -> None:
     if name in known:
         return
     begins = [one for one in known if len(str(name)) >= LEAST_BEGIN and one.startswith(str(name))]
-    near = begins or get_close_matches(str(name), known, n=1, cutoff=NEAR)
+    near = begins or get_close_matches(str(name), known, n=1, cutoff=NAME_SIMILARITY)
     hint = f", the nearest is '{near[0]}'" if near else ""
     raise SettingsError(f"{expected}, found '{name}'{hint}")
 

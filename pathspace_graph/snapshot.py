@@ -32,7 +32,7 @@ from .errors import InputError, PathspaceError, SettingsError
 
 E = TypeVar("E")
 
-FORMAT: Final = f"pathspace-snapshot/3 of pathspace-graph {version('pathspace-graph')}"
+SNAPSHOT: Final = f"pathspace-snapshot/3 of pathspace-graph {version('pathspace-graph')}"
 ROOMS: Final = tuple(  # rooms and modules whose classes estimators are made of
     f"{__package__}.{room}"
     for room in (
@@ -53,7 +53,7 @@ def save(estimator: object, path: Path | str) -> None:
     _Pickler(stream, pickle.HIGHEST_PROTOCOL).dump(estimator)
     content = stream.getvalue()
     with atomic_file(path) as temporary:
-        temporary.write_bytes(b"\n".join([FORMAT.encode(), sha256(content).hexdigest().encode(), content]))
+        temporary.write_bytes(b"\n".join([SNAPSHOT.encode(), sha256(content).hexdigest().encode(), content]))
 
 
 def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
@@ -74,8 +74,8 @@ def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
 def _verified(file: Path) -> bytes:
     """Return the pickle of a file; InputError where it is of another format, or not as it was written."""
     head, _, rest = read_bytes(file, "a snapshot").partition(b"\n")
-    if head != FORMAT.encode():
-        raise InputError(file, f"expected {FORMAT}, found {shown(head[:80].decode(errors='replace'))}")
+    if head != SNAPSHOT.encode():
+        raise InputError(file, f"expected {SNAPSHOT}, found {shown(head[:80].decode(errors='replace'))}")
     digest, _, content = rest.partition(b"\n")
     if sha256(content).hexdigest().encode() != digest:
         raise InputError(file, "expected a snapshot as it was written, found another content")

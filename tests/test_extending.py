@@ -29,7 +29,7 @@ from pathspace_graph.loop import open as open_phase
 from pathspace_graph.run import split_odometry
 from pathspace_graph.sim import track_files
 
-from .scenes.drives import bean_track, exact_log, lap_log, noisy, replay, true_poses
+from .scenes.drives import exact_log, noisy_lap, replay, true_poses
 from .scenes.jacobians import numeric_jacobian
 from .scenes.paths import ROOT
 from .scenes.pretenders import write_round_track
@@ -189,7 +189,7 @@ def test_the_new_phase_freezes_the_map_in_the_pit_lane(
 ) -> None:
     """Cones half a metre beside the boundaries, seen in the lane only, change nothing there."""
     pit_lane, circuit = page("pit_lane"), page("circuit")
-    drive = noisy(lap_log(bean_track(), overrun=60.0), seed=3)
+    drive = noisy_lap()
     beside, middle = np.array([0.0, 0.5]), true_poses(drive)[180, :2]
     monkeypatch.setattr(circuit.Circuit, "lane", (middle, 8.0))
     monkeypatch.setattr(open_phase, "Closed", circuit.Circuit)

@@ -24,7 +24,7 @@ from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.run import split_odometry
-from pathspace_graph.snapshot import FORMAT, array_of, new, restore, save
+from pathspace_graph.snapshot import SNAPSHOT, array_of, new, restore, save
 
 from .scenes.digest import digest
 from .scenes.drives import ODOMETRY_SIGMA, ahead, corridor, exact_log
@@ -159,7 +159,7 @@ class Calls:
         return self.call, self.arguments
 
 
-def write(file: Path, content: bytes, head: str = FORMAT) -> None:
+def write(file: Path, content: bytes, head: str = SNAPSHOT) -> None:
     """Write a snapshot with the digest that belongs to its content."""
     file.write_bytes(b"\n".join([head.encode(), sha256(content).hexdigest().encode(), content]))
 
@@ -214,12 +214,12 @@ def test_no_file_and_a_folder_are_refused(tmp_path: Path) -> None:
             restore(path, DrivenPath, id)
 
 
-@pytest.mark.parametrize("head", ["pathspace-snapshot/2", f"{FORMAT}.1", "", FORMAT[:-1]])
+@pytest.mark.parametrize("head", ["pathspace-snapshot/2", f"{SNAPSHOT}.1", "", SNAPSHOT[:-1]])
 def test_another_format_or_version_is_refused_in_one_line(head: str, tmp_path: Path) -> None:
     write(tmp_path / "a.snap", pickle.dumps(None), head)
     with pytest.raises(InputError) as caught:
         restore(tmp_path / "a.snap", DrivenPath, id)
-    assert str(caught.value).endswith(f"a.snap: expected {FORMAT}, found {head!r}")
+    assert str(caught.value).endswith(f"a.snap: expected {SNAPSHOT}, found {head!r}")
 
 
 def test_every_flipped_bit_and_every_cut_is_refused(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.baselines.ckf_belief import Belief, point_columns
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import clamped_knots
@@ -14,7 +15,6 @@ from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping import path
-from pathspace_graph.mapping.belief import Belief, point_columns
 from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from scipy.linalg import block_diag
 
+from pathspace_graph.baselines.ckf_belief import SENSOR_COLUMNS, to_vehicle_rows, transform
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import scatter
 from pathspace_graph.factors.residuals import project
@@ -17,7 +18,6 @@ from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.belief import SENSOR_COLUMNS, to_vehicle_rows, transform
 from pathspace_graph.settings.mapper import CkfSettings
 
 from .ckf_curves import CurveState

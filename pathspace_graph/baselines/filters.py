@@ -5,6 +5,7 @@ from typing import ClassVar, Final, Self
 import numpy as np
 from scipy.linalg import block_diag
 
+from pathspace_graph.baselines.ckf_belief import HEAD, Belief, point_columns
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import left_of, to_map
 from pathspace_graph.front_end.front_end import Reading
@@ -16,7 +17,6 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.loop.closing import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping import registration
-from pathspace_graph.mapping.belief import HEAD, Belief, point_columns
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.registration import Motion, near_start
@@ -107,7 +107,7 @@ class CkfMapper(_Filter):
         if self.closed:
             return
         recent = [*self._recent, (state.pose.copy(), detections)]
-        self._recent = [cycle for cycle in recent if cycle[1].t > detections.t - registration.WINDOW]
+        self._recent = [cycle for cycle in recent if cycle[1].t > detections.t - registration.REGISTERED_AGE]
         too_soon = self.path.length - self._last_check < settings.check_interval
         if too_soon or not state.curves or not near_start(self.path, state.pose, settings):
             return

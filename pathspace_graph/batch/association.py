@@ -13,7 +13,7 @@ from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, in_front_row
+from pathspace_graph.mapping.path import LATERAL_GAP, ROW_BESIDE, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
@@ -26,12 +26,12 @@ SHARP: Final = 0.6  # largest standard deviation of detections that say where a 
 SHARP_SHARE: Final = 0.1  # share of so certain detections below which all of them say it
 MIN_SHARE: Final = 0.1  # least size of a cone's cluster as a share of the median cluster's
 MIN_SHARE_BESIDE: Final = 0.3  # `MIN_SHARE` of a cluster beside a curve, whose detections aren't used
-MIN_CONES: Final = 4  # least number of cones of a curve, below which none is removed
-STEP: Final = 1.0  # at which the curve's point nearest to a pose is searched for, m along the curve
+ROW_CONES: Final = 4  # least number of cones of a curve, below which none is removed
+POSE_STEP: Final = 1.0  # at which the curve's point nearest to a pose is searched for, m along the curve
 DIRECTION_PENALTY: Final = 100.0  # distance added in quadrature where the curve runs against a heading, m
 FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched, m along the curve
-STRETCH: Final = 5.0  # most distance along the curve from a cone to the poses that pass it, m
-ROOM: Final = 2.0  # by which two poses may be farther apart along an open curve than was driven, m
+PASS_STRETCH: Final = 5.0  # most distance along the curve from a cone to the poses that pass it, m
+POSE_ROOM: Final = 2.0  # by which two poses may be farther apart along an open curve than was driven, m
 FOLD_COSINE: Final = 0.5  # a row of cones folds back where the cosine of its turn is less than minus this
 FOLD_DISTANCE: Final = 1.5  # from its nearer neighbour (m), below which a cone at such a turn is a duplicate
 
@@ -59,7 +59,7 @@ def locate_poses(state: State) -> None:
     """
     poses = state.poses
     for label, boundary in state.boundaries.items():
-        count = int(np.ceil(boundary.length / STEP))
+        count = int(np.ceil(boundary.length / POSE_STEP))
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
         position, tangent = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
         tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
@@ -70,7 +70,7 @@ def locate_poses(state: State) -> None:
         if boundary.periodic:
             state.pose_u[label] = np.unwrap(u[square.argmin(axis=1)], period=boundary.length)
         else:
-            driven = np.hypot(*np.diff(poses[:, :2], axis=0).T) + ROOM
+            driven = np.hypot(*np.diff(poses[:, :2], axis=0).T) + POSE_ROOM
             state.pose_u[label] = u[_along(square, driven * count / boundary.length)]
 
 
@@ -220,7 +220,7 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
         pose_u = state.pose_u[label]
         lap = pose_u > pose_u[-1] - boundary.length  # the last one
         apart = np.mod(cones.u[:, None] + begin - pose_u[lap], boundary.length)
-        own = np.minimum(apart, boundary.length - apart) < STRETCH
+        own = np.minimum(apart, boundary.length - apart) < PASS_STRETCH
         cones = along_drive(cones, state.poses[lap], own, label)
     return without_folds(cones, boundary.periodic)
 
@@ -252,7 +252,7 @@ def along_drive(cones: Cones, lap: Array, own: BoolArray, label: int) -> Cones:
     nearest = np.add(square, DIRECTION_PENALTY**2, out=square, where=~own).argmin(axis=1)
     ahead, left = to_vehicle(cones.points, lap[nearest]).T
     station, side = path_lengths(lap)[nearest] + ahead, SIDES[label] * left
-    front = in_front_row(station, side, BESIDE, LATERAL_GAP)
+    front = in_front_row(station, side, ROW_BESIDE, LATERAL_GAP)
     order = np.argsort(station, kind="stable")
     return cones.where(order[front[order]])
 
@@ -274,7 +274,7 @@ def _beside(
 def without_folds(cones: Cones, periodic: bool) -> Cones:
     """Return the cones without duplicates, at which their row folds back on itself over a short distance."""
     points = cones.points
-    if len(points) < MIN_CONES:
+    if len(points) < ROW_CONES:
         return cones
     into, out = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
     lengths = np.hypot(*into.T), np.hypot(*out.T)

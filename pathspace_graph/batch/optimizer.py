@@ -20,14 +20,14 @@ from .system import LOOSE_GATE, BatchSystem, Biweight, Evaluation, moved
 STATION_PASSES: Final = 2  # times that detections are matched with the cones of a closed optimum
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 SEARCH: Final = 20  # rounds in which associations are found anew
-SETTLE: Final = 8  # most refinements of the foot points before a step
+SETTLE_FEET: Final = 8  # most refinements of the foot points before a step
 POSE_STEPS: Final = 3  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
 ROUGH_TOLERANCE: Final = 40.0  # factor of the tolerances in the first optimization
 TOLERANCE_COST: Final = 1e-5  # most |cost_before - cost_after| over a round at convergence, over the cost
 TOLERANCE_CURVE: Final = 2e-3  # largest move of a curve across itself in a round then, as seen from poses (m)
 TOLERANCE_DECREASE: Final = 5e-3  # most decrease of the cost by an undamped step then; one sigma has 1/2
 CURVE_SAMPLES: Final = 2  # points in each knot interval at which the movement of a curve is measured
-SHARES: Final = (0.3, 0.97)  # of a step in the one before, between which it is extrapolated
+CREEP_SHARES: Final = (0.3, 0.97)  # of a step in the one before, between which it is extrapolated
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ class Optimizer:
         if not held:
             associate(state, system.detections, system.settings, gate, strict)
         at = system.evaluate(state, hold=not held)
-        for _ in range(SETTLE):
+        for _ in range(SETTLE_FEET):
             self._keep_foot_points(at)
             before, at = at, system.evaluate(state, hold=not held)
             if abs(before.cost - at.cost) <= self.effort.tolerance * TOLERANCE_COST * at.cost:
@@ -214,13 +214,13 @@ class Optimizer:
 def extrapolation_factor(step: Array, before: Array) -> float:
     """Return `1 / (1 - r)`: how much longer a step (n,) is made, r being its share of the step before.
 
-    Aitken's process for vectors, with r by least squares, and 1 where |r| isn't between `SHARES`. Robust
-    weights, held sigmas and foot points on a bend let Gauss-Newton converge only linearly: it creeps (r > 0),
-    or oscillates (r < 0), where a shorter step ends it.
+    Aitken's process for vectors, with r by least squares, and 1 where |r| isn't between `CREEP_SHARES`.
+    Robust weights, held sigmas and foot points on a bend let Gauss-Newton converge only linearly: it creeps
+    (r > 0), or oscillates (r < 0), where a shorter step ends it.
     """
     square = float(before @ before)
     share = float(step @ before) / square if square > 0.0 else 0.0
-    return 1.0 / (1.0 - share) if SHARES[0] < abs(share) < SHARES[1] else 1.0
+    return 1.0 / (1.0 - share) if CREEP_SHARES[0] < abs(share) < CREEP_SHARES[1] else 1.0
 
 
 def gradient(groups: Sequence[Rows], layout: Layout) -> Array:

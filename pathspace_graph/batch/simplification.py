@@ -19,7 +19,7 @@ from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
 
-from .association import MIN_CONES, associate, cones_of_curve, feet_of_cones, locate_poses
+from .association import ROW_CONES, associate, cones_of_curve, feet_of_cones, locate_poses
 
 MIN_SIZE_SHARE: Final = 0.6  # least share of the largest number of control points that is tried
 ALIKE: Final = (3.0, 0.01)  # parameters on curves of length L through the same cones differ by < a + b L (m)
@@ -35,7 +35,7 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
     for label, boundary in list(state.boundaries.items()):
         cones = cones_of_curve(state, detections, label, settings)
         points = cones.points
-        if len(points) < MIN_CONES:
+        if len(points) < ROW_CONES:
             continue
         if not dense:  # the optimum's curve beside the cones, since some of them are strays
             points = feet_of_cones(state, cones, label).position
@@ -162,7 +162,7 @@ def cross_validated(points: Array, periodic: bool, settings: MapperSettings, sha
     distances = [np.zeros(0)]
     for fold in range(FOLDS):
         out = (number % FOLDS == fold) & ~ends
-        if (~out).sum() < MIN_CONES:
+        if (~out).sum() < ROW_CONES:
             continue
         spline = fit_through(points[~out], periodic, settings, share)
         low, high = (np.full(out.sum(), end) for end in spline.domain)

@@ -36,15 +36,15 @@ from pathspace_graph.run import OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from .association import MIN_CONES, add_drive, cluster
+from .association import ROW_CONES, add_drive, cluster
 from .simplification import boundary_of, exact_settings, fit_through
 from .system import BatchSystem
 
 ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the passes of a place together
 ALIGN_TOLERANCE: Final = 1e-2  # largest move of a step at which they are together (m, rad)
-INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
+REVISIT_INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
 LAP_SHARE: Final = 0.7  # least share of a lap between two passes
-MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
+START_MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
 
 
 class CurveMapper(OnlineEstimator, Protocol):
@@ -174,7 +174,7 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
     """Return the revisits of a whole drive by its cones: the first return to its beginning, and later ones.
 
     Before the first return the poses are dead reckoned, so it has to be sure. Each revisit aligns the poses,
-    and the next is searched for `INTERVAL` metres later, nearby.
+    and the next is searched for `REVISIT_INTERVAL` metres later, nearby.
     """
 
     chain, settings, table = judged.chain, judged.settings, all_cones(judged)
@@ -191,7 +191,7 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
             continue
         so_far = poses[: newest + 1]
         if revisits:
-            due = driven[newest] + INTERVAL / 3.0
+            due = driven[newest] + REVISIT_INTERVAL / 3.0
             revisit = _return_again(seen_in, so_far, lap, settings)
         else:
             due = driven[newest] + closing.check_interval
@@ -202,7 +202,7 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
             lap = length_of_lap(reckoned.poses, revisit)
         revisits.append(revisit)
         poses = aligned_odometry(chain, revisits).poses
-        due = driven[newest] + INTERVAL
+        due = driven[newest] + REVISIT_INTERVAL
     return tuple(revisits)
 
 
@@ -240,10 +240,10 @@ def _begin_boundary(
     points = to_map(detections.point[rows], poses[cycles])
     station, lateral = along_and_across(points, path, stations)
     side, ahead = SIDES[label] * lateral, station - driven[cycles]
-    kept = (side > MIN_LATERAL) & (side < MAX_LATERAL)
+    kept = (side > MIN_LATERAL) & (side < START_MAX_LATERAL)
     kept &= (ahead > -gate.view_behind) & (ahead < gate.view_ahead) & (station >= 0.0) & (station < length)
     covariances = rotated(detections.covariance[rows[kept]], poses[cycles[kept], 2])
     cones = cluster(points[kept], station[kept], covariances, length, closes, settings)
-    if len(cones.u) >= MIN_CONES:
+    if len(cones.u) >= ROW_CONES:
         spline = fit_through(cones.points, closes, settings, settings.batch.size_share)
         state.add_boundary(label, *boundary_of(spline, settings))

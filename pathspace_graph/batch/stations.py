@@ -14,16 +14,16 @@ from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.stations import SIGMA_POSE, CurveStations, Stations
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .association import MIN_CONES, cones_of_curve, feet_of_cones
+from .association import ROW_CONES, cones_of_curve, feet_of_cones
 
 SIGMA_STATION: Final = 0.02  # of a cone along a curve that has a control point for each and follows it (m)
-BLOCK: Final = 20.0  # length of the stretches of a later lap that are shifted along the curves together (m)
-REACH: Final = 4.0  # most of a shift (m)
-STEP: Final = 0.1  # between the shifts that are tried (m)
+SHIFT_BLOCK: Final = 20.0  # length of the stretches of a later lap that are shifted together (m)
+SHIFT_REACH: Final = 4.0  # most of a shift (m)
+SHIFT_STEP: Final = 0.1  # between the shifts that are tried (m)
 SIGMA_SHIFT: Final = 1.0  # standard deviation of a shift before it is known (m)
-STRAY: Final = 0.05  # likelihood of a detection far from any cone, by that of one at a cone
-APART: Final = 0.5  # difference between shifts that contradict each other (m)
-ODDS: Final = 20.0  # least odds of a shift against each that contradicts it
+SHIFT_STRAY: Final = 0.05  # likelihood of a detection far from any cone, by that of one at a cone
+SHIFT_APART: Final = 0.5  # difference between shifts that contradict each other (m)
+SHIFT_ODDS: Final = 20.0  # least odds of a shift against each that contradicts it
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ def match_stations(
     for label in state.boundaries:
         first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0))
         cones = cones_of_curve(state, first, label, settings)
-        if len(cones.u) < MIN_CONES:
+        if len(cones.u) < ROW_CONES:
             return None
         places[label] = feet_of_cones(state, cones, label).u
     sigmas = {label: np.full(len(u), SIGMA_STATION) for label, u in places.items()}
@@ -92,7 +92,7 @@ class SeenAgain:
         tangent, poses = state.spline(label).tangent_unit(u), state.variables.poses_at(cycle)
         sigma = sigma_across(tangent, detections.covariance[rows], poses, 0.0)
         again = laps_of(state, detections, label)[rows] > 0
-        block = (path_lengths(state.poses)[cycle] // BLOCK).astype(np.intp)
+        block = (path_lengths(state.poses)[cycle] // SHIFT_BLOCK).astype(np.intp)
         return cls(curve, rows, u, sigma, np.where(again, block, -1))
 
 
@@ -111,18 +111,18 @@ def shifts(seen: Sequence[SeenAgain]) -> Array:
     block and its neighbours, each once, at their stations.
     """
     count = 1 + max(int(one.block.max(initial=-1)) for one in seen)
-    tries = np.arange(-REACH, REACH + 0.5 * STEP, STEP)
+    tries = np.arange(-SHIFT_REACH, SHIFT_REACH + 0.5 * SHIFT_STEP, SHIFT_STEP)
     score = np.zeros((len(tries), count + 2))
     for one in seen:
         again = one.block >= 0
         u, block = one.u[again], one.block[again]
         sigma = np.hypot(one.sigma[again], SIGMA_POSE)
         beyond = one.curve.nearest(u + tries[:, None])[1]
-        likelihood = np.log(STRAY + np.exp(-0.5 * (beyond / sigma) ** 2))
+        likelihood = np.log(SHIFT_STRAY + np.exp(-0.5 * (beyond / sigma) ** 2))
         cone = block * len(one.curve.u) + one.curve.nearest(u)[0]
         likelihood /= np.bincount(cone)[cone]
         score[:, 1:-1] += [np.bincount(block, row, count) for row in likelihood]
     score = score[:, :-2] + score[:, 1:-1] + score[:, 2:] - 0.5 * (tries[:, None] / SIGMA_SHIFT) ** 2
     best = tries[score.argmax(axis=0)]
-    rival = np.where(np.abs(tries[:, None] - best) > APART, score, -np.inf).max(axis=0)
-    return np.where(score.max(axis=0) - rival > np.log(ODDS), best, np.nan)
+    rival = np.where(np.abs(tries[:, None] - best) > SHIFT_APART, score, -np.inf).max(axis=0)
+    return np.where(score.max(axis=0) - rival > np.log(SHIFT_ODDS), best, np.nan)

@@ -34,16 +34,16 @@ from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
 
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
-MAX_STAMP: Final = 1e11  # largest stamp, s: some three thousand years. Stamps in nanoseconds are larger
-UNITS: Final = "stamps are in seconds"  # hint where a stamp looks like one in milliseconds or nanoseconds
-STAMPS: Final = f"at most {MAX_STAMP:g} s ({UNITS})"
+LATEST_STAMP: Final = 1e11  # largest stamp, s: some three thousand years. Stamps in nanoseconds are larger
+IN_SECONDS: Final = "stamps are in seconds"  # hint where one looks like one in milli- or nanoseconds
+STAMPS: Final = f"at most {LATEST_STAMP:g} s ({IN_SECONDS})"
 MAX_TWISTS: Final = 100_000
-MAX_DETECTIONS: Final = 500  # largest numbers of twists and detections in a cycle, which bound its time
+MOST_DETECTIONS: Final = 500  # largest numbers of twists and detections in a cycle, which bound its time
 MIN_RANGE: Final = 0.01  # least distance of a detection from the vehicle, m
 MIN_SIGMA: Final = 1e-6
 MAX_SIGMA: Final = 100.0  # least and largest standard deviation of a detection in any direction, m
 MIN_DETERMINANT: Final = 1e-12  # least det of a covariance over xx * yy: singular to doubles below
-MAX_ASYMMETRY: Final = 1e-6  # largest |xy - yx| of a covariance by its larger eigenvalue
+MOST_ASYMMETRY: Final = 1e-6  # largest |xy - yx| of a covariance by its larger eigenvalue
 _KNOWN_LABELS: Final = "one of " + ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
 
 
@@ -144,7 +144,7 @@ def _stamp(value: Any) -> float:
         t = float(value)
     except (TypeError, ValueError, OverflowError):
         raise ReadingError("detections.t", "a number", type(value).__name__) from None
-    if not abs(t) <= MAX_STAMP:
+    if not abs(t) <= LATEST_STAMP:
         raise ReadingError("detections.t", STAMPS, t)
     return t
 
@@ -164,7 +164,7 @@ def _check_order(stamps: Array, t: float, newest: float | None, silence: float) 
     if len(steps) == 0 or steps.max() <= silence:
         return
     at = int(steps.argmax()) + 1
-    expected = f"at most {silence:g} s after the reading at {known[at - 1]:.12g} s ({UNITS})"
+    expected = f"at most {silence:g} s after the reading at {known[at - 1]:.12g} s ({IN_SECONDS})"
     if at == len(known) - 1:
         raise ReadingError("detections.t", expected, t)
     raise ReadingError("odometry.t", expected, float(known[at]), at - len(before))
@@ -176,7 +176,7 @@ def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, A
     twists = _numbers(odometry.twist, "odometry.twist", (len(stamps), len(TWIST)))
     if len(stamps) > MAX_TWISTS:
         raise ReadingError("odometry.t", f"at most {MAX_TWISTS} twists", len(stamps))
-    within, later = np.abs(stamps) <= MAX_STAMP, np.ones(len(stamps), bool)
+    within, later = np.abs(stamps) <= LATEST_STAMP, np.ones(len(stamps), bool)
     later[1:] = stamps[1:] > stamps[:-1]
     _require(within, "odometry.t", STAMPS, stamps)
     _require(later, "odometry.t", "a stamp later than the one before", stamps)
@@ -221,10 +221,10 @@ def possible_detections(
     count = len(points)
     covariances = _numbers(detections.covariances, "detections.covariances", (count, 2, 2))
     labels = _labels(detections.labels, count)
-    if count > MAX_DETECTIONS:
-        raise ReadingError("detections.points_vehicle", f"at most {MAX_DETECTIONS} rows", count)
+    if count > MOST_DETECTIONS:
+        raise ReadingError("detections.points_vehicle", f"at most {MOST_DETECTIONS} rows", count)
     ranges, sigmas = (MIN_RANGE * scale, limits.range_max), (MIN_SIGMA * scale, MAX_SIGMA * scale)
-    near, definite = kernels.usable(points, covariances, (*ranges, MAX_ASYMMETRY, MIN_DETERMINANT, *sigmas))
+    near, definite = kernels.usable(points, covariances, (*ranges, MOST_ASYMMETRY, MIN_DETERMINANT, *sigmas))
     good = near & definite
     if good.all():
         return Detections(t, points, covariances, labels), ""

@@ -18,7 +18,7 @@ from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_w
 from pathspace_graph.factors.se2 import in_vehicle, rotations, to_map
 from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE
 
-from .sightings import MAD, MAX_RANGE, MIN_SPEED_SHARE, ConeTracker, SeenCycle, Sightings, TwistRecord
+from .sightings import FOLLOW_RANGE, MAD, MIN_SPEED_SHARE, ConeTracker, SeenCycle, Sightings, TwistRecord
 
 DRIFT: Final = np.array([0.05, 0.05, 0.0017])
 """Assumed drift of any odometry (m, m, rad per root of s): 0.5 m and 0.9 degrees after 90 s.
@@ -28,28 +28,28 @@ less than 0.05 m/s is lost in the noise of its detections."""
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02, 0.02])
 """Weak priors of the sensor's errors (rad, m, s, -, m), of the bend of its ranges (1/m) and of the yaw rate's
 bias (rad/s), one sigma. Without the bend, yaw, lateral offset and scale would take it up."""
-BEND: Final = SENSOR_SIZE  # place of the bend among the constants
+OF_BEND: Final = SENSOR_SIZE  # place of the bend among the constants
 FIRST_ALONG: Final = (0.1, 0.04)
 FIRST_ACROSS: Final = (0.05, 0.016)  # noise that the iteration begins with: m and m/m, then m and rad
 PASSES: Final = 4  # times that cones are followed
 FOLLOWED: Final = 40  # cycles in which cones are followed in a step
-ROUNDS: Final = 5  # times that errors, noise and weights are found in turn
+ROUNDS_FIRST: Final = 5  # times that errors, noise and weights are found in turn
 ROUNDS_AGAIN: Final = 3  # rounds of a pass that starts from measured noise, which is nearly converged
-STRETCH: Final = 3.0  # time (s) over which errors of the odometry are alike
-COUNTED: Final = 0.8  # share of `MAX_RANGE` beyond which cones are followed only where they seem nearer
+CLUSTER_TIME: Final = 3.0  # time (s) over which errors of the odometry are alike
+COUNTED: Final = 0.8  # share of `FOLLOW_RANGE` beyond which cones are followed only where they seem nearer
 HARDLY: Final = 1e-6  # weight of sightings beyond: a cone seen only there still has a place
-HUBER: Final = 2.0
+NOISE_HUBER: Final = 2.0
 MIN_COUNT: Final = 5  # least number of sightings of a cone that counts
 MIN_ROWS: Final = 60  # least number of sightings with a reference that tell the noise of detections
-NEAR: Final = 0.6  # share of a sighting's range within which the same cone's sightings are its reference
+NEAR_SHARE: Final = 0.6  # share of a sighting's range within which the same cone's others are its reference
 NEAR_TIME: Final = 6.0  # greatest time to a reference (s), over which odometry is trusted
 BINS: Final = 8
-TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # correlation times that are tried (s)
+STAY_TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # correlation times that are tried (s)
 LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)  # edges of the lags at which correlation is measured (s)
 MODEL_ERROR: Final = 0.05  # share of an error that the linear model may be wrong by, one sigma
 FIRST_SHARE: Final = 0.5  # share of a cone's error that stays with it, unless cones say otherwise
 FIRST_CONES: Final = 8.0  # number of cones that `FIRST_SHARE` counts as much as
-LEAST: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
+LEAST_NOISE: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
 
 Rays = tuple[RayNoise, RayNoise]
 """Noise along the ray and across it."""
@@ -133,11 +133,11 @@ def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Arra
 def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
     """Return the covariance (7, 7) of the constants by how much the stretches of the drive disagree.
 
-    With the scores g (c, 7) of the cones summed over `STRETCH` seconds it is `P (sum g g') P` (White's
+    With the scores g (c, 7) of the cones summed over `CLUSTER_TIME` seconds it is `P (sum g g') P` (White's
     estimator for clusters), which has the errors of the odometry in it.
     """
     middle = np.add.reduceat(cones.table.t, cones.begins) / cones.counts
-    _, stretch = np.unique(np.floor(middle / STRETCH), return_inverse=True)
+    _, stretch = np.unique(np.floor(middle / CLUSTER_TIME), return_inverse=True)
     count = int(stretch.max()) + 1
     summed = np.zeros((count, scores.shape[1]))
     np.add.at(summed, stretch, scores)
@@ -153,7 +153,7 @@ def _residuals(cones: _Cones, errors: Array, noise: Rays, odometry: Array) -> tu
     points, sigmas = cones.points + cones.columns @ errors, cones.sigmas(noise)
     weight = 1.0 / (sigmas**2).mean(axis=0)
     values, table = np.column_stack([points, *sigmas]), cones.table
-    sought = NEAR, NEAR_TIME
+    sought = NEAR_SHARE, NEAR_TIME
     rows, counts, means = kernels.references(table.cone, table.t, cones.ranges, weight, values, sought)
     offsets, lag = cones.on_axes(points[rows] - means[:, 1:3], rows), means[:, 0]
     across = odometry[1] ** 2 + (odometry[2] * cones.ranges[rows]) ** 2
@@ -224,10 +224,11 @@ def _staying(lagged: Lagged, off: Array, reference: Array, sigma: Array) -> tupl
     lags, correlations = (
         np.bincount(place, values)[enough] / counts[enough] for values in (lag, product / scale)
     )
-    weights, model = np.sqrt(counts[enough]), np.exp(-lags / np.array(TIMES)[:, None])  # a row for each time
+    weights = np.sqrt(counts[enough])
+    model = np.exp(-lags / np.array(STAY_TIMES)[:, None])  # a row for each time
     shares = np.clip((weights * model) @ correlations / (weights * model**2).sum(axis=1), 0.0, 1.0)
     best = int((weights * (correlations - shares[:, None] * model) ** 2).sum(axis=1).argmin())
-    return float(shares[best]), TIMES[best]
+    return float(shares[best]), STAY_TIMES[best]
 
 
 class Measurement:
@@ -278,7 +279,7 @@ class Measurement:
         along, across, self._rounds = self._found.along, self._found.across, ROUNDS_AGAIN
         if along is None or across is None:
             along, across = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
-            self._rounds = ROUNDS
+            self._rounds = ROUNDS_FIRST
         self._noise, self._weights = (along, across), np.ones(len(self._cones.ranges))
         return None
 
@@ -286,15 +287,15 @@ class Measurement:
         walk, noise = self._found.odometry * np.sqrt(self._found.interval), self._noise
         errors, *covariances, off = _solve(cones, cones.information(noise, self._weights))
         cones = self._cones = cones.without(off)
-        self._weights = huber_weights(np.hypot(*(cones.on_axes(off) / cones.sigmas(noise))), HUBER) ** 2
-        self._weights[cones.ranges > COUNTED * MAX_RANGE] = HARDLY
+        self._weights = huber_weights(np.hypot(*(cones.on_axes(off) / cones.sigmas(noise))), NOISE_HUBER) ** 2
+        self._weights[cones.ranges > COUNTED * FOLLOW_RANGE] = HARDLY
         rows, (along, across), (by_along, by_across) = _residuals(cones, errors, noise, walk)
         if len(rows) < MIN_ROWS:
             return self._passed(self._found)
         lagged = _lagged(cones.table.cone[rows], cones.table.t[rows])
         self._noise = (
-            _ray_noise(cones, rows, lagged, along, by_along, (LEAST[0], 0.0)),
-            _ray_noise(cones, rows, lagged, across, by_across, (0.0, LEAST[1])),
+            _ray_noise(cones, rows, lagged, along, by_along, (LEAST_NOISE[0], 0.0)),
+            _ray_noise(cones, rows, lagged, across, by_across, (0.0, LEAST_NOISE[1])),
         )
         self._rounds -= 1
         return None if self._rounds else self._passed(self._result(cones, errors, *covariances))
@@ -310,7 +311,7 @@ class Measurement:
         stays = max(one.inflation_of_slope(count, period) for one in self._noise)
         sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
         sigmas = np.hypot(sigmas, MODEL_ERROR * np.abs(errors))
-        is_bent = np.abs(errors[BEND]) > SURE * sigmas[BEND]
+        is_bent = np.abs(errors[OF_BEND]) > SURE * sigmas[OF_BEND]
         return replace(
             self._found,
             along=self._noise[0],
@@ -320,7 +321,7 @@ class Measurement:
             per_cycle=len(sightings.t) / len(stamps),
             sensor=errors[:SENSOR_SIZE],
             sensor_sigma=sigmas[:SENSOR_SIZE],
-            range_bend=float(errors[BEND]) if is_bent else 0.0,
+            range_bend=float(errors[OF_BEND]) if is_bent else 0.0,
             seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
         )
 

@@ -24,11 +24,11 @@ DOUBT_RATE: Final = 2.0  # agreement within which a contradicted odometry's yaw 
 MAX_CHANGE: Final = 3.5  # largest difference of a motion from the one before, in `SIGMAS_CHANGE`
 SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)  # m/s, m/s, rad/s from cycle to cycle without odometry
 BEFORE: Final = 0.5  # share of a contradiction added to its motion's sigma: it may have begun earlier
-WIDENING: Final = 1.5  # of the sigmas of a motion by detections, which the estimator uses again
+WIDENED: Final = 1.5  # of the sigmas of a motion by detections, which the estimator uses again
 HOLD: Final = 0.15  # time for which a twist is held without a loss of certainty, s
 HOLD_INTERVALS: Final = 3.0  # shortest intervals of twists for which it is held so, if longer
 STUCK: Final = 3  # twists equal to the one before from which readings are stuck
-REST: Final = 1.0  # time of standing from which the mean yaw rate measures the bias, s
+REST_TIME: Final = 1.0  # time of standing from which the mean yaw rate measures the bias, s
 REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest, m/s, m/s, rad/s, but for noise
 REST_SIGMAS: Final = 3.0  # standard deviations of the mean that count as its noise
 SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # m, m, rad, of a motion at rest from cycle to cycle
@@ -191,7 +191,7 @@ class MotionCheck:
                 mean[2], covariance[2, 2] = odometry.delta[2], odometry.covariance[2, 2]
             turn = np.eye(3)  # from the frame of the check to the vehicle's
             turn[:2, :2] = rotation(best.pose[2]).T
-            information = turn @ best.information @ turn.T / (WIDENING**2 * matcher.excess)
+            information = turn @ best.information @ turn.T / (WIDENED**2 * matcher.excess)
             prior = np.linalg.inv(covariance)
             covariance = np.linalg.inv(information + prior)
             delta = covariance @ (information @ relative(self.pose, best.pose) + prior @ mean)
@@ -267,11 +267,11 @@ class Rest:
         self._sum, self._count = self._sum + twists.sum(axis=0), self._count + len(twists)
         self._rate_sum += float(twists[:, 2].sum())
         self._rate_count += len(twists)
-        return _is_still(self._sum / self._count, self._count, sigma) and t - self._since >= REST
+        return _is_still(self._sum / self._count, self._count, sigma) and t - self._since >= REST_TIME
 
     def bias(self, t: float, sigma: Array) -> BiasMeasurement | None:
         """Return the bias that was measured since the last call, if that is long enough ago at t (s)."""
-        if t - self._measured_since < REST:
+        if t - self._measured_since < REST_TIME:
             return None
         mean, sigma_mean = self._rate_sum / self._rate_count, float(sigma[2]) / np.sqrt(self._rate_count)
         self._measured_since, self._rate_sum, self._rate_count = t, 0.0, 0

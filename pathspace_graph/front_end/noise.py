@@ -22,7 +22,7 @@ from .sightings import SeenCycle, TwistRecord
 FIRST: Final = 8.0  # driving time (s) after which noise is measured first
 AGAIN: Final = 1.5  # growth of the driving time after which it is measured again
 MOST_CYCLES: Final = 300  # newest cycles on which it is measured, which bounds its time
-MIN_SPEED: Final = 0.3  # speed from which on the vehicle drives (m/s)
+DRIVING_SPEED: Final = 0.3  # speed from which on the vehicle drives (m/s)
 SCALE: Final = SENSOR.index("range_scale")
 SIGMA_FREE: Final = 0.02  # of the scale of the ranges, beside that measured, where odometry sets the size (-)
 REFERENCE_RANGE: Final = 10.0  # range at which the scatter of ranges tells how well their scale is known (m)
@@ -75,7 +75,7 @@ class NoiseLearner:
         self._twists.add(odometry)
         seen = SeenCycle(detections, pose.copy(), motion.odometry.twist)
         self._cycles = (*self._cycles[1 - MOST_CYCLES :], seen)
-        if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > MIN_SPEED:
+        if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > DRIVING_SPEED:
             self._driven += min(detections.t - self._t, 1.0)
         self._t = detections.t
         if self._measurement is None and self._driven >= self._due:

@@ -22,28 +22,30 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
 
-ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
+LEARNED_ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
 SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
 SIGMAS_CHANGES: Final = (0.001, 0.005)  # their change in a minute, rad and s
 MINUTE: Final = 60.0
 
-MEMORY: Final = 0.65  # age of remembered detections, s, over which odometry hardly drifts
+SCAN_MEMORY: Final = 0.65  # age of remembered detections, s, over which odometry hardly drifts
 MOST_REMEMBERED: Final = 2000  # largest number of remembered detections, which bounds the time of a match
-REACH: Final = 1.0
+REACH_FIRST: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
-ITERATIONS: Final = 6
-REACHES: Final = [REACH * ((REACH_LAST / REACH) ** (1.0 / (ITERATIONS - 1))) ** k for k in range(ITERATIONS)]
-REACHES_CHECK: Final = (REACH, REACH_LAST)  # of the check, which begins near the solution
+MATCH_STEPS: Final = 6
+REACHES: Final = [
+    REACH_FIRST * ((REACH_LAST / REACH_FIRST) ** (1.0 / (MATCH_STEPS - 1))) ** k for k in range(MATCH_STEPS)
+]
+REACHES_CHECK: Final = (REACH_FIRST, REACH_LAST)  # of the check, which begins near the solution
 FARTHEST: Final = 3.0  # distance in reaches from which on a remembered detection has no weight
 MIN_WEIGHT: Final = 0.7  # least sum of weights of a matched detection
 MIN_MATCHED: Final = 3  # least number of matched detections that tell a motion
-HUBER: Final = 2.5  # whitened distance beyond which the Huber loss reduces the weight of a matched detection
+SCAN_HUBER: Final = 2.5  # whitened distance beyond which Huber's loss reduces a detection's weight
 SIGMA_CONE: Final = 0.05  # added to a detection's, m, since one side of a cone is seen
 LEAST_SHARE: Final = 1e-6  # least det of a pose's information by the product of its diagonal
 MOST_MISFIT: Final = 9.0  # largest whitened square in a misfit that is compared with another
 MIN_DOUBTING: Final = 4  # least number of matched detections of a contradiction
-MISFIT: Final = 1.5  # mean-square misfit beyond which its excess scales the detections' covariances
+LARGE_MISFIT: Final = 1.5  # mean-square misfit beyond which its excess scales the detections' covariances
 MISFIT_GAIN: Final = 0.02  # smoothing gain of the mean-square misfit
 MAX_MISFIT: Final = 3.0  # largest misfit of a motion: 1 where the vehicle moved, 4 where it was put down
 MISFIT_ODOMETRY: Final = 2.0  # least misfit at the odometry's own pose in a contradiction
@@ -59,7 +61,7 @@ class RecentDetections:
     def __init__(self) -> None:
         self.points: Array = np.zeros((0, 2))  # (n, 2) place of each detection, m
         # a row is [stamp | point as measured | place of the vehicle | derivatives of x | derivatives of y]
-        self._table: Array = np.zeros((0, 5 + 2 * len(ERRORS)))
+        self._table: Array = np.zeros((0, 5 + 2 * len(LEARNED_ERRORS)))
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
@@ -79,7 +81,7 @@ class RecentDetections:
         self.points = self._table[:, 1:3] + columns @ errors
 
     def forget(self, t: float) -> None:
-        first = int(self._table[:, 0].searchsorted(t - MEMORY, side="right"))
+        first = int(self._table[:, 0].searchsorted(t - SCAN_MEMORY, side="right"))
         self._table = self._table[first:]
         self.points = self._table[:, 1:3]
 
@@ -122,7 +124,7 @@ def match(
     the weighted mean of the recent detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) +
     SIGMA_CONE^2` with n_i the sum of the weights. The variances (m,) are those of one coordinate (m^2).
     """
-    limits = (FARTHEST, MIN_WEIGHT, HUBER, SIGMA_CONE, MIN_MATCHED, LEAST_SHARE)
+    limits = (FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED, LEAST_SHARE)
     pose, information, matched, cost = kernels.matched(
         recent.points, points_vehicle, variances, start, reaches, limits
     )
@@ -144,7 +146,7 @@ def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array,
 
 def by_errors(points_vehicle: Array, twist: Array) -> Array:
     """Return the derivatives (m, 2, 2) of detections (m, 2), vehicle frame, by the yaw and by the latency."""
-    columns = np.empty((len(points_vehicle), 2, len(ERRORS)))
+    columns = np.empty((len(points_vehicle), 2, len(LEARNED_ERRORS)))
     columns[:, :, 0] = left_of(points_vehicle)
     columns[:, :, 1] = -twist[:2] - twist[2] * columns[:, :, 0]
     return columns
@@ -168,11 +170,11 @@ class SensorErrors:
     """
 
     def __init__(self, settings: MotionSettings) -> None:
-        self.mean: Array = np.zeros(len(ERRORS))  # (2,) yaw (rad, to the left) and latency (s)
+        self.mean: Array = np.zeros(len(LEARNED_ERRORS))  # (2,) yaw (rad, to the left) and latency (s)
         self.covariance: Array = np.diag(np.square(SIGMAS_ERRORS))  # (2, 2) their covariance
         self._drift: Array = np.diag(np.square(SIGMAS_CHANGES)) / MINUTE
         self._velocity: Array = np.zeros(3)
-        self._possible: Array = 0.5 * MEMORY * np.array(settings.accelerations)
+        self._possible: Array = 0.5 * SCAN_MEMORY * np.array(settings.accelerations)
 
     def copy(self) -> Self:
         """Return a copy that goes on independently: no attribute is changed in place."""
@@ -197,7 +199,7 @@ class SensorErrors:
 
     def follow(self, velocity: Array, dt: float) -> None:
         """Take the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""
-        share = min(dt / (0.5 * MEMORY), 1.0)
+        share = min(dt / (0.5 * SCAN_MEMORY), 1.0)
         self._velocity = self._velocity + share * (velocity - self._velocity)
 
     def covariance_of(self, difference: Difference) -> Array:
@@ -218,7 +220,7 @@ class SensorErrors:
 
     def update(self, difference: Difference, dt: float) -> None:
         """Learn from a match that agrees, dt (s) after the last; it counts by its share of memory."""
-        measured = difference.off, difference.covariance, difference.shifts, min(dt / MEMORY, 1.0)
+        measured = difference.off, difference.covariance, difference.shifts, min(dt / SCAN_MEMORY, 1.0)
         self.mean, self.covariance = kernels.learned(self.mean, self.covariance, dt * self._drift, *measured)
 
 
@@ -246,7 +248,7 @@ class ScanMatcher:
     @property
     def excess(self) -> float:
         """Factor by which the variance of detections is larger than they claim; at least 1."""
-        return max(self._misfit / MISFIT, 1.0)
+        return max(self._misfit / LARGE_MISFIT, 1.0)
 
     def corrected(self, detections: Detections, twist: Array) -> Seen:
         """Return a cycle's detections by the errors of the sensor, and correct the remembered ones."""

@@ -13,27 +13,27 @@ import numpy as np
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.front_end.cone_rows import ConeRow, deal_out
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.path import BESIDE, LATERAL_GAP, SIDES, DrivenPath, PathAhead, in_front_row
-from pathspace_graph.mapping.rows import ConeRow, deal_out
+from pathspace_graph.mapping.path import LATERAL_GAP, ROW_BESIDE, SIDES, DrivenPath, PathAhead, in_front_row
 from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.online import SidesSettings
 
-REACH: Final = 8.0  # length of the predicted path beside which coloured cones say what the colours mean, m
-MIN_LATERAL: Final = 0.5
-MAX_LATERAL: Final = 8.0  # distances from the path between which it tells the side of a cone, m
+VOTE_REACH: Final = 8.0  # length of the predicted path beside which cones say what the colours mean, m
+NEAREST_SIDE: Final = 0.5
+FARTHEST_SIDE: Final = 8.0  # distances from the path between which it tells the side of a cone, m
 MAJORITY: Final = 2.5  # least ratio of cones on the other colour's side where colours are swapped
 MIN_VOTES: Final = 3  # least number of cones on the other colour's side where colours are swapped
 ENOUGH_VOTES: Final = 30  # number of cones that settles what the colours mean
 REMEMBERED: Final = 0.98  # factor from cycle to cycle of the detections so far in the colourless share
-MIN_DETECTIONS: Final = 6  # least number of detections of which the share is taken
+MIN_SHARED: Final = 6  # least number of detections of which the share is taken
 MERGE_RADIUS: Final = 1.0  # distance within which detections are of one cone, m
 FORGET_AFTER: Final = 3.0  # time without a detection after which a cone is forgotten, s
-MAX_CONES: Final = 2000  # largest number of cones that are remembered, the ones that were seen last
-SIGHTINGS: Final = 2  # detections from which a cone has a side
+MOST_CONES: Final = 2000  # largest number of cones that are remembered, the ones that were seen last
+SIDED_FROM: Final = 2  # detections from which a cone has a side
 BEHIND: Final = 8.0  # length behind the vehicle at which the rows begin, m along the path
-SURE: Final = 3.0  # length ahead of it up to which the path tells sides, m; beyond, the rows do
+PATH_TELLS: Final = 3.0  # length ahead of it up to which the path tells sides, m; beyond, the rows do
 HALF_WIDTH: Final = 1.5  # distance beside the vehicle at which a row without any cone begins, m
 
 
@@ -70,7 +70,7 @@ class SideJudge:
         self._path = self._path or DrivenPath()
         self._path.update(pose)
         self._path.steer(twists)
-        path = self._path.ahead(pose, REACH)
+        path = self._path.ahead(pose, VOTE_REACH)
         points = to_map(detections.points_vehicle, pose[None])
         cones = self._cones.add(detections.t, points, labels)
         if not in_lane:
@@ -92,8 +92,8 @@ class SideJudge:
         if len(fresh) == 0:
             return
         stations, lateral = path.locate(near.points[fresh])
-        beside = (np.abs(lateral) > MIN_LATERAL) & (np.abs(lateral) < MAX_LATERAL)
-        beside &= (stations > path.driven) & (stations < path.driven + REACH)
+        beside = (np.abs(lateral) > NEAREST_SIDE) & (np.abs(lateral) < FARTHEST_SIDE)
+        beside &= (stations > path.driven) & (stations < path.driven + VOTE_REACH)
         near.judge(fresh[beside])
         is_left = near.votes[fresh, LEFT] > near.votes[fresh, RIGHT]
         agree = (lateral > 0.0) == is_left
@@ -109,11 +109,11 @@ class SideJudge:
         self._unknown = REMEMBERED * self._unknown + unknown
         self._known = REMEMBERED * self._known + len(labels) - unknown
         total = self._known + self._unknown
-        return total >= MIN_DETECTIONS and self._unknown > self.settings.colourless * total
+        return total >= MIN_SHARED and self._unknown > self.settings.colourless * total
 
     def _sides(self, pose: Array, path: PathAhead) -> IntArray:
         near = self._cones
-        seen = np.flatnonzero(near.counts >= SIGHTINGS)
+        seen = np.flatnonzero(near.counts >= SIDED_FROM)
         sides = np.full(len(near.points), UNKNOWN)
         if len(seen) == 0:
             return sides
@@ -131,10 +131,10 @@ class SideJudge:
     ) -> ConeRow:
         """Return the row of a boundary up to the vehicle, through the cones (k,) that were seen."""
         side = SIDES[label] * lateral
-        beside = (side > MIN_LATERAL) & (side < MAX_LATERAL)
-        beside &= (stations > path.driven - BEHIND) & (stations < path.driven + SURE)
+        beside = (side > NEAREST_SIDE) & (side < FARTHEST_SIDE)
+        beside &= (stations > path.driven - BEHIND) & (stations < path.driven + PATH_TELLS)
         order = np.flatnonzero(beside)[np.argsort(stations[beside])]
-        cones = seen[order[in_front_row(stations[order], side[order], BESIDE, LATERAL_GAP)]]
+        cones = seen[order[in_front_row(stations[order], side[order], ROW_BESIDE, LATERAL_GAP)]]
         candidates, ahead = self._cones.points, np.array([np.cos(pose[2]), np.sin(pose[2])])
         line = candidates[cones]
         if len(cones) == 0:
@@ -161,7 +161,7 @@ class NearCones:
 
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:
         """Add detections at points (m, 2) with labels (m,), seen at t (s); return the cone (m,) of each."""
-        kept = newest_of(self._last, MAX_CONES) & (self._last > t - FORGET_AFTER)
+        kept = newest_of(self._last, MOST_CONES) & (self._last > t - FORGET_AFTER)
         for name, column in vars(self).items():
             setattr(self, name, column[kept])
         cones, known = nearest_within(points, self.points, MERGE_RADIUS)

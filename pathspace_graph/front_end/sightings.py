@@ -19,9 +19,9 @@ MOST_TWISTS: Final = 4000
 MOST_PARTS: Final = 200
 MIN_SPEED_SHARE: Final = 0.3  # share of its median speed below which a vehicle says little of noise in motion
 MIN_TWISTS: Final = 30  # least number of twists that tell white noise
-MAX_RANGE: Final = 30.0  # m; beyond, cones are hardly ever seen near later
+FOLLOW_RANGE: Final = 30.0  # m; beyond, cones are hardly ever seen near later
 MAX_AGE: Final = 3.0  # time without a sighting after which a cone counts as another one (s)
-GATE: Final = (0.4, 0.06, 1.5)  # gate of the nearest cone while its noise is not known, `min(a + b r, c)`, m
+GATE_UNKNOWN: Final = (0.4, 0.06, 1.5)  # of the nearest cone while noise is unknown: `min(a + b r, c)`, m
 FOLLOWING: Final = (0.5, 0.15)  # of a cone to where it is seen, and was seen from nearer before
 GATE_SIGMAS: Final = 3.5
 GATE_LEAST: Final = 0.4
@@ -88,7 +88,7 @@ class ConeTracker:
         measured = np.concatenate([one.points_vehicle for one in seen])
         ranges = np.hypot(*measured.T)
         order = np.lexsort((ranges, cycle))
-        order = order[ranges[order] < MAX_RANGE]
+        order = order[ranges[order] < FOLLOW_RANGE]
         cycle, measured, ranges = cycle[order], measured[order], ranges[order]
         points = to_map(self._known.corrected(measured, twists[cycle]), poses[cycle])
         begins, gates = cycle.searchsorted(np.arange(len(cycles) + 1)), self._gates(ranges)
@@ -115,7 +115,7 @@ class ConeTracker:
         """Return how far along and across its ray a detection (m,) may be from its cone (m)."""
         known = self._known
         if known.along is None or known.across is None:
-            round_gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
+            round_gate = np.minimum(GATE_UNKNOWN[0] + GATE_UNKNOWN[1] * ranges, GATE_UNKNOWN[2])
             return round_gate, round_gate
         along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
         return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)

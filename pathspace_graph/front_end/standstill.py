@@ -17,9 +17,9 @@ from pathspace_graph.factors.se2 import compose, move_points, relative
 
 from .scan_matching import MOST_MISFIT, SIGMA_CONE
 
-WINDOW: Final = 1.0  # age of the cycles that are compared, s
+COMPARED: Final = 1.0  # age of the cycles that are compared, s
 CREEP: Final = 3.0  # speed above which no odometry creeps, m/s; wheels that spin contradict single cycles
-SHARES: Final = (0.0, 0.25, 0.5, 1.0)
+HYPOTHESES: Final = (0.0, 0.25, 0.5, 1.0)
 """Hypotheses as shares of the odometry's motion: rest, slip and the odometry itself."""
 CHANCE: Final = 4.5  # gain from which points of a line do not fit by chance, sigmas by its own scatter
 NOWHERE: Final = np.full((1, 2), 1e6)  # a point that is near none, so that no cycle is empty
@@ -51,7 +51,7 @@ class Standstill:
         by_odometry = compose(cycles[0].by_odometry, delta) if cycles else np.zeros(3)
         if cycles and np.hypot(delta[0], delta[1]) > CREEP * (t - cycles[0].t):
             cycles = ()
-        cycles = tuple(one for one in cycles if one.t >= t - WINDOW)
+        cycles = tuple(one for one in cycles if one.t >= t - COMPARED)
         gains = _gains(cycles, points, covariances, by_odometry)
         farthest = np.sqrt((points**2).sum(axis=1).max(initial=0.0))
         points = np.concatenate([points, NOWHERE])
@@ -71,7 +71,7 @@ class Standstill:
         needs no noise. The poses since are then the first one's.
         """
         earlier = len(self._cycles) - 1
-        sums = np.zeros((len(SHARES) + 1, earlier))
+        sums = np.zeros((len(HYPOTHESES) + 1, earlier))
         for k, one in enumerate(self._cycles):
             sums[:, k:] += one.gains[:, : earlier - k]
         rest, *slip, odometry, squares = sums
@@ -99,7 +99,7 @@ def _gains(cycles: Sequence[_Cycle], points: Array, covariances: Array, by_odome
     moves with the vehicle, so what is new at its border matches only at rest.
     """
     if not cycles:
-        return np.zeros((len(SHARES) + 1, 0))
+        return np.zeros((len(HYPOTHESES) + 1, 0))
     ways = np.array([relative(by_odometry, one.by_odometry) for one in cycles])
     begins = np.cumsum([0, *(len(one.points) for one in cycles)])[:-1]
     resting = np.concatenate([one.points for one in cycles])
@@ -109,7 +109,7 @@ def _gains(cycles: Sequence[_Cycle], points: Array, covariances: Array, by_odome
     precisions = np.linalg.inv(2.0 * covariances + SIGMA_CONE**2 * np.eye(2))
     (xx, xy), (_, yy) = precisions.transpose(1, 2, 0)[..., None]
     gains = []
-    for share in SHARES:
+    for share in HYPOTHESES:
         x, y = (points[:, None] - resting - share * (moved - resting)).transpose(2, 0, 1)
         square = np.minimum.reduceat(xx * x * x + 2.0 * xy * x * y + yy * y * y, begins, axis=1)
         gains.append(seen * np.maximum(MOST_MISFIT - square, 0.0))

@@ -11,7 +11,7 @@ from pathspace_graph.copies import shallow
 from pathspace_graph.settings.mapper import MapperSettings
 
 from . import worker
-from .worker import LATE, LapBatch, Unsolved
+from .worker import BATCH_LATE, LapBatch, Unsolved
 
 LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cycle before it was
 
@@ -103,7 +103,7 @@ class LapSolver:
         if batch is None or cycle < batch.due:
             return None
         period = float(np.ptp(times[-2:]))
-        outcome: Outcome | None = LATE
+        outcome: Outcome | None = BATCH_LATE
         if cycle <= batch.last:
             outcome = batch.marginal(max(min(period, LONGEST_WAIT) - spent, 0.0))
         else:

@@ -32,15 +32,15 @@ from .known_loop import KnownLoop, Loop
 
 REPAIRED: Final = "the map was repaired"  # beginning of the notice of the cycle in which it was
 SIGHTINGS: Final = 6  # detections of a cone that contradicts the map; clutter has one, a cone passed twenty
-MEMORY: Final = 30.0  # time after its last detection at which a contradiction is forgotten (s)
+REPAIR_MEMORY: Final = 30.0  # time after its last detection at which a contradiction is forgotten (s)
 CONES: Final = 3  # least number of contradictions in a row that is repaired
-BESIDE: Final = 0.5  # distance from a curve within which a cone does not contradict it (m)
+REPAIR_BESIDE: Final = 0.5  # distance from a curve within which a cone does not contradict it (m)
 CERTAIN: Final = 1.0  # most sigma of a detection that may contradict the map (m): far cones are smeared
 ROW: Final = 11.0  # most distance of neighbours in a row (m): two regular gaps, since one cone may be missed
 SETTLE: Final = 1.5  # time without detections of its cones after which the vehicle has passed a stretch (s)
 MOST: Final = 20  # number of contradictions passed after which enough of a stretch is seen, whatever the time
-INTERVAL: Final = 1.0  # time after which contradictions are looked for again (s)
-ATTEMPTS: Final = 8  # largest number of attempts to repair a map
+REPAIR_INTERVAL: Final = 1.0  # time after which contradictions are looked for again (s)
+REPAIRS: Final = 8  # largest number of attempts to repair a map
 EXPLAINED: Final = 0.5  # least share of the contradictions that a repaired map explains, or the old one stays
 
 
@@ -56,7 +56,7 @@ class Contradictions:
     """The detections that no curve of a closed map explains, by label."""
 
     def __init__(self, settings: GrowthSettings) -> None:
-        merging = replace(settings, sightings=SIGHTINGS, forget_after=MEMORY)
+        merging = replace(settings, sightings=SIGHTINGS, forget_after=REPAIR_MEMORY)
         self._tracks = {label: TentativeTracks(merging) for label in BOUNDARIES}
 
     def copy(self) -> Self:
@@ -96,7 +96,9 @@ class Contradictions:
             chosen = tracks.confirmed()
             if len(chosen) < CONES:
                 continue
-            away = {b: curve.query(tracks.points[chosen])[0] > BESIDE for b, curve in loop.curves.items()}
+            away = {
+                b: curve.query(tracks.points[chosen])[0] > REPAIR_BESIDE for b, curve in loop.curves.items()
+            }
             in_gap = loop.beside_gaps(np.full(len(chosen), label), tracks.points[chosen])
             chosen = chosen[(away[label] | in_gap) & away[LEFT + RIGHT - label]]
             chosen = chosen[self._undisputed(label, chosen)]
@@ -143,7 +145,7 @@ class MapRepair:
 
     def is_due(self, known: KnownLoop, smoother: CurveSmoother, t: float, driven: float) -> bool:
         """Return whether the closed map is contradicted at t (s), after a path of this length (m)."""
-        if t < self._asked + INTERVAL or driven < self._wait_until or self._attempts >= ATTEMPTS:
+        if t < self._asked + REPAIR_INTERVAL or driven < self._wait_until or self._attempts >= REPAIRS:
             return False
         loop, self._asked = known.of(smoother), t
         self._stretches = self.contradictions.stretches(loop, t)
@@ -169,7 +171,7 @@ class MapRepair:
         for stretch in stretches:
             cones = carried(stretch.cones, self._lap, now)
             distance = KDTree(sampled(marginal.splines[stretch.label], SAMPLE)).query(cones)[0]
-            explained[stretch.label] += int(np.count_nonzero(distance < BESIDE))
+            explained[stretch.label] += int(np.count_nonzero(distance < REPAIR_BESIDE))
         if sum(explained) < EXPLAINED * sum(len(stretch.cones) for stretch in stretches):
             return ""
         self._wait_until = 0.0
@@ -224,7 +226,7 @@ def lap_begin(poses: Array, length: float) -> int:
 
 def _is_replaced(cones: Array, at: Array, row: Array, row_at: Array, settings: MapperSettings) -> BoolArray:
     """Return which cones (k, 2) at stations (k,) are those of a row (r, 2), or lie beside it."""
-    order, beside = np.argsort(row_at), BESIDE
+    order, beside = np.argsort(row_at), REPAIR_BESIDE
     away = np.abs(along_and_across(cones, row[order], row_at[order])[1])
     within = (at > row_at.min() - beside) & (at < row_at.max() + beside)
     same = KDTree(row).query(cones)[0] < settings.growth.merge_radius

@@ -25,14 +25,14 @@ from pathspace_graph.mapping.state import State
 from .known_loop import MIDDLE_STEP, Loop, lay_out_loop
 
 FOUND: Final = "the vehicle was lost, and is found again"  # notice of the cycle in which it is found
-INTERVAL: Final = 0.5  # least time between two attempts (s)
-MEMORY: Final = 60.0  # length of the newest path whose detections are compared with the map (m)
-MOST_DETECTIONS: Final = 200  # largest number of detections, evenly chosen, that are compared with the map
+SEARCH_INTERVAL: Final = 0.5  # least time between two attempts (s)
+SEARCH_MEMORY: Final = 60.0  # length of the newest path whose detections are compared with the map (m)
+SEARCH_DETECTIONS: Final = 200  # largest number of detections, evenly chosen, that are compared with the map
 MIN_DETECTIONS: Final = 40  # least number of detections that are compared with the map
 LEAD: Final = 4.0  # distance ahead of the point on the middle of the track that the vehicle heads for (m)
 MISFIT: Final = 3.0  # rms distance of the path driven from the middle within which a place is compared (m)
 REACH: Final = 3.0  # distance from its curve that any farther detection counts as (m)
-STARTS: Final = 12  # largest number of places that are refined
+SEARCH_STARTS: Final = 12  # largest number of places that are refined
 APART: Final = 4.0  # distance below which two places are one (m)
 SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)  # of the pose about a place, before it is refined (m, m, rad)
 SIGMA_FIT: Final = 0.3  # a detection at a distance d from its curve scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)
@@ -81,12 +81,12 @@ class Search:
         self._poses.append(pose.copy())
         self._seen.append(detections)
         driven = path_lengths(np.array(self._poses))
-        old = int(driven.searchsorted(driven[-1] - MEMORY))
+        old = int(driven.searchsorted(driven[-1] - SEARCH_MEMORY))
         del self._poses[:old], self._seen[:old]
 
     def find(self, road: Road) -> RefinedMotion | None:
         """Return the motion onto the only place that agrees, once it was found several times in a row."""
-        if not self._seen or self._seen[-1].t - self._tried < INTERVAL:
+        if not self._seen or self._seen[-1].t - self._tried < SEARCH_INTERVAL:
             return None
         best, last, newest = self._best(road), self._last, self._poses[-1][None, :2]
         self._tried, self._last = self._seen[-1].t, None if best is None else best.motion
@@ -127,7 +127,7 @@ class Search:
         cycles = np.repeat(np.arange(len(self._seen)), [len(one.labels) for one in self._seen])
         points = np.concatenate([one.points_vehicle for one in self._seen])
         rows = np.flatnonzero(np.isin(labels, BOUNDARIES))
-        rows = rows[:: max(-(-len(rows) // MOST_DETECTIONS), 1)]
+        rows = rows[:: max(-(-len(rows) // SEARCH_DETECTIONS), 1)]
         placed = to_map(points[rows], np.array(self._poses)[cycles[rows]])
         return Sightings.of_points(rows, labels[rows], placed)
 
@@ -185,7 +185,7 @@ def _spread(loop: Loop, places: IntArray, cost: Array) -> list[int]:
         away = np.abs(loop.stations[chosen] - loop.stations[i])
         if (np.minimum(away, loop.length - away) >= APART).all():
             chosen.append(i)
-        if len(chosen) == STARTS:
+        if len(chosen) == SEARCH_STARTS:
             break
     return chosen
 

@@ -54,8 +54,8 @@ from pathspace_graph.settings.online import ClosingSettings
 from .closing import SIGMA_STEP
 from .drive_record import DriveRecord
 
-ATTEMPTS: Final = 3.0  # least distance of two attempts (m along the path)
-INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
+REVISIT_ATTEMPTS: Final = 3.0  # least distance of two attempts (m along the path)
+REVISIT_INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
 RETURN: Final = 30.0  # least length of the path between both passes (m)
 RADIUS: Final = 4.0  # largest distance of both passes, as the map has them (m)
 DIVERGED: Final = 8.0  # distance that the ways to the place must have had, as seen from the place (m)
@@ -76,13 +76,13 @@ class Revisits:
             return None
         if smoother.submaps is None or not smoother.submaps.keyframes:
             return None
-        self._next = length + ATTEMPTS
+        self._next = length + REVISIT_ATTEMPTS
         poses = record.with_window(road)
         place = earlier_pass(poses)
         seen_in = record.seen_in(smoother.variables.sensor, noise)
         revisit = None if place is None else self._measured(smoother, seen_in, poses, place)
         if revisit is not None:
-            self._next = length + INTERVAL
+            self._next = length + REVISIT_INTERVAL
         return revisit
 
     def _measured(self, smoother: CurveSmoother, seen_in: SeenIn, poses: Array, place: int) -> Revisit | None:
@@ -141,7 +141,7 @@ def have_parted(poses: Array, stations: Array, place: int) -> bool:
 STRETCH: Final = 150.0  # length at the end of the curves that is registered (m): its bends tell the place
 STRETCH_ROOM: Final = 10.0  # beyond the ends of the earlier stretch in which foot points are searched (m)
 SIGMAS_BENT: Final = (1.5, 1.5, 0.15)  # of the newest pose in the stretch behind it (m, m, rad)
-STARTS: Final = 6  # most earlier stretches, alike in their turns, that it is registered with
+STRETCHES: Final = 6  # most earlier stretches, alike in their turns, that it is registered with
 
 
 def recognize(smoother: CurveSmoother) -> RefinedMotion | None:
@@ -227,7 +227,7 @@ def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple
     turned = rotations(turn) @ (middle - centre) + centre
     motions = np.column_stack([places - turned, wrap_angle(turn)])
     possible = np.einsum("ij,jk,ik->i", motions, prior, motions) < START_CHI2
-    best = _minima(np.where(possible, unlike, np.inf), int(settings.overlap / step))[:STARTS]
+    best = _minima(np.where(possible, unlike, np.inf), int(settings.overlap / step))[:STRETCHES]
     return [(motions[i], float(step * i)) for i in best]
 
 

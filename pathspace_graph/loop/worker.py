@@ -33,7 +33,7 @@ class Unsolved:
     is_final: bool = True  # whether another attempt, after more of the drive, would fail as well
 
 
-LATE: Final = Unsolved("the batch of the lap was late")
+BATCH_LATE: Final = Unsolved("the batch of the lap was late")
 
 
 class LapBatch:

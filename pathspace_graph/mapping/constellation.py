@@ -35,29 +35,29 @@ from .detections import DetectionColumns
 from .registration import HEADING, start_crossings
 from .tentative import merged_in_turn
 
-SIGMA: Final = 0.25  # of a cone's place besides its covariance: errors of the sensor that change slowly (m)
-GATE: Final = 9.0  # cap of a cone's square (sigmas^2); beyond it, the cone lies on no other
+LAID_SIGMA: Final = 0.25  # of a cone's place besides its covariance: slow errors of the sensor (m)
+LAID_GATE: Final = 9.0  # cap of a cone's square (sigmas^2); beyond it, the cone lies on no other
 CELL: Final = 0.5  # of the votes (m)
 TURN: Final = 0.05  # step of the headings that are tried (rad)
-APART: Final = 1.0  # least distance of two different places (m)
+LAID_APART: Final = 1.0  # least distance of two different places (m)
 PLACES: Final = 10  # most places of each heading, and a third of the most that are refined
 RANGE: Final = 16.0  # farthest detections that are merged (m)
 VIEWED: Final = 0.95  # share of the detections within the range and the bearing of a view
 VIEWS: Final = 2.0  # step at which the views along a path are looked at (m)
-NEWEST: Final = 30.0  # newest path whose cones are laid on earlier ones (m)
+LAID_NEWEST: Final = 30.0  # newest path whose cones are laid on earlier ones (m)
 BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
-MIN_CONES: Final = 6  # least number of cones in view that tell a place
-MISFIT: Final = 2.0  # most mean capped square of these: that of cones that agree, in two dimensions
+LAID_CONES: Final = 6  # least number of cones in view that tell a place
+LAID_MISFIT: Final = 2.0  # most mean capped square of these: that of cones that agree, in two dimensions
 UNSEEN: Final = 2.0  # most cost of a cone where nothing was in view: what one that agrees costs on average
-FAILED: Final = 20.0  # cost of odometry that has failed: twice the logarithm of the odds against it
-ODDS: Final = 14.0  # least difference of cost to the next place: odds of a thousand
-SIGHTINGS: Final = 3  # least number of detections of a cone
-BEGINNING: Final = 40.0  # length of the beginning of a drive that closes a lap (m)
-NEWEST_LAP: Final = 60.0  # length of the newest path that crosses the start, if a lap is closed (m)
-TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
+ODOMETRY_FAILED: Final = 20.0  # cost of odometry that has failed: twice the logarithm of the odds against it
+LAID_ODDS: Final = 14.0  # least difference of cost to the next place: odds of a thousand
+LAID_SIGHTINGS: Final = 3  # least number of detections of a cone
+LAP_BEGINNING: Final = 40.0  # length of the beginning of a drive that closes a lap (m)
+LAP_NEWEST: Final = 60.0  # length of the newest path that crosses the start, if a lap is closed (m)
+LAP_TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
 SAME_ROAD: Final = 2.5  # largest distance of both passes across their road, by the cones (m)
 SAME_HEADING: Final = 0.5  # largest angle between both passes, by the cones (rad)
-LIMITS: Final = (SIGMA, GATE, CELL, TURN, APART, float(PLACES), UNSEEN, FAILED)
+LIMITS: Final = (LAID_SIGMA, LAID_GATE, CELL, TURN, LAID_APART, float(PLACES), UNSEEN, ODOMETRY_FAILED)
 
 
 Cones = tuple[Array, Array, IntArray]
@@ -89,7 +89,7 @@ class Constellation:
         for label in np.unique(labels).tolist():
             own = labels == label
             places, information, counts = merged_in_turn(points[own], covariances[own], settings)
-            seen = counts >= SIGHTINGS
+            seen = counts >= LAID_SIGHTINGS
             covariance = np.asarray(np.linalg.inv(information[seen]), np.float64)
             found.append((places[seen], covariance, np.full(len(covariance), label)))
         places, covariances, labels = (np.concatenate(column) for column in zip(*found, strict=True))
@@ -118,7 +118,7 @@ class Laid:
     @property
     def is_sure(self) -> bool:
         """Whether nearly all of enough cones lie on earlier ones, and no other place is nearly as good."""
-        return self.count >= MIN_CONES and self.misfit <= MISFIT and self.odds >= ODDS
+        return self.count >= LAID_CONES and self.misfit <= LAID_MISFIT and self.odds >= LAID_ODDS
 
 
 def lay(
@@ -127,9 +127,9 @@ def lay(
     """Lay cones on known ones, in the frames of a vehicle and of the map; None where they are too few.
 
     The pose is searched within a `reach` (m, rad) of its `mean` (3,). The square of the difference from the
-    mean, by its `information` (3, 3), counts up to `FAILED`.
+    mean, by its `information` (3, 3), counts up to `ODOMETRY_FAILED`.
     """
-    if min(len(seen.labels), len(known.labels)) < MIN_CONES:
+    if min(len(seen.labels), len(known.labels)) < LAID_CONES:
         return None
     places = kernels.laid(seen.cones, known.cones, known.views, mean, information, reach, LIMITS)
     return _best(*places, len(seen.labels))
@@ -142,10 +142,10 @@ def _best(poses: Array, informations: Array, squares: Array, counts: Array, away
     view: rows at regular distances, which fit in many places, say little.
     """
     misfit = squares / np.maximum(counts, 1.0)
-    enough = np.where(counts >= MIN_CONES, misfit, inf)
+    enough = np.where(counts >= LAID_CONES, misfit, inf)
     _, unseen = _best_and_next(enough, poses, UNSEEN)
-    costs = squares + unseen * (total - counts) + np.minimum(away, FAILED)
-    best, rival = _best_and_next(costs, poses, FAILED + unseen * total)  # which may be new road
+    costs = squares + unseen * (total - counts) + np.minimum(away, ODOMETRY_FAILED)
+    best, rival = _best_and_next(costs, poses, ODOMETRY_FAILED + unseen * total)  # which may be new road
     odds = float(rival - costs[best])
     return Laid(poses[best], informations[best], int(counts[best]), float(misfit[best]), odds)
 
@@ -153,7 +153,7 @@ def _best(poses: Array, informations: Array, squares: Array, counts: Array, away
 def _best_and_next(values: Array, poses: Array, limit: float) -> tuple[int, float]:
     """Return the pose (of m) with the least value, and the least value of another place, up to a limit."""
     best = int(values.argmin())
-    others = np.hypot(*(poses[:, :2] - poses[best, :2]).T) > APART
+    others = np.hypot(*(poses[:, :2] - poses[best, :2]).T) > LAID_APART
     return best, float(values[others].min(initial=limit))
 
 
@@ -189,7 +189,7 @@ class Expected:
     def after(cls, length: float, covariance: Array, closing: ClosingSettings) -> Self:
         """Expect a pose with a covariance (3, 3) that has drifted for some length (m)."""
         information = np.asarray(np.linalg.inv(covariance), np.float64)
-        return cls(closing.radius + closing.drift * length, TURNED, information)
+        return cls(closing.radius + closing.drift * length, LAP_TURNED, information)
 
 
 NEARBY: Final = Expected.within(4.0, 0.15, (1.0, 1.0, 0.05))
@@ -207,12 +207,13 @@ def return_to_beginning(
     """
     stations, closing = path_lengths(poses), settings.closing
     length = float(stations[-1])
-    last, expected = min(length - closing.min_path, BEGINNING), Expected.after(length, covariance, closing)
+    last = min(length - closing.min_path, LAP_BEGINNING)
+    expected = Expected.after(length, covariance, closing)
     found = find_return(seen_in, poses, last, expected, settings.growth)
     if found is None or not found[0].is_sure:
         return None
     laid, earlier = found
-    newest = to_vehicle(poses[stations > length - NEWEST_LAP, :2], poses[-1:])
+    newest = to_vehicle(poses[stations > length - LAP_NEWEST, :2], poses[-1:])
     crosses, _ = start_crossings(to_map(newest, laid.pose[None]), poses[0])
     return revisit_of(laid, poses, earlier, len(poses) - 1) if crosses.any() else None
 
@@ -245,8 +246,8 @@ def lay_newest(
 ) -> Laid | None:
     """Lay the cones of the newest metres on those about an earlier place, by the poses (P, 3) of all."""
     stations = path_lengths(poses)
-    first = int(stations.searchsorted(stations[-1] - NEWEST, side="right"))
-    old = np.flatnonzero(np.abs(stations[:first] - stations[place]) < NEWEST + BEYOND)
+    first = int(stations.searchsorted(stations[-1] - LAID_NEWEST, side="right"))
+    old = np.flatnonzero(np.abs(stations[:first] - stations[place]) < LAID_NEWEST + BEYOND)
     known = Constellation.of(seen_in(old), poses, settings)
     seen = Constellation.of(seen_in(np.arange(first, len(poses))), poses, settings).seen_from(poses[-1])
     return lay(seen, known, poses[-1], expected.information, (expected.radius, expected.turn))

@@ -12,7 +12,7 @@ from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.labels import LEFT, RIGHT
 
 STEP: Final = 0.3  # least distance of neighbouring positions of the stored path (m)
-MEMORY: Final = 60.0  # length of the stored path behind the vehicle, and of the stored first stretch (m)
+PATH_MEMORY: Final = 60.0  # length of the stored path behind the vehicle, and of the stored first stretch (m)
 BEGINNING_STEP: Final = 1.0  # least distance of neighbouring poses of the stored first stretch (m)
 MAX_CURVATURE: Final = 0.3  # largest curvature of the predicted path (1/m): that of a tight hairpin
 CURVATURE_GAIN: Final = 0.4  # share of a cycle's measured curvature in the smoothed one
@@ -63,7 +63,7 @@ class DrivenPath:
     def update(self, pose: Array) -> None:
         """Extend the path to `pose` (3,), map frame."""
         position, known = pose[:2], self.beginning[-1:, :2]
-        if self.length <= MEMORY and (np.hypot(*(position - known).T) >= BEGINNING_STEP).all():
+        if self.length <= PATH_MEMORY and (np.hypot(*(position - known).T) >= BEGINNING_STEP).all():
             self.beginning = np.concatenate([self.beginning, pose[None]])
         if len(self.points) == 0:
             self.points, self.stations = position[None].copy(), np.zeros(1)
@@ -75,7 +75,7 @@ class DrivenPath:
         if distance >= STEP:
             self.points = np.concatenate([self.points, position[None]])
             self.stations = np.append(self.stations, self.length)
-            keep = self.stations >= self.length - MEMORY
+            keep = self.stations >= self.length - PATH_MEMORY
             self.points, self.stations = self.points[keep], self.stations[keep]
 
     def move(self, motion: Array) -> None:
@@ -134,7 +134,7 @@ def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
 
 LATERAL_CHANGE: Final = 1.5  # how much farther from the path the next cone may be than the newest ones (m)
 LATERAL_RATE: Final = 0.2  # growth of `LATERAL_CHANGE` with the distance along the path (m/m)
-BESIDE: Final = 2.0  # distance along the path below which cones stand beside each other (m)
+ROW_BESIDE: Final = 2.0  # distance along the path below which cones stand beside each other (m)
 LATERAL_GAP: Final = 0.8  # by how much a cone must be nearer to the path to hide one beside it (m)
 STATION_MARGIN: Final = 0.3  # least distance past the end of a curve of what extends it (m along the path)
 END_BEHIND: Final = 5.0
@@ -181,7 +181,7 @@ def chain(candidates: Candidates, end: End | None) -> IntArray:
     to the path remain: a second row is of another stretch of the track.
     """
     stations, sides = candidates.stations, candidates.sides
-    in_front = np.flatnonzero(in_front_row(stations, sides, BESIDE, LATERAL_GAP))
+    in_front = np.flatnonzero(in_front_row(stations, sides, ROW_BESIDE, LATERAL_GAP))
     if len(in_front) == 0:
         return in_front
     out = sides[in_front] - LATERAL_RATE * stations[in_front]

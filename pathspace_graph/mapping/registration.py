@@ -19,15 +19,15 @@ from .state import Curves, State
 HEADING: Final = 0.8  # largest angle between the headings now and at the beginning for closing (rad)
 START_LATERAL: Final = 5.0  # largest distance from the start at which its line is crossed to close a loop (m)
 START_HEADING: Final = 0.5  # largest angle between the directions of the start and of that crossing (rad)
-WINDOW: Final = 2.0  # age of the oldest detections that are registered (s)
+REGISTERED_AGE: Final = 2.0  # age of the oldest detections that are registered (s)
 BEGINNING: Final = 60.0  # length of the curves that counts as their beginning (m)
 BEGINNING_SHARE: Final = 0.6  # largest share of a short curve that counts as its beginning
-REACH: Final = 3.0  # largest distance from the curves of detections that the first iteration uses (m)
-SHRINK: Final = 0.7  # factor on `REACH` for each further iteration, down to `closing.inlier_distance`
-ITERATIONS: Final = 7
+REGISTERED_REACH: Final = 3.0  # largest distance from the curves that the first iteration uses (m)
+REGISTERED_SHRINK: Final = 0.7  # factor for each further iteration, down to `closing.inlier_distance`
+REGISTERED_ITERATIONS: Final = 7
 START_STEP: Final = 2.0  # distance of the poses of the beginning where a lost vehicle is tried (m)
 START_CHI2: Final = 16.3  # their squared Mahalanobis distance at most: 99.9 % of chi-square, 3 degrees
-MIN_DETECTIONS: Final = 25
+REGISTERED_DETECTIONS: Final = 25
 MIN_INLIERS: Final = 5  # least number of inliers on each boundary
 
 
@@ -109,8 +109,8 @@ class Registration:
     def refine(self, start: Motion, mean: Array, information: Array) -> RefinedMotion:
         """Refine a motion by iterated closest points; its prior has a mean (3,) and an information (3, 3)."""
         vector = start.vector
-        for iteration in range(ITERATIONS):
-            reach = max(self.settings.inlier_distance, REACH * SHRINK**iteration)
+        for iteration in range(REGISTERED_ITERATIONS):
+            reach = max(self.settings.inlier_distance, REGISTERED_REACH * REGISTERED_SHRINK**iteration)
             matches = self.match(Motion(start.centre, vector), reach)
             negative_gradient = matches.negative_gradient - information @ (vector - mean)
             vector = vector + np.linalg.solve(matches.hessian + information, negative_gradient)
@@ -192,7 +192,7 @@ def register(
         motions = beginning[first] - state.poses[-1]
         motions[:, 2] = wrap_angle(motions[:, 2])
         starts = [vector, *(v for v in motions if v @ prior @ v < START_CHI2)]
-        inliers = [registration.match(Motion(centre, v), REACH).inlier.sum() for v in starts]
+        inliers = [registration.match(Motion(centre, v), REGISTERED_REACH).inlier.sum() for v in starts]
         vector = starts[int(np.argmax(inliers))]
     found = registration.refine(Motion(centre, vector), np.zeros(3), prior)
     agree = agrees(found.matches, list(state.boundaries), settings)
@@ -202,19 +202,19 @@ def register(
 def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
     """Return whether the newest detections reach the beginning: otherwise only a lost vehicle registers."""
     unmoved = Motion(track.state.poses[-1, :2], np.zeros(3))
-    return bool(_with_beginning(track, times, settings).match(unmoved, REACH).hessian.any())
+    return bool(_with_beginning(track, times, settings).match(unmoved, REGISTERED_REACH).hessian.any())
 
 
 def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
     """Return whether a pose with this covariance (3, 3) is less certain than the registration can bridge."""
     prior = np.linalg.inv(covariance * settings.prior_scale**2)
-    return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < REACH**-2)
+    return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < REGISTERED_REACH**-2)
 
 
 def _with_beginning(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> Registration:
     """Return the registration of the coloured detections of the newest poses with the curves' beginning."""
     detections, variables, stamps = track.detections, track.variables, np.asarray(times)
-    rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - WINDOW)
+    rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - REGISTERED_AGE)
     rows = rows[np.isin(detections.label[rows], list(track.state.boundaries))]
     points, covariances = detections.points_map(rows, variables), detections.covariances_map(rows, variables)
     recent = Sightings(rows, detections.label[rows], points, covariances, detections.used[rows])
@@ -254,7 +254,7 @@ def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bo
     """
     asked = matches.explained
     count, inliers = int(asked.sum()), int(matches.inlier[asked].sum())
-    if count < MIN_DETECTIONS or inliers < settings.inlier_share * count:
+    if count < REGISTERED_DETECTIONS or inliers < settings.inlier_share * count:
         return False
     on_each = [matches.inliers(label)[1] for label in labels]
     return all(len(u) >= MIN_INLIERS and np.ptp(u) >= settings.overlap for u in on_each)

@@ -7,17 +7,16 @@ import numpy as np
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import TOLERANCES, FootPoints
-from pathspace_graph.factors.residuals import project
-from pathspace_graph.factors.sensor import sensor_rows
 from pathspace_graph.graph.inactive import Attached
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.variables import SENSOR_KEY, pose_keys
+from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import relocate
 
 from .curve_map import CurveMap
+from .detection_rows import rows_across
 from .motion import smoother_settings
 
 
@@ -121,18 +120,10 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
         It is the variance of each residual by pose, control points and calibration of the sensor.
         """
-        detections, sensor = self.map.detections, self.variables.sensor
-        cycles, measured, twists = detections.cycle[rows], detections.measured[rows], detections.twist[rows]
-        poses, sigma_model = self.variables.poses_at(cycles), self.map.settings.spline.sigma_model
-        projected = project(points, detections.covariance[rows], poses, foot, sigma_model)
-        residual = projected.residual
-        by_sensor = sensor_rows(foot.normal_unit, residual, poses, measured, twists, sensor).by_sensor
-        by_control = projected.by_control.reshape(len(rows), 2 * foot.basis.shape[1])
-        jacobian = np.concatenate([projected.by_pose, by_sensor, by_control], axis=1)
-        seen_from = np.stack([pose_keys(cycles), np.full(len(rows), SENSOR_KEY)], axis=1)
-        seen_from = seen_from[:, : 2 if len(sensor) else 1]
-        keys = np.concatenate([seen_from, self.map.state.curves.keys[foot.columns]], axis=1)
-        return self.predicted_covariance(Rows(keys, jacobian, residual, cycles))[:, 0, 0]
+        detections, sigma_model = self.map.detections, self.map.settings.spline.sigma_model
+        seen = rows_across(self.map.state, detections, rows, points, foot, sigma_model)
+        gradient = Rows(seen.keys, seen.jacobian, seen.residual, detections.cycle[rows])
+        return self.predicted_covariance(gradient)[:, 0, 0]
 
     # --- the newest pose beside the curves ---------------------------------------------------------------
 

@@ -18,7 +18,7 @@ from .detection_rows import DetectionRows, measuring_keys
 from .detections import NO_STATION, DetectionTable
 from .state import State
 
-CERTAIN: Final = 3.0  # sigmas along a curve that are less than half the distance of the next cone
+STATION_CERTAIN: Final = 3.0  # sigmas along a curve that are less than half the distance of the next cone
 SIGMA_POSE: Final = 0.2  # standard deviation of the vehicle along a curve when its detections are matched (m)
 
 
@@ -58,7 +58,7 @@ class CurveStations:
         is expected: a choice by the distances that were found would keep the small ones.
         """
         station, beyond = self.nearest(u)
-        limit = CERTAIN * np.hypot(sigma, self.sigma[station])
+        limit = STATION_CERTAIN * np.hypot(sigma, self.sigma[station])
         sure = (limit < 0.5 * self.apart[station]) & (np.abs(beyond) < limit)
         return np.where(sure, self.first + station, NO_STATION)
 

@@ -1,4 +1,4 @@
-"""Fixed-lag online mapping, in the paper's order: predict, classify, expand, update, close, simplify."""
+"""Fixed-lag online mapping, in the order of the paper: predict, classify, expand, update, close."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -88,13 +88,11 @@ class FixedLagMapper(MapperEstimate):
         """Process one perception cycle: the twists since the last cycle, and its detections.
 
         A cycle that cannot be used (`front_end.gate`, `settings.online`) raises a ReadingError and changes
-        nothing; impossible detections are dropped and counted in the result. The twists are a stream: each is
-        held until the next one, those in force before the newest cycle are left out, and where some are lost,
-        the last one is held.
+        nothing; impossible detections are dropped and counted. Each twist is held until the next one, and
+        those in force before the newest cycle are left out.
 
-        Where another process solves the lap as a batch, the call waits for it no longer than the time since
-        the cycle before, and the map is replaced in a later cycle if need be. A replay of a log calls `wait`
-        before, so that it does not depend on the speed of the machine.
+        Where a batch is under way, the call waits for it no longer than the time since the cycle before. A
+        replay of a log calls `wait` first, so that it does not depend on the speed of the machine.
 
         `factors` are GTSAM factors of your own, at scale 1, on poses in the window (`pose_key`,
         `next_pose_key`: `Pose2`), on control points (`control_keys`: `Point2`) and on the calibration. Each
@@ -102,9 +100,8 @@ class FixedLagMapper(MapperEstimate):
         One on control points alone is kept until the loop closes. SettingsError is raised, and nothing is
         changed, if a key is not a variable of the graph or a number not finite.
 
-        Nothing else is raised. Where a step fails, the mapper goes back to before the cycle and takes it
-        again with the loop left alone, or without detections, or not at all. The notice says which, and
-        `failures` counts. If `strict`, it goes back, and what was raised is raised again.
+        Nothing else is raised, unless `strict`: where a step fails, the mapper goes back to before the cycle
+        and takes it again with less, as the notice says, and `failures` counts.
         """
         factors = tuple(factors)
         cycle, unused = self._admit(odometry, detections, factors), self._unused

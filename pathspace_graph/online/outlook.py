@@ -12,12 +12,12 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.front_end.cone_rows import ConeRow, extend_rows
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.growth import newest, undisputed
 from pathspace_graph.mapping.path import SIDES, DrivenPath
-from pathspace_graph.mapping.rows import ConeRow, extend_rows
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.ahead import CurveAhead
@@ -30,7 +30,7 @@ UNCONFIRMED_MEMORY: Final = 0.35
 TAIL: Final = 20.0  # length of the confirmed curves that tells where the track leads and how wide it is (m)
 TAIL_STEP: Final = 1.0  # step of the points along that length (m)
 BEGIN_LATERAL: Final = 1.5  # distance beside the vehicle at which a row without a curve is searched (m)
-SIGMA_CONE: Final = 0.1  # of a cone's distance from a smooth curve (m), added to a track's own
+SIGMA_TRACK: Final = 0.1  # of a cone's distance from a smooth curve (m), added to a track's own
 SIGMA_BEND: Final = 1.0
 """Standard deviation of the second difference of control points about that of a straight line (m). It widens
 the band between tracks that are far apart, and beyond the last one."""
@@ -126,7 +126,7 @@ def look_ahead(
     """Return each open curve with its tentative stretch at t (s), and curves that have not begun but may."""
     state, outlooks = track.state, {}
     for label, (row, chosen) in extended_rows(track, tentative, path, t).items():
-        variances = tentative[label].variances(chosen) + SIGMA_CONE**2
+        variances = tentative[label].variances(chosen) + SIGMA_TRACK**2
         if label in state.boundaries:
             known, longer = state.control_points(label), shallow(state.boundaries[label])
             end = longer.confirmed_end

@@ -11,8 +11,8 @@ from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.gate import TWIST
-from pathspace_graph.front_end.measurement import DRIFT, LEAST
-from pathspace_graph.front_end.sightings import GATE, MAX_RANGE, TwistRecord
+from pathspace_graph.front_end.measurement import DRIFT, LEAST_NOISE
+from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_UNKNOWN, TwistRecord
 from pathspace_graph.io.log import CALIBRATION, Log
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
 from pathspace_graph.lengths import POSE, Length, Text, joined, scaled
@@ -173,7 +173,7 @@ def _detections(log: Log) -> list[Hint]:
     points = np.concatenate([cycle.points_vehicle for cycle in cycles])
     sigmas = ray_sigmas(points, np.concatenate([cycle.covariances for cycle in cycles]))
     ranges = np.hypot(*points.T)
-    near = ranges < MAX_RANGE
+    near = ranges < FOLLOW_RANGE
     hints = []
     for axis, (name, ray) in enumerate((("along", measured.along), ("across", measured.across))):
         size = _contradicted(ranges[near], sigmas[near, axis], ray, axis)
@@ -189,9 +189,9 @@ def _detections(log: Log) -> list[Hint]:
 def _contradicted(ranges: Array, stated: Array, ray: RayNoise, axis: int) -> str:
     """Return how stated sigmas (m,) are wrong; the size of a cone and a gate bound the scatter."""
     measured = ray.sigmas(ranges)
-    floor = np.array([np.full(len(ranges), LEAST[0]), LEAST[1] * ranges])[axis]
+    floor = np.array([np.full(len(ranges), LEAST_NOISE[0]), LEAST_NOISE[1] * ranges])[axis]
     small = measured > SCATTER_FACTOR * np.maximum(stated, floor)
-    gate = np.minimum(GATE[0] + GATE[1] * ranges, GATE[2])
+    gate = np.minimum(GATE_UNKNOWN[0] + GATE_UNKNOWN[1] * ranges, GATE_UNKNOWN[2])
     large = (SCATTER_FACTOR * measured < stated) & (3.0 * measured < gate)
     for size, which in (("small", small), ("large", large)):
         if len(which) and which.mean() > NOISE_SHARE:

@@ -58,7 +58,7 @@ FRAME_MEANINGS: Final = {  # what a turn of the sensor (degrees), mirrored or no
     (180.0, True): "the sensor's frame has x to the rear",
     (-90.0, True): "the sensor's frame has x to the right and y to the rear",
 }
-LARGEST: Final = 1e20  # largest number of a log of which anything is said
+LARGEST_READING: Final = 1e20  # largest number of a log of which anything is said
 MIRRORED: Final = 0.0, True  # frame in which y points to the right and x ahead
 
 
@@ -74,7 +74,7 @@ def hints(log: Log) -> list[Hint]:
 def _has_numbers(log: Log) -> bool:
     arrays = ((cycle.points_vehicle, cycle.covariances) for cycle in log.cycles)
     parts = (*_stamps(log).values(), log.odometry.twist, *chain.from_iterable(arrays))
-    return all((np.abs(part) <= LARGEST).all() for part in parts)
+    return all((np.abs(part) <= LARGEST_READING).all() for part in parts)
 
 
 def _hints(log: Log) -> list[Hint]:
@@ -362,9 +362,11 @@ def refused_hints(folder: Path) -> list[Hint]:
     try:
         files = ODOMETRY_FILE, DETECTIONS_FILE
         odometry, table = (read_table(folder / file, logs.COLUMNS[file]) for file in files)
-        twists = Odometry(odometry.numbers("t", LARGEST), odometry.stack(("vx", "vy", "wz"), LARGEST))
-        stamps, points = table.numbers("t", LARGEST), table.stack(("x", "y"), LARGEST)
-        covariances = logs.covariances_of(*table.stack(("xx", "xy", "yy"), LARGEST).T)
+        twists = Odometry(
+            odometry.numbers("t", LARGEST_READING), odometry.stack(("vx", "vy", "wz"), LARGEST_READING)
+        )
+        stamps, points = table.numbers("t", LARGEST_READING), table.stack(("x", "y"), LARGEST_READING)
+        covariances = logs.covariances_of(*table.stack(("xx", "xy", "yy"), LARGEST_READING).T)
     except InputError:
         return []
     cycles = logs.cycles_of(stamps, points, covariances, logs.labels_of(table))

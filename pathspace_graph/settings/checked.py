@@ -2,14 +2,14 @@
 
 from dataclasses import fields
 from functools import cache
-from math import inf, isfinite
+from math import inf
 from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Any, ClassVar, Final, Literal, Union, get_args, get_origin, get_type_hints
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import NUMBERS, SettingsError
 
-_NUMBERS: Final[dict[Any, tuple[type[Any], str]]] = {
+_NUMBER_KINDS: Final[dict[Any, tuple[type[Any], str]]] = {
     float: (Real, "a number"),
     int: (Integral, "a whole number"),
 }
@@ -37,13 +37,9 @@ class Positive:
                 raise SettingsError(f"{self.prefix}{entry.name}: {expected:.200}")
             if isinstance(value, bool) or not isinstance(value, int | float):
                 continue
-            if entry.name in self.SIGNED:
-                expected = "" if isfinite(value) else "a number"
-            elif value > 0:
-                expected = "a finite number" if value == inf and entry.name not in self.UNLIMITED else ""
-            else:
-                expected = "a positive number"
-            if expected:
+            expected = "a number" if entry.name in self.SIGNED else "a positive number"
+            is_unlimited = value == inf and entry.name in self.UNLIMITED
+            if not is_unlimited and not NUMBERS[expected](value):
                 raise SettingsError(f"{self.prefix}{entry.name}: expected {expected}, found {value}")
 
 
@@ -62,8 +58,8 @@ def is_of(value: Any, kind: Any) -> bool:
     if get_origin(kind) is tuple:
         each = options[:1] * len(value) if isinstance(value, tuple) and options[-1] is ... else options
         return isinstance(value, tuple) and len(value) == len(each) and all(map(is_of, value, each))
-    if kind in _NUMBERS:
-        return isinstance(value, _NUMBERS[kind][0]) and not isinstance(value, bool)
+    if kind in _NUMBER_KINDS:
+        return isinstance(value, _NUMBER_KINDS[kind][0]) and not isinstance(value, bool)
     return isinstance(value, kind)
 
 
@@ -75,6 +71,6 @@ def in_words(kind: Any) -> str:
         return " or ".join(map(repr, options))
     if get_origin(kind) is tuple:
         return f"a list, each {in_words(options[0])}"
-    if kind in _NUMBERS:
-        return _NUMBERS[kind][1]
+    if kind in _NUMBER_KINDS:
+        return _NUMBER_KINDS[kind][1]
     return {bool: "True or False", NoneType: "None"}.get(kind) or f"a {getattr(kind, '__name__', kind)}"

@@ -49,9 +49,8 @@ def speed_profile(
     with the curvature k and the acceleration a, which is constant from each point to the next one; each such
     step obeys it at its slower end. a_long is `forward` or `braking`. At first v^2 = a_lateral / |k|; then a
     forward and a backward pass bound v_next^2 by v^2 + 2 a ds (Kapania et al., J. Dyn. Syst. Meas. Control
-    138, 2016). A closed line begins and ends at the same speed. An open one may begin and end at given speeds
-    (m/s), by default as fast as its curvature allows. SettingsError is raised where a line has fewer
-    than two points, a speed is not a number from 0 on, or one is given for a closed line.
+    138, 2016). A closed line begins and ends at the same speed, an open one at given speeds (m/s), by default
+    as fast as its curvature allows. SettingsError on fewer than two points, or on a speed that cannot be.
     """
     settings = settings or SpeedSettings()
     _check_ends(line, begin, end)

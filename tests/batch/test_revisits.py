@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.objections import BENT_SIGMAS, disagreement
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import (
-    INTERVAL,
+    REVISIT_INTERVAL,
     aligned_odometry,
     find_revisits,
     length_of_lap,
@@ -61,8 +61,8 @@ def test_each_later_lap_of_a_drive_is_met_again_every_few_metres() -> None:
     lap = float(driven[revisits[0].later] - driven[revisits[0].earlier])
     assert length_of_lap(chain.dead_reckoned(np.zeros(2)), revisits[0]) == pytest.approx(lap, rel=0.02)
     later = driven[[one.later for one in revisits]]
-    assert (np.diff(later[:-1]) >= INTERVAL - 1.0).all()  # at the end of the drive there may be one more
-    assert len(revisits) > 0.6 * (driven[-1] - lap) / INTERVAL
+    assert (np.diff(later[:-1]) >= REVISIT_INTERVAL - 1.0).all()  # the last may be nearer
+    assert len(revisits) > 0.6 * (driven[-1] - lap) / REVISIT_INTERVAL
     off = np.array([one.local - relative(truth[one.earlier], truth[one.later]) for one in revisits])
     off[:, 2] = wrap_angle(off[:, 2])
     assert np.hypot(*off[:, :2].T).max() < 0.15 and np.abs(off[:, 2]).max() < 0.03

@@ -14,7 +14,7 @@ from pathspace_graph.batch.lap import OpenLap, along_of, lap_optimum, marginal_o
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.optimizer import gradient
 from pathspace_graph.batch.simplification import map_block, simplified
-from pathspace_graph.batch.stations import BLOCK, SeenAgain, laps_of, match_stations, shifts
+from pathspace_graph.batch.stations import SHIFT_BLOCK, SeenAgain, laps_of, match_stations, shifts
 from pathspace_graph.batch.system import SIGMA_SLIDE, BatchSystem, Evaluation, moved
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log
@@ -44,21 +44,21 @@ def seen_again(curve: CurveStations, off: float) -> SeenAgain:
     """Return five detections of each cone in a second lap, with foot points `off` (m) along the curve."""
     rng = np.random.default_rng(5)
     u = np.repeat(curve.u, 5) - off + 0.05 * rng.normal(size=5 * len(curve.u))
-    block = ((LENGTH + u) // BLOCK).astype(np.intp)
+    block = ((LENGTH + u) // SHIFT_BLOCK).astype(np.intp)
     return SeenAgain(curve, np.arange(len(u)), u, np.full(len(u), 0.1), block)
 
 
 @pytest.mark.parametrize("off", [0.0, 1.3, -1.7, 2.9])
 def test_a_later_lap_is_shifted_to_its_cones(off: float) -> None:
     """The blocks of the first lap have nothing to shift."""
-    found = shifts([seen_again(row(3.0, JITTER), off)])[int(LENGTH / BLOCK) :]
+    found = shifts([seen_again(row(3.0, JITTER), off)])[int(LENGTH / SHIFT_BLOCK) :]
     np.testing.assert_allclose(found, off, atol=0.11)
 
 
 def test_a_shift_that_may_be_another_is_in_doubt() -> None:
     """In a row of gaps of 3 m half a gap ahead is half a gap behind; a whole one is too much to believe."""
     regular = row(3.0, 0.0)
-    half, none = (shifts([seen_again(regular, off)])[int(LENGTH / BLOCK) :] for off in (1.5, 0.0))
+    half, none = (shifts([seen_again(regular, off)])[int(LENGTH / SHIFT_BLOCK) :] for off in (1.5, 0.0))
     assert np.isnan(half).all()
     np.testing.assert_allclose(none, 0.0, atol=0.11)
 
@@ -66,8 +66,8 @@ def test_a_shift_that_may_be_another_is_in_doubt() -> None:
 def test_both_boundaries_tell_the_shift_together() -> None:
     """Each of two regular rows would be in doubt, but not both."""
     rows = [seen_again(row(gap, 0.0), 1.4) for gap in (2.5, 3.0)]
-    assert np.isnan(shifts(rows[:1])[int(LENGTH / BLOCK) :]).all()
-    np.testing.assert_allclose(shifts(rows)[int(LENGTH / BLOCK) :], 1.4, atol=0.11)
+    assert np.isnan(shifts(rows[:1])[int(LENGTH / SHIFT_BLOCK) :]).all()
+    np.testing.assert_allclose(shifts(rows)[int(LENGTH / SHIFT_BLOCK) :], 1.4, atol=0.11)
 
 
 def test_nothing_seen_again_has_no_shift() -> None:

@@ -22,7 +22,8 @@ from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE
 
-from ..scenes.gtsam import (
+from ..scenes.jacobians import assert_jacobians
+from .window_in_gtsam import (
     CONTROL_KEYS,
     DEGREE,
     HUBER,
@@ -45,7 +46,6 @@ from ..scenes.gtsam import (
     to_state,
     to_values,
 )
-from ..scenes.jacobians import assert_jacobians
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["isotropic", "anisotropic"])

@@ -197,7 +197,6 @@ CASES: dict[str, Arguments] = {
     "laid_out": lambda rng: (np.sort(rng.integers(0, 50, COUNT)), 5, 40, (2, 5, 3), np.arange(0, 60, 7)),
     "columns_of": some_columns,
     "spread": lambda rng: (rng.integers(0, 99, COUNT), rng.integers(0, 4, COUNT)),
-    "by_sensor": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng)),
     "shifted": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng), rng.normal(size=5)),
     "to_map": lambda rng: (rng.normal(size=(COUNT, 2)), poses(rng)),
     "detection_rows": lambda rng: detections(rng, 5),

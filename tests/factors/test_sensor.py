@@ -7,17 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
-from pathspace_graph.factors.se2 import compose, inverse, rotation, se2_exp, to_map
+from pathspace_graph.factors.se2 import compose, in_vehicle, inverse, rotation, se2_exp, to_map
 from pathspace_graph.factors.sensor import (
     SENSOR,
     by_bend,
     by_range,
     by_sensor,
-    in_vehicle,
     restored,
-    sensor_rows,
 )
 
 TWIST = np.array([[10.0, 0.5, 0.4]])
@@ -73,8 +72,28 @@ def rows_at(sensor: Array, pose: Array, seen: Array, direction: Array, base: Arr
     """Returns the multiplied distance past `base` (2,) along a direction, and its derivatives (5,)."""
     corrected = seen + by_sensor(seen[None], TWIST)[0] @ sensor
     residual = direction @ (to_map(corrected[None], pose[None])[0] - base)
-    rows = sensor_rows(direction[None], np.array([residual]), pose[None], seen[None], TWIST, sensor)
-    return float(rows.factor[0] * residual), rows.by_sensor[0]
+    terms = terms_of(corrected[None], pose[None], direction[None], np.array([residual]), seen[None], sensor)
+    return float(terms[0][0]), terms[1][0, 3:8]
+
+
+def terms_of(
+    corrected: Array, poses: Array, directions: Array, residuals: Array, seen: Array, sensor: Array
+) -> tuple[Array, Array]:
+    """Returns residuals (m,) of corrected detections along directions (m, 2), and their derivatives."""
+    count = len(seen)
+    residual, _, jacobian = kernels.detection_rows(
+        to_map(corrected, poses),
+        np.tile(np.eye(2), (count, 1, 1)),
+        poses,
+        directions,
+        residuals,
+        np.ones((count, 1)),
+        seen,
+        np.tile(TWIST, (count, 1)),
+        sensor,
+        0.0,
+    )
+    return residual, jacobian
 
 
 @given(st.integers(0, 10**6))
@@ -91,16 +110,11 @@ def test_derivatives_are_those_of_the_multiplied_residual(seed: int) -> None:
 
 
 def test_without_a_calibration_residuals_are_as_they_are() -> None:
-    rows = sensor_rows(
-        np.eye(2),
-        np.ones(2),
-        np.zeros((2, 3)),
-        np.ones((2, 2)),
-        np.zeros((2, 3)),
-        np.zeros(0),
-    )
-    np.testing.assert_array_equal(rows.factor, 1.0)
-    assert rows.by_sensor.shape == (2, 0)
+    seen, directions = np.ones((2, 2)), np.eye(2)
+    residual, jacobian = terms_of(seen, np.zeros((2, 3)), directions, np.array([2.0, 3.0]), seen, np.zeros(0))
+    np.testing.assert_array_equal(residual, [2.0, 3.0])
+    np.testing.assert_array_equal(jacobian[:, :2], directions)
+    assert jacobian.shape == (2, 3 + 2)
 
 
 def test_a_smaller_world_fits_no_better() -> None:

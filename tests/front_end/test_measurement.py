@@ -17,14 +17,14 @@ from pathspace_graph.factors.sensor import BENDS_FROM
 from pathspace_graph.front_end import measurement
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import (
-    BEND,
     FOLLOWED,
     MIN_ROWS,
     MODEL_ERROR,
+    OF_BEND,
     PASSES,
     PRIOR,
-    ROUNDS,
     ROUNDS_AGAIN,
+    ROUNDS_FIRST,
     Measurement,
     measure,
 )
@@ -102,7 +102,7 @@ def test_ranges_that_bend_do_not_spoil_the_other_errors(monkeypatch: pytest.Monk
     assert yaw == pytest.approx(0.02, abs=0.0015)
     assert scale == pytest.approx(0.05, abs=0.01)
     assert np.mean([one.range_bend for one in bent]) == pytest.approx(-0.005, abs=0.001)
-    monkeypatch.setattr(measurement, "PRIOR", np.where(np.arange(7) == BEND, 1e-9, PRIOR))
+    monkeypatch.setattr(measurement, "PRIOR", np.where(np.arange(7) == OF_BEND, 1e-9, PRIOR))
     straight = BENT.found(0)
     assert abs(straight.sensor[3] - 0.05) > 0.02
     assert straight.range_bend == 0.0
@@ -203,4 +203,4 @@ def test_in_steps_it_is_the_same_and_none_is_long() -> None:
         steps += 1
     np.testing.assert_array_equal(found.sensor, whole.sensor)
     follows = -(-len(cycles) // FOLLOWED)
-    assert steps + 1 == PASSES * follows + ROUNDS + (PASSES - 1) * ROUNDS_AGAIN
+    assert steps + 1 == PASSES * follows + ROUNDS_FIRST + (PASSES - 1) * ROUNDS_AGAIN

@@ -87,7 +87,7 @@ def test_detections_that_are_worse_than_they_claim_do_not_deny_the_odometry(
     motions = checked(overconfident)
     assert not any(motion.fault for motion in motions)
     assert np.abs(errors(log, motions).cumsum(axis=0)).max() < 0.2
-    monkeypatch.setattr(scan_matching, "MISFIT", 1e9)
+    monkeypatch.setattr(scan_matching, "LARGE_MISFIT", 1e9)
     assert any(motion.doubted for motion in checked(overconfident))
 
 
@@ -192,13 +192,13 @@ def test_an_excess_of_four_is_that_of_covariances_four_times_as_large(
     """What is doubted, what takes its place, and what is learned of the sensor are the same."""
     for module, name, value in (
         (scan_matching, "SIGMA_CONE", 1e-6),
-        (scan_matching, "HUBER", np.inf),
+        (scan_matching, "SCAN_HUBER", np.inf),
         (scan_matching, "MISFIT_GAIN", 1e-9),
-        (scan_matching, "MISFIT", 0.25),
+        (scan_matching, "LARGE_MISFIT", 0.25),
     ):
         monkeypatch.setattr(module, name, value)
     check, motions = past_cones(0.01)
-    monkeypatch.setattr(scan_matching, "MISFIT", 1.5)
+    monkeypatch.setattr(scan_matching, "LARGE_MISFIT", 1.5)
     other, wide = past_cones(0.04)
     assert [motion.fault for motion in motions] == [motion.fault for motion in wide]
     assert any(motion.doubted for motion in motions)

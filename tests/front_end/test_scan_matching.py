@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from pathspace_graph.factors.se2 import to_map, to_vehicle
 from pathspace_graph.front_end import scan_matching
 from pathspace_graph.front_end.scan_matching import (
-    ERRORS,
-    MEMORY,
+    LEARNED_ERRORS,
     MOST_MISFIT,
-    REACH,
+    REACH_FIRST,
     REACH_LAST,
     REACHES,
     REACHES_CHECK,
+    SCAN_MEMORY,
     SIGMA_CONE,
     RecentDetections,
     match,
@@ -30,7 +30,7 @@ CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0],
 
 def remember(recent: RecentDetections, t: float, points: np.ndarray) -> None:
     """Adds detections from the origin, by a sensor without errors."""
-    recent.add(t, points, np.zeros((len(points), 2, len(ERRORS))), np.zeros(3))
+    recent.add(t, points, np.zeros((len(points), 2, len(LEARNED_ERRORS))), np.zeros(3))
 
 
 def seen_once(cones: np.ndarray = CONES) -> RecentDetections:
@@ -78,7 +78,7 @@ def test_the_covariance_is_that_of_many_noisy_matches(monkeypatch: pytest.Monkey
     """Errors that are whitened by the claimed covariance have the covariance 1, cross terms included."""
     rng, sigma, n = np.random.default_rng(0), 0.02, 3
     monkeypatch.setattr(scan_matching, "SIGMA_CONE", 1e-6)
-    monkeypatch.setattr(scan_matching, "HUBER", np.inf)
+    monkeypatch.setattr(scan_matching, "SCAN_HUBER", np.inf)
     seen, errors = detected(POSE, ASYMMETRIC), []
     for _ in range(400):
         recent = RecentDetections()
@@ -128,7 +128,7 @@ def test_detections_of_one_cone_alone_hold_no_motion_however_many_they_are() -> 
 def test_old_detections_are_forgotten() -> None:
     recent = seen_once()
     remember(recent, 0.1, CONES[:2])
-    recent.forget(MEMORY + 0.01)
+    recent.forget(SCAN_MEMORY + 0.01)
     np.testing.assert_array_equal(recent.points, CONES[:2])
 
 
@@ -150,5 +150,5 @@ def test_a_detection_is_seen_again_where_one_was() -> None:
 
 def test_the_reaches_shrink_from_the_first_to_the_last() -> None:
     np.testing.assert_allclose(REACHES, 0.4 ** np.linspace(0.0, 1.0, 6))
-    assert (REACHES[0], REACHES[-1]) == (REACH, pytest.approx(REACH_LAST))
-    assert REACHES_CHECK == (REACH, REACH_LAST)
+    assert (REACHES[0], REACHES[-1]) == (REACH_FIRST, pytest.approx(REACH_LAST))
+    assert REACHES_CHECK == (REACH_FIRST, REACH_LAST)

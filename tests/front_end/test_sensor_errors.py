@@ -14,7 +14,7 @@ from pathspace_graph.front_end import scan_matching
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log
 from pathspace_graph.front_end.motion import MotionCheck
 from pathspace_graph.front_end.scan_matching import (
-    ERRORS,
+    LEARNED_ERRORS,
     SIGMAS_ERRORS,
     Difference,
     RecentDetections,
@@ -88,7 +88,7 @@ def test_matches_give_the_errors_with_the_claimed_covariance(
             noise = np.sqrt(np.diag(spread)) * rng.standard_normal(3)
             for _ in range(shared):
                 seen = shifts @ (truth - known.mean) + noise
-                known.update(Difference(seen, spread, shifts), scan_matching.MEMORY / shared)
+                known.update(Difference(seen, spread, shifts), scan_matching.SCAN_MEMORY / shared)
         off.append(np.linalg.solve(np.linalg.cholesky(known.covariance), truth - known.mean))
     np.testing.assert_allclose(np.cov(np.array(off).T), np.eye(2), atol=0.25)
 
@@ -107,14 +107,14 @@ def test_an_old_latency_is_forgotten_so_that_a_new_one_is_learned() -> None:
     for cycle in range(9_000):
         truth = np.array([0.0, 0.0 if cycle < 7_500 else 0.03])
         shifts = known.shifts(np.array([1.0, 0.0]), np.array([*rng.normal(scale=0.5, size=2), 0.1]))
-        known.update(Difference(shifts @ (truth - known.mean), spread, shifts), scan_matching.MEMORY)
+        known.update(Difference(shifts @ (truth - known.mean), spread, shifts), scan_matching.SCAN_MEMORY)
     assert known.mean[1] == pytest.approx(0.03, abs=0.003)
 
 
 def test_the_derivatives_are_those_of_the_calibration_of_the_sensor() -> None:
     points, twist = CONES, np.array([8.0, 0.3, 0.7])
     whole = by_sensor(points, np.tile(twist, (len(points), 1)))
-    np.testing.assert_allclose(by_errors(points, twist), whole[:, :, ERRORS])
+    np.testing.assert_allclose(by_errors(points, twist), whole[:, :, LEARNED_ERRORS])
 
 
 # --- whole drives ----------------------------------------------------------------------------------------

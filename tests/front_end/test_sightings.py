@@ -12,7 +12,7 @@ from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.sightings import (
-    MAX_RANGE,
+    FOLLOW_RANGE,
     MIN_TWISTS,
     ConeTracker,
     SeenCycle,
@@ -194,7 +194,7 @@ def test_with_known_errors_a_cone_keeps_its_number_from_afar_until_it_is_near() 
     assert counts(found) == counts(expected)
     np.testing.assert_array_equal(found.cone, expected.cone)
     measured = np.concatenate([cycle.detections.points_vehicle for cycle in cycles])
-    seen = measured[np.hypot(*measured.T) < MAX_RANGE]
+    seen = measured[np.hypot(*measured.T) < FOLLOW_RANGE]
     np.testing.assert_array_equal(np.sort(found.point, axis=0), np.sort(seen, axis=0))
     assert len(counts(follow(cycles, NO_ERRORS))) > len(counts(found))
 

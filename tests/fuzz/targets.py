@@ -19,7 +19,7 @@ from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.sim.track_files import read_track
-from pathspace_graph.snapshot import FORMAT
+from pathspace_graph.snapshot import SNAPSHOT
 
 SECTION = re.compile(rb"(?:\A|(?<=\n))=== ([a-z_]+\.[a-z]+)\n")
 
@@ -62,7 +62,7 @@ def read_snapshots(folder: Path) -> None:
     """Reads a snapshot as it is, or of a pickle, with the format and the digest that belong to it."""
     if (folder / "content.pickle").exists():
         content = (folder / "content.pickle").read_bytes()
-        head = FORMAT.encode(), sha256(content).hexdigest().encode()
+        head = SNAPSHOT.encode(), sha256(content).hexdigest().encode()
         (folder / "mapper.snap").write_bytes(b"\n".join([*head, content]))
     FixedLagMapper.restore(folder / "mapper.snap")
 

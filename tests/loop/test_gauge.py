@@ -106,7 +106,7 @@ def test_holding_moves_nothing_and_keeps_what_is_known_of_map_and_pose() -> None
 
 def test_a_step_of_a_held_map_is_that_of_a_free_one_given_that_the_whole_does_not_move() -> None:
     """With the covariance P of the points and the rows C the free step is conditioned on `C dx = 0`."""
-    smoother, free = (run(np.inf, mid()).smoother for _ in range(2))
+    smoother, free = (run(np.inf, mid()).road.smoother for _ in range(2))
     keys, C = across(smoother.map.state)
     P, before = smoother.covariance(keys), smoother.variables.of(keys)
     hold_gauge(smoother)
@@ -152,7 +152,7 @@ def test_factors_of_the_user_may_tell_the_gauge_so_that_it_is_not_held() -> None
 
 
 def test_a_map_that_replaces_another_has_a_gauge_of_its_own() -> None:
-    smoother = run(0.1, mid()).smoother
+    smoother = run(0.1, mid()).road.smoother
     assert smoother.held is not None
     keys = smoother.map.state.map_keys
     restart(smoother, smoother.first_cycle, keys, keys, smoother.variables.of(keys).reshape(-1, 2))

@@ -22,7 +22,7 @@ from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.known_loop import KnownLoop, evidence_of, lay_out_loop
-from pathspace_graph.loop.relocalization import FOUND, MEMORY, Search, start_anew
+from pathspace_graph.loop.relocalization import FOUND, SEARCH_MEMORY, Search, start_anew
 from pathspace_graph.mapping.registration import Matches, Motion, RefinedMotion
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -223,7 +223,7 @@ def test_the_remembered_path_has_a_bound() -> None:
     for pose, cycle in zip(true_poses(log), log.cycles, strict=True):
         search.observe(pose, cycle)
     poses = np.array(search._poses)
-    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() <= MEMORY
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() <= SEARCH_MEMORY
 
 
 def test_forgetting_the_poses_keeps_all_that_the_prior_knows_of_the_map() -> None:

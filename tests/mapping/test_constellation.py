@@ -13,14 +13,14 @@ from pathspace_graph.factors.se2 import compose, left_of, path_lengths, relative
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.constellation import (
-    FAILED,
-    MIN_CONES,
-    MISFIT,
+    LAID_CONES,
+    LAID_MISFIT,
+    LAID_ODDS,
+    LAID_SIGHTINGS,
+    LAID_SIGMA,
     NEARBY,
-    ODDS,
+    ODOMETRY_FAILED,
     RANGE,
-    SIGHTINGS,
-    SIGMA,
     UNSEEN,
     VIEWS,
     Constellation,
@@ -86,7 +86,7 @@ def test_a_few_cones_tell_the_pose_from_which_they_were_seen() -> None:
     arm = left_of(known.points[:10] - POSE[:2])
     by_turn, sum_of_squares = arm.sum(axis=0), np.sum(arm**2)
     expected = np.array([[10.0, 0.0, by_turn[0]], [0.0, 10.0, by_turn[1]], [*by_turn, sum_of_squares]])
-    np.testing.assert_allclose(laid.information, expected / (SIGMA**2 + 2.0 * COVARIANCE), atol=1e-3)
+    np.testing.assert_allclose(laid.information, expected / (LAID_SIGMA**2 + 2.0 * COVARIANCE), atol=1e-3)
 
 
 def test_a_cone_lies_on_one_of_its_own_colour_only() -> None:
@@ -96,14 +96,14 @@ def test_a_cone_lies_on_one_of_its_own_colour_only() -> None:
     assert laid is None or not laid.is_sure
 
 
-NEW_ROAD = FAILED + 20 * UNSEEN
+NEW_ROAD = ODOMETRY_FAILED + 20 * UNSEEN
 """Cost of twenty cones where nothing was in view, after odometry has failed: less than in any wrong place."""
 
 
 def test_what_is_expected_counts_until_odometry_has_failed() -> None:
     """The pose is a metre and a tenth of a radian off, which are one sigma each, or any number of them."""
     known, mean = scattered(), POSE + np.array([1.0, 0.0, 0.1])
-    for sigmas, cost in (((1.0, 1.0, 0.1), 2.0), ((0.01, 0.01, 0.001), FAILED)):
+    for sigmas, cost in (((1.0, 1.0, 0.1), 2.0), ((0.01, 0.01, 0.001), ODOMETRY_FAILED)):
         laid = lay(beside(known, slice(None)), known, mean, np.diag(np.array(sigmas) ** -2.0), REACH)
         assert laid is not None
         np.testing.assert_allclose(laid.pose, POSE, atol=1e-6)
@@ -123,7 +123,7 @@ def test_the_information_is_that_of_repeated_observations() -> None:
     Cones whose errors are those of their covariances alone tell more than is claimed.
     """
     rng, known = np.random.default_rng(3), scattered(16)
-    variances = SIGMA**2 + 2.0 * COVARIANCE, 2.0 * COVARIANCE
+    variances = LAID_SIGMA**2 + 2.0 * COVARIANCE, 2.0 * COVARIANCE
     for variance, (least, most) in zip(variances, ((0.9, 1.6), (0.15, 0.4)), strict=True):
         squares = []
         for _ in range(300):
@@ -138,12 +138,12 @@ def test_the_information_is_that_of_repeated_observations() -> None:
 
 # --- how sure it is --------------------------------------------------------------------------------------
 
-SURE = Laid(POSE, np.eye(3), MIN_CONES, MISFIT, ODDS)
+SURE = Laid(POSE, np.eye(3), LAID_CONES, LAID_MISFIT, LAID_ODDS)
 
 
 def test_each_limit_has_two_sides() -> None:
     assert SURE.is_sure
-    for worse in ({"misfit": 1.01 * MISFIT}, {"count": MIN_CONES - 1}, {"odds": ODDS - 0.1}):
+    for worse in ({"misfit": 1.01 * LAID_MISFIT}, {"count": LAID_CONES - 1}, {"odds": LAID_ODDS - 0.1}):
         assert not replace(SURE, **worse).is_sure
 
 
@@ -162,7 +162,7 @@ def test_most_cones_must_lie_on_earlier_ones(gone: int, is_sure: bool) -> None:
 def test_cones_that_lie_beside_others_do_not_agree(sigmas: float, is_sure: bool) -> None:
     """Half of them lie to one side and half to the other, by the same distance, which no motion explains."""
     points = np.array([[6.0 * (k // 4), 6.0 * (k % 4)] for k in range(16)])
-    off = sigmas * np.sqrt(SIGMA**2 + 2.0 * COVARIANCE) * np.where(np.arange(16) % 4 % 3, 1.0, -1.0)
+    off = sigmas * np.sqrt(LAID_SIGMA**2 + 2.0 * COVARIANCE) * np.where(np.arange(16) % 4 % 3, 1.0, -1.0)
     moved = points + np.column_stack([off, np.zeros(16)])
     laid = lay(constellation(moved).seen_from(POSE), constellation(points), POSE, NOTHING, (0.4, 0.01))
     assert laid is not None and laid.count == 16
@@ -219,7 +219,7 @@ def test_a_vehicle_that_is_not_back_yet_fits_a_gap_farther_along_a_row() -> None
         assert laid is not None and not laid.is_sure
 
 
-@pytest.mark.parametrize(("seen", "known"), [(MIN_CONES - 1, 20), (MIN_CONES - 1, MIN_CONES - 1), (0, 20)])
+@pytest.mark.parametrize(("seen", "known"), [(LAID_CONES - 1, 20), (LAID_CONES - 1, LAID_CONES - 1), (0, 20)])
 def test_a_few_cones_are_laid_on_none(seen: int, known: int) -> None:
     cones = scattered()
     assert lay(beside(cones, slice(seen)), beside(cones, slice(known)), POSE, NOTHING, REACH) is None
@@ -246,13 +246,13 @@ def test_detections_are_merged_in_turn_as_tracks_are() -> None:
 def test_cones_are_seen_often_enough_near_enough_and_in_colour() -> None:
     """Each of four cones but the first lacks one of these."""
     near, far = [5.0, 1.0], [RANGE + 1.0, 0.0]
-    rows = [(near, LEFT)] * SIGHTINGS + [([5.0, -3.0], LEFT)] * (SIGHTINGS - 1)
-    rows += [(far, LEFT)] * SIGHTINGS + [([1.0, 4.0], UNKNOWN)] * SIGHTINGS
+    rows = [(near, LEFT)] * LAID_SIGHTINGS + [([5.0, -3.0], LEFT)] * (LAID_SIGHTINGS - 1)
+    rows += [(far, LEFT)] * LAID_SIGHTINGS + [([1.0, 4.0], UNKNOWN)] * LAID_SIGHTINGS
     points, labels = np.array([point for point, _ in rows]), np.array([label for _, label in rows])
     seen = Detections(0.0, points, np.tile(0.03 * np.eye(2), (len(rows), 1, 1)), labels)
     found = Constellation.of(DetectionColumns.of([seen]), POSE[None], GROWTH)
     np.testing.assert_allclose(found.points, to_map(np.array([near]), POSE[None]))
-    np.testing.assert_allclose(found.covariances, [0.03 / SIGHTINGS * np.eye(2)], atol=1e-12)
+    np.testing.assert_allclose(found.covariances, [0.03 / LAID_SIGHTINGS * np.eye(2)], atol=1e-12)
     np.testing.assert_array_equal(found.labels, [LEFT])
 
 
@@ -348,7 +348,7 @@ def test_another_road_beside_is_no_return(lane: float, is_same: bool) -> None:
 
 def test_a_pose_before_the_newest_moves_with_it() -> None:
     true = along(LAP, (20.0, 1.0 / 12.0))
-    laid = Laid(true[-1], np.eye(3), 20, 0.0, ODDS)
+    laid = Laid(true[-1], np.eye(3), 20, 0.0, LAID_ODDS)
     revisit = revisit_of(laid, true, 8, len(true) - 11)
     np.testing.assert_allclose(revisit.local, relative(true[8], true[-11]), atol=1e-9)
     assert (revisit.earlier, revisit.later) == (8, len(true) - 11)

@@ -36,7 +36,7 @@ def test_standing_still_adds_nothing() -> None:
 
 
 def test_only_the_last_stretch_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(path_module, "MEMORY", 5.0)
+    monkeypatch.setattr(path_module, "PATH_MEMORY", 5.0)
     path = driven(np.arange(0.0, 21.0).tolist())
     np.testing.assert_allclose(path.stations, np.arange(15.0, 21.0))
     np.testing.assert_allclose(path.points[:, 0], np.arange(15.0, 21.0))

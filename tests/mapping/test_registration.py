@@ -154,7 +154,7 @@ def test_matches_are_coloured_detections_beside_their_own_curve() -> None:
 
 
 def test_only_the_newest_seconds_are_registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registration, "WINDOW", 1.0)
+    monkeypatch.setattr(registration, "REGISTERED_AGE", 1.0)
     scene = window()
     found = scene.register(sigma_max=1.0)
     assert found is not None
@@ -359,7 +359,7 @@ def test_near_the_start_is_a_matter_of_place_and_direction(
     pose: tuple[float, ...], near: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After 80 m straight on, on the first 20 m: within 8 m + 3 % of 80 m, and 0.8 rad."""
-    monkeypatch.setattr(path_module, "MEMORY", 20.0)
+    monkeypatch.setattr(path_module, "PATH_MEMORY", 20.0)
     path, frame = DrivenPath(), np.array([3.0, -5.0, 0.7])
     for x in np.arange(0.0, 80.1, 0.5):
         path.update(compose(frame, np.array([x, 0.0, 0.0])))

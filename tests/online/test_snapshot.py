@@ -256,11 +256,6 @@ def file(mapped: FixedLagMapper, tmp_path: Path) -> Iterator[Path]:
     assert not list(tmp_path.glob(".*"))
 
 
-def test_the_file_of_a_mapper_is_written_the_same_again(file: Path, tmp_path: Path) -> None:
-    FixedLagMapper.restore(file).save(tmp_path / "again.snap")
-    assert (tmp_path / "again.snap").read_bytes() == file.read_bytes()
-
-
 def test_an_earlier_snapshot_is_kept_as_a_backup(file: Path) -> None:
     before = file.read_bytes()
     FixedLagMapper(odometry_sigma=ODOMETRY_SIGMA).save(file)

@@ -9,11 +9,11 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation
-from pathspace_graph.factors.sensor import SENSOR_SIZE, by_bend
-from pathspace_graph.front_end.measurement import BEND, PRIOR, _runs, pairs
+from pathspace_graph.factors.sensor import SENSOR_SIZE, by_bend, by_sensor
+from pathspace_graph.front_end.measurement import OF_BEND, PRIOR, _runs, pairs
 from pathspace_graph.front_end.sightings import Cones
 
-from .measuring import by_sensor, to_map
+from .measuring import to_map
 
 
 def usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tuple[BoolArray, BoolArray]:
@@ -189,7 +189,7 @@ def by_constants(
     columns, turned = np.empty((len(seen), 2, len(PRIOR))), by_bias - then
     columns[:, 0, :SENSOR_SIZE], columns[:, 1, :SENSOR_SIZE] = c * x - s * y, s * x + c * y
     in_map = np.concatenate([c * ahead - s * left, s * ahead + c * left], axis=1)
-    columns[:, :, BEND] = -by_bend(seen)[:, None] * in_map
+    columns[:, :, OF_BEND] = -by_bend(seen)[:, None] * in_map
     columns[:, :, -1] = turned[:, :2] - then[:, 2:] * left_of(moved) + turned[:, 2:] * left_of(in_map)
     return columns
 

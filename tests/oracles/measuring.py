@@ -8,8 +8,8 @@ from scipy.linalg import lapack
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.residuals import sigma_across
-from pathspace_graph.factors.se2 import compose, left_of, se2_exp, wrap_angle
-from pathspace_graph.factors.sensor import SENSOR_SIZE, sensor_rows
+from pathspace_graph.factors.se2 import compose, in_vehicle, left_of, se2_exp, wrap_angle
+from pathspace_graph.factors.sensor import RANGE, by_range, by_sensor
 
 
 def to_map(points_vehicle: Array, poses: Array) -> Array:
@@ -19,22 +19,23 @@ def to_map(points_vehicle: Array, poses: Array) -> Array:
     return np.array([c * x - s * y + poses[:, 0], s * x + c * y + poses[:, 1]]).T
 
 
-def by_sensor(points_vehicle: Array, twists: Array) -> Array:
-    """Return the derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b."""
-    turned = left_of(points_vehicle)
-    distance = np.maximum(np.hypot(points_vehicle[:, 0], points_vehicle[:, 1]), np.finfo(float).tiny)
-    columns = np.empty((len(points_vehicle), 2, SENSOR_SIZE))
-    columns[:, :, 0] = turned
-    columns[:, :, 1] = 0.0, 1.0
-    columns[:, :, 2] = -(twists[:, :2] + twists[:, 2:] * turned)
-    columns[:, :, 3] = -points_vehicle
-    columns[:, :, 4] = -points_vehicle / distance[:, None]
-    return columns
-
-
 def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
     """Return `z + C b` (m, 2) of detections z (m, 2), with C of `by_sensor` and a calibration b (5,)."""
     return np.asarray(measured + by_sensor(measured, twists) @ sensor)
+
+
+def sensor_terms(
+    directions: Array, residual: Array, poses: Array, measured: Array, twists: Array, sensor: Array
+) -> tuple[Array, Array]:
+    """Return factors `f = 1 + rates b` (m,) and derivatives `f d' R C + r rates` (m, 5) by b."""
+    if len(sensor) == 0:
+        return np.ones(len(residual)), np.zeros((len(residual), 0))
+    along = in_vehicle(directions, poses)
+    rates = np.einsum("mi,mkij,mj->mk", along, by_range(measured), along)
+    factor = 1.0 + rates @ sensor[RANGE]
+    jacobian = np.einsum("mi,mik->mk", along, by_sensor(measured, twists)) * factor[:, None]
+    jacobian[:, RANGE] += residual[:, None] * rates
+    return factor, jacobian
 
 
 def detection_rows(
@@ -52,12 +53,12 @@ def detection_rows(
     """Return residuals (m,) and sigmas (m,) of `project`, and derivatives by [pose | sensor | controls]."""
     arm = points_map - poses[:, :2]
     by_theta = normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1]
-    by = sensor_rows(normals, distances, poses, measured, twists, sensor)
+    factors, by_calibration = sensor_terms(normals, distances, poses, measured, twists, sensor)
     by_pose = np.concatenate([normals, by_theta[:, None]], axis=1)
     by_control = (-basis[:, :, None] * normals[:, None, :]).reshape(len(basis), 2 * basis.shape[1])
-    factor = by.factor[:, None]
-    jacobian = np.concatenate([factor * by_pose, by.by_sensor, factor * by_control], axis=1)
-    return by.factor * distances, sigma_across(normals, covariances, poses, sigma_model), jacobian
+    factor = factors[:, None]
+    jacobian = np.concatenate([factor * by_pose, by_calibration, factor * by_control], axis=1)
+    return factors * distances, sigma_across(normals, covariances, poses, sigma_model), jacobian
 
 
 def station_rows(

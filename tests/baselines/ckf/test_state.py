@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.baselines.ckf_belief import HEAD, Belief
 from pathspace_graph.baselines.ckf_curves import SIGMA_START, CurveState
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.mapping.belief import HEAD, Belief
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.baselines.ckf_belief import to_vehicle_rows
 from pathspace_graph.baselines.ckf_update import classify, on_curve, update
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.belief import to_vehicle_rows
 from pathspace_graph.settings.mapper import CkfSettings
 
 from .scenes import COVARIANCE, bend, detections_of, straight_rows

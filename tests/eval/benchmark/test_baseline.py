@@ -21,7 +21,7 @@ from pathspace_graph.eval.benchmark.measurement import (
     write_baseline,
 )
 
-from ...scenes.timing import steady_run
+from .timing import steady_run
 
 
 def ratio(value: float, key: str = "a") -> Metric:

@@ -10,7 +10,7 @@ import pytest
 from pathspace_graph.eval.benchmark import __main__ as benchmark
 from pathspace_graph.eval.benchmark.measurement import metrics
 
-from ...scenes.timing import steady_run
+from .timing import steady_run
 
 
 @pytest.mark.parametrize(("times", "code"), [(1.0, None), (2.0, 1)])

@@ -12,7 +12,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from ...scenes.drives import bean_track, beginning
-from ...scenes.timing import record
+from .timing import record
 
 
 def test_a_short_run_gives_every_figure() -> None:

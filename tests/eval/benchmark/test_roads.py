@@ -24,7 +24,7 @@ from pathspace_graph.eval.benchmark.roads import (
 )
 from pathspace_graph.io.log import Log
 
-from ...scenes.timing import SMALL
+from .timing import SMALL
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from pathspace_graph.eval.benchmark.scaling import (
     write_scaling,
 )
 
-from ...scenes.timing import SMALL
+from .timing import SMALL
 
 pytestmark = pytest.mark.usefixtures("png_only")
 

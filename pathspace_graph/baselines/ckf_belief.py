@@ -18,9 +18,8 @@ from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.results import VehicleState
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
-
-from .motion import MeasuredMotion
 
 _LEAST_VARIANCE: Final = 1e-12
 """Share of the largest eigenvalue to which others are raised where a covariance has no Cholesky factor."""

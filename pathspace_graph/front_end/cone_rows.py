@@ -12,8 +12,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths
-
-from .path import along_and_across, crosses
+from pathspace_graph.mapping.path import along_and_across, crosses
 
 
 @dataclass(frozen=True)
@@ -75,6 +74,26 @@ class ConeRow:
         cost = distance * (1.0 + limits.turn_cost * turn**2)
         return distance, np.where(turn < limits.turn - limits.turn_rate * distance, cost, np.inf)
 
+    def choose_next(self, other: "ConeRow", driven: Array, threshold: float) -> bool:
+        """Continue the row through the candidate that `extend_rows` allows; return whether there is one.
+
+        The row has ended where no candidate continues it wherever the other one leads.
+        """
+        distance, cost = self.costs(np.arange(len(self.candidates)), EXTENDED)
+        possible = (distance > threshold) & (distance < EXTENDED.gap) & np.isfinite(cost)
+        possible[self.chosen] = False
+        indices = np.flatnonzero(possible)
+        indices = indices[np.argsort(cost[indices])]
+        self.ended = len(indices) == 0
+        if self.ended:
+            return False
+        points = self.candidates[indices]
+        fits = _has_width(self, other, points)
+        fits &= ~crosses(self.end, points, driven) & ~crosses(self.end, points, other.line)
+        if fits.any():
+            self.choose(int(indices[fits.argmax()]))
+        return bool(fits.any())
+
 
 def extend_rows(left: ConeRow, right: ConeRow, driven: Array, threshold: float) -> None:
     """Continue both rows through their candidates, each time the one that lags behind.
@@ -86,28 +105,10 @@ def extend_rows(left: ConeRow, right: ConeRow, driven: Array, threshold: float) 
     while waiting:
         ahead = left.direction + right.direction
         row = min(waiting, key=lambda row: float(row.end @ ahead))
-        index = _next(row, right if row is left else left, driven, threshold)
-        if index is None:
-            waiting = [other for other in waiting if other is not row]
-        else:
-            row.choose(index)
+        if row.choose_next(right if row is left else left, driven, threshold):
             waiting = [other for other in (left, right) if not other.ended]
-
-
-def _next(row: ConeRow, other: ConeRow, driven: Array, threshold: float) -> int | None:
-    """Return the index of the candidate that continues a row, or None."""
-    distance, cost = row.costs(np.arange(len(row.candidates)), EXTENDED)
-    possible = (distance > threshold) & (distance < EXTENDED.gap) & np.isfinite(cost)
-    possible[row.chosen] = False
-    indices = np.flatnonzero(possible)
-    indices = indices[np.argsort(cost[indices])]
-    if len(indices) == 0:
-        row.ended = True
-        return None
-    points = row.candidates[indices]
-    fits = _has_width(row, other, points)
-    fits &= ~crosses(row.end, points, driven) & ~crosses(row.end, points, other.line)
-    return int(indices[fits.argmax()]) if fits.any() else None
+        else:
+            waiting = [other for other in waiting if other is not row]
 
 
 def _has_width(row: ConeRow, other: ConeRow, points: Array) -> BoolArray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.mapping.belief import cubature_points, square_root, transform
+from pathspace_graph.baselines.ckf_belief import cubature_points, square_root, transform
 
 Array = NDArray[np.float64]
 

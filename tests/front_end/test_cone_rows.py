@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.front_end.cone_rows import DEALT_OUT, ConeRow, deal_out, extend_rows
 from pathspace_graph.mapping.path import crosses
-from pathspace_graph.mapping.rows import DEALT_OUT, ConeRow, deal_out, extend_rows
 
 Array = NDArray[np.float64]
 

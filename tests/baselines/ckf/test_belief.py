@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.baselines.ckf_belief import HEAD, Belief, point_columns, to_map_rows, to_vehicle_rows
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
 from pathspace_graph.factors.se2 import compose
-from pathspace_graph.mapping.belief import HEAD, Belief, point_columns, to_map_rows, to_vehicle_rows
 
 Array = NDArray[np.float64]
 
