@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
 from itertools import islice
 from typing import Any
 
@@ -23,13 +22,13 @@ from pathspace_graph.loop.map_repair import REPAIRED
 from pathspace_graph.loop.open import Open
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.online.fixed_lag import _Before
-from pathspace_graph.run import split_odometry
+from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
 
 from .oracles.copied import copied
 from .scenes.digest import digest
-from .scenes.drives import beginning, map_beginning, noisy_lap, replay
+from .scenes.drives import beginning, map_beginning, mapped, noisy_lap, replay
 from .scenes.holes import unseen
 from .scenes.kidnapped import laps_log, pear_track, put_down
 
@@ -63,12 +62,8 @@ def losing() -> Log:
     return replace(log, cycles=log.cycles[:300])
 
 
-DRIVES = [
-    closing,
-    revisiting,
-    pytest.param(repairing, marks=pytest.mark.slow),
-    pytest.param(losing, marks=pytest.mark.slow),
-]
+def slow(*values: Any) -> Any:
+    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 def state_of(held: _Before | FixedLagMapper) -> str:
@@ -76,70 +71,49 @@ def state_of(held: _Before | FixedLagMapper) -> str:
     return digest({name: getattr(held, name) for name in PARTS})
 
 
-@cache
-def ended(log: Log) -> tuple[str, list[str]]:
-    """Return the digest of a mapper after a drive, and the names of its phases and of what was met."""
-    mapper, met = FixedLagMapper(None, log.odometry_sigma), []
-    for cycle in split_odometry(log):
-        result = replay(mapper, *cycle)
-        busy = "batch" if mapper.drive.solver.is_busy else ""
-        repaired = "repaired" if result.notice.startswith(REPAIRED) else ""
-        new_road = "new road" if isinstance(mapper.phase, Lost) and mapper.phase.new_road else ""
-        met += [type(mapper.phase).__name__, busy, repaired, new_road]
-        met += ["revisit"] if mapper.revisits else []
-    return state_of(mapper), sorted({*met} - {""})
-
-
-@cache
-def log_of(make: Any) -> Log:
-    log: Log = make()
-    return log
+def met_in(mapper: FixedLagMapper, result: CycleResult) -> set[str]:
+    """Return the name of the phase, and of what else a cycle has met."""
+    is_new_road = isinstance(mapper.phase, Lost) and mapper.phase.new_road is not None
+    met = {"batch": mapper.drive.solver.is_busy, "new road": is_new_road, "revisit": bool(mapper.revisits)}
+    met["repaired"] = result.notice.startswith(REPAIRED)
+    return {type(mapper.phase).__name__, *(name for name, is_met in met.items() if is_met)}
 
 
 @pytest.mark.parametrize(
-    ("make", "met"),
+    ("make", "expected"),
     [
-        (closing, ["Closed", "Open", "batch"]),
-        (revisiting, ["Open", "revisit"]),
-        pytest.param(repairing, ["Closed", "Open", "batch", "repaired"], marks=pytest.mark.slow),
-        pytest.param(losing, ["Closed", "Lost", "Open", "batch", "new road"], marks=pytest.mark.slow),
+        (closing, {"Closed", "Open", "batch"}),
+        (revisiting, {"Open", "revisit"}),
+        slow(repairing, {"Closed", "Open", "batch", "repaired"}),
+        slow(losing, {"Closed", "Lost", "Open", "batch", "new road"}),
     ],
 )
-def test_the_drives_meet_what_they_are_for(make: Any, met: list[str]) -> None:
-    assert set(ended(log_of(make))[1]) >= set(met)
+def test_a_copy_stays_as_it_is_whatever_the_original_does(make: Any, expected: set[str]) -> None:
+    """It is held against a deep copy of that moment, and goes on as the original has done.
 
-
-@pytest.mark.parametrize("make", DRIVES)
-def test_a_mapper_that_is_given_back_in_every_cycle_ends_with_the_same_bits(make: Any) -> None:
-    log = log_of(make)
-    mapper = FixedLagMapper(None, log.odometry_sigma)
-    for cycle in split_odometry(log):
-        mapper._go_back(_Before.of(mapper))
-        replay(mapper, *cycle)
-    assert state_of(mapper) == ended(log)[0]
-
-
-@pytest.mark.parametrize("make", DRIVES)
-def test_a_copy_stays_as_it_is_whatever_the_original_does(make: Any) -> None:
-    """It is held against a deep copy of that moment, and goes on as the original has done."""
-    log, copies = log_of(make), {}
+    The original is given back what it was before each cycle, and ends with the bits of one that is not.
+    """
+    log, copies, met = make(), {}, set[str]()
     mapper = FixedLagMapper(None, log.odometry_sigma)
     for k, cycle in enumerate(split_odometry(log)):
+        before = _Before.of(mapper)
+        mapper._go_back(before)
         if k % EVERY == 0:
-            copies[k] = _Before.of(mapper), digest(copied({name: getattr(mapper, name) for name in PARTS}))
-        before, known = copies.get(k - GOES_ON, (None, ""))
-        if before is not None:
-            assert state_of(before) == known
-        replay(mapper, *cycle)
+            copies[k] = before, digest(copied({name: getattr(mapper, name) for name in PARTS}))
+        earlier, known = copies.get(k - GOES_ON, (None, ""))
+        if earlier is not None:
+            assert state_of(earlier) == known
+        met |= met_in(mapper, replay(mapper, *cycle))
+    assert met >= expected
+    assert state_of(mapper) == state_of(mapped(log)[0])
     assert len(copies) > 5
     for before, known in copies.values():
         assert state_of(before) == known
-    _, (before, _) = list(copies.items())[-2]
+    first, (before, _) = list(copies.items())[-2]
     other = FixedLagMapper(None, log.odometry_sigma)
     other._go_back(before)
-    for k, cycle in enumerate(split_odometry(log)):
-        if k >= [*copies][-2]:
-            replay(other, *cycle)
+    for cycle in islice(split_odometry(log), first, None):
+        replay(other, *cycle)
     assert state_of(other) == state_of(mapper)
 
 
@@ -184,7 +158,7 @@ def at_cycle(log: Log, cycle: int) -> tuple[FixedLagMapper, list[tuple[Odometry,
     ("stage", "cycle"), [*((stage, 40) for stage in STAGES), *((stage, 165) for stage in CLOSED)]
 )
 def test_a_cycle_that_fails_leaves_no_trace(stage: tuple[type, str], cycle: int) -> None:
-    mapper, (first, *rest) = at_cycle(log_of(closing), cycle)
+    mapper, (first, *rest) = at_cycle(closing(), cycle)
     assert mapper.closed == (cycle == 165)
     before, rested = digest(mapper), copied(mapper)
     with failing(stage, 1), pytest.raises(np.linalg.LinAlgError, match="no convergence"):
@@ -203,7 +177,7 @@ def test_a_cycle_that_fails_leaves_no_trace(stage: tuple[type, str], cycle: int)
 
 @pytest.mark.failing
 def test_a_cycle_in_which_every_attempt_fails_is_left_out() -> None:
-    mapper, (first, second, *_) = at_cycle(log_of(closing), 40)
+    mapper, (first, second, *_) = at_cycle(closing(), 40)
     before, other = digest(mapper), copied(mapper)
     with failing((Road, "update"), 3):
         result = mapper.update(*first)

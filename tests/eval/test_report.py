@@ -207,15 +207,15 @@ def test_a_quick_report_goes_with_no_pages(tmp_path: Path, capsys: pytest.Captur
 def test_a_report_writes_its_figures_and_the_pages_and_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By two estimators that are fast."""
-    monkeypatch.setattr(report, "ESTIMATORS", ("fixed-lag", "landmark-fixed-lag"))
+    """Of the online estimator alone."""
+    monkeypatch.setattr(report, "ESTIMATORS", ("fixed-lag",))
     (tmp_path / "docs").mkdir()
     for page in PAGES:
         (tmp_path / page).write_text("<!-- report: skidpad -->\n<!-- end report -->\n")
     run = ["report", "--out", str(tmp_path / "r"), "--only", "skidpad", "--jobs", "1", "--quick"]
     assert main(run) == 0
     found = read_figures(tmp_path / "r" / "figures.json")["skidpad"]
-    assert [label for label, _ in found.rows] == ["`fixed-lag`", "`landmark-fixed-lag`"]
+    assert [label for label, _ in found.rows] == ["`fixed-lag`"]
     assert found.sources == sources_digest()
     assert all(figure.value is not None and figure.value < 1.0 for figure in found.rows[0][1])
     cells = {file: file.stat().st_mtime_ns for file in (tmp_path / "r").rglob("cells/*")}

@@ -179,13 +179,13 @@ def test_known_gaps_are_gone_after_mending() -> None:
 def test_one_side_unseen_for_50_m_is_mended_in_the_second_lap() -> None:
     faults = Faults(sensor=SensorFaults(blind=50.0))
     log = simulate(
-        generate_track(np.random.default_rng(0)), SimulationSettings(laps=3, faults=faults), seed=0
+        generate_track(np.random.default_rng(0)), SimulationSettings(laps=2, faults=faults), seed=0
     )
     result = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
     assert log.truth is not None
     metrics = {lap: lap_metrics(lap_map, log.truth, lap) for lap, lap_map in result.lap_maps}
     assert metrics[1].missed > 0.05
-    assert metrics[2].missed <= 0.02 and metrics[3].missed <= 0.02
-    assert metrics[3].rmse < 0.3
+    assert metrics[2].missed <= 0.02
+    assert metrics[2].rmse < 0.3
     assert any(record.notice.startswith(REPAIRED) for record in result.cycles)
     assert LOST not in {record.health for record in result.cycles}

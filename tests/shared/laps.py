@@ -7,6 +7,8 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
+from joblib.externals import loky
+
 from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
 from pathspace_graph.loop import worker
 
@@ -24,7 +26,7 @@ def solved(lap: OpenLap) -> LapMarginal:
 
 def submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
     """In place of `worker.submit`: a lap is solved at once, and all other work is done by the process."""
-    future: Future[Any] = Future()
+    future: Future[Any] = loky.Future()
     if work is worker.nothing:
         future.set_result(None)
     elif work is solve_lap:
