@@ -107,7 +107,7 @@ def test_the_batch_begins_online_where_odometry_leads_to_no_loop(
 
     monkeypatch.setattr(Optimizer, "find", fails_once)
     if why == "the map is objected to":
-        monkeypatch.setattr(batch_mapper, "objection", lambda *_: "its boundaries cross")
+        monkeypatch.setattr(batch_mapper, "speaks_against", lambda *_: "its boundaries cross")
     result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log)
     assert result.online is not None
     assert len(searches) == (1 if why == "no cone is met again" else 2)
