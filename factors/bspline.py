@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import factorial, floor
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
@@ -72,8 +72,6 @@ class SpanPolynomials:
     degree: int
     periodic: bool = False  # parameters are taken modulo the length of the domain instead of being clipped
     known: Array | None = field(default=None, repr=False)  # coefficients of the first spans
-
-    constant: ClassVar[bool] = True  # nothing changes but what is cached
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", np.ascontiguousarray(self.knots, dtype=np.float64))

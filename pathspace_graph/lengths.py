@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 
 T = TypeVar("T")
 
-POSE: Final = (1, 1, 0)  # powers of the length in a pose, or in a twist
+POSE_LENGTHS: Final = (1, 1, 0)  # powers of the length in a pose, or in a twist
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,6 @@ class Text(str):
 
     An example is `Text("{place} is {far:.2f} m away", place="the end", far=Length(0.3))`.
     """
-
-    constant: ClassVar = True  # copies of an estimator share it
 
     template: str
     figures: dict[str, Any]  # by their names in the template; a Length or a Text changes with the scale

@@ -18,7 +18,7 @@ from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
-from pathspace_graph.lengths import POSE, times
+from pathspace_graph.lengths import POSE_LENGTHS, times
 
 from .errors import check_type
 from .health import Health
@@ -30,7 +30,7 @@ from .laps import LapCounter
 class CycleResult(Brief):
     """Result of an online estimator in one perception cycle."""
 
-    LENGTHS: ClassVar = {"pose": POSE, "jump": POSE, "notice": 0, "health": 0}
+    LENGTHS: ClassVar = {"pose": POSE_LENGTHS, "jump": POSE_LENGTHS, "notice": 0, "health": 0}
 
     t: float
     """Stamp of the cycle (s)."""
@@ -272,7 +272,7 @@ class _Run:
         self._waited += timed_wait(self._estimator)
         result, seconds, processor = timed_update(self._estimator, odometry, detections)
         lap_before = self._laps.lap
-        lap = self._laps.update(times(np.asarray(result.pose), POSE, 1.0 / scale(self._estimator)))
+        lap = self._laps.update(times(np.asarray(result.pose), POSE_LENGTHS, 1.0 / scale(self._estimator)))
         if lap > lap_before:
             self._lap_maps.append((lap_before, self._estimator.map()))
         self._poses.append(np.array(result.pose, dtype=float))

@@ -176,17 +176,14 @@ ASSIGNED = {
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
     "eval.view.animation": {"writer.fig"},  # of matplotlib
-    "front_end.cone_rows": {"row.ended"},
     "graph.changes": {f"smoother.{part}" for part in ("prior", "submaps", "inactive", "held")}
     | {"smoother.variables.first_cycle"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
     "baselines.landmark_association": {"detections.landmark"},
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},
     "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
-    "loop.open": {"drive.revisits", "drive.closed_by"},
     "mapping.road": {"self.smoother.attached"},
     "mapping.smoother": {"self.window.exact"},
-    "online.fixed_lag": {f"mapper.{part}" for part in ("front_end", "road", "drive", "phase", "health")},
     "commands.options": {"entry.metadata"},  # of dataclasses
     "snapshot": {"array.flags.writeable"},  # of numpy
 }

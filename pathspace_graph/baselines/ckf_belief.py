@@ -10,7 +10,6 @@ from typing import Final, Self
 import numpy as np
 from scipy.linalg import block_diag, lapack
 
-from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.se2 import compose, to_map, to_vehicle
@@ -99,12 +98,6 @@ class Belief:
         known = np.array([*settings.means, *sensor.means])
         belief.mean[POSE : POSE + len(known)] = known
         return belief
-
-    def copy(self) -> Self:
-        other = shallow(self)
-        other.mean = self.mean.copy()
-        other.covariance = self.covariance.copy()
-        return other
 
     @property
     def pose(self) -> Array:

@@ -1,11 +1,10 @@
 """The paper's state, a pose and control points of clamped splines, and its growth (paper: Expansion)."""
 
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.baselines.ckf_belief import Belief, point_columns
-from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
@@ -38,13 +37,6 @@ class CurveState:
         self.belief = belief  # mean and covariance of x
         self.curves: dict[int, BSpline] = {}  # by label; control points: only their number is current
         self.pose_u: dict[int, float] = {}  # parameter of the vehicle's foot point on each curve, not wrapped
-
-    def copy(self) -> Self:
-        other = shallow(self)
-        other.belief = self.belief.copy()
-        other.curves = self.curves.copy()
-        other.pose_u = self.pose_u.copy()
-        return other
 
     @property
     def pose(self) -> Array:
@@ -170,13 +162,6 @@ class Expansion:
         self.observed: dict[int, list[Array]] = {label: [] for label in BOUNDARIES}
         """All distinct cones that were confirmed, as points (2,) in m, map frame, by label."""
         self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # lengths (m) since the last cone
-
-    def copy(self) -> Self:
-        other = shallow(self)
-        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
-        other.observed = {label: known.copy() for label, known in self.observed.items()}
-        other._carried = self._carried.copy()
-        return other
 
     def observe(self, state: CurveState, detections: Detections) -> None:
         """Add all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""

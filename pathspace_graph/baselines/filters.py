@@ -1,6 +1,6 @@
 """The paper's filters: that of splines, which closes its loop, and its landmark baseline (paper: Results)."""
 
-from typing import ClassVar, Final, Self
+from typing import ClassVar, Final
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -43,11 +43,6 @@ class _Filter(OnlineBaseline):
     def _begin(self) -> None:
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
 
-    def copy(self) -> Self:
-        other = super().copy()
-        other.belief = self.belief.copy()
-        return other
-
     def vehicle_state(self) -> VehicleState:
         return scaled(self.belief.vehicle_state(), self.scale)
 
@@ -63,12 +58,6 @@ class CkfMapper(_Filter):
         self.closed = False
         self._recent: list[tuple[Array, Detections]] = []
         self._last_check = 0.0
-
-    def copy(self) -> Self:
-        other = super().copy()
-        other.state, other.path = self.state.copy(), self.path.copy()
-        other.belief, other.expansion = other.state.belief, self.expansion.copy()
-        return other
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         state = self.state
@@ -223,11 +212,6 @@ class LandmarkCkf(_Filter):
         super()._begin()
         self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
-
-    def copy(self) -> Self:
-        other = super().copy()
-        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
-        return other
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         self.belief.follow(reading.motion)

@@ -4,7 +4,7 @@ The loop closes where enough of the landmarks seen now are those of the beginnin
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.lengths import POSE, scaled, times
+from pathspace_graph.lengths import POSE_LENGTHS, scaled, times
 from pathspace_graph.mapping import motion as motions
 from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
@@ -51,12 +51,6 @@ class LandmarkFixedLag(OnlineBaseline):
         self.closed = False
         self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
         self._last_check = 0.0
-
-    def copy(self) -> Self:
-        other = super().copy()
-        other.smoother, other.path = self.smoother.copy(), self.path.copy()
-        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
-        return other
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         motion, detections = reading.motion, reading.detections
@@ -161,7 +155,7 @@ class LandmarkFixedLag(OnlineBaseline):
         return point_map(state.landmarks, state.labels, None, self.closed)
 
     def window_poses(self) -> Array:
-        poses: Array = times(self.smoother.variables.poses.copy(), POSE, self.scale)
+        poses: Array = times(self.smoother.variables.poses.copy(), POSE_LENGTHS, self.scale)
         return poses
 
     def readings(self) -> Readings:

@@ -1,9 +1,7 @@
 """What the online baselines share: the front end that the mapper has too, the scale, and the map's metres."""
 
 from abc import abstractmethod
-from typing import Self
 
-from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
@@ -33,12 +31,6 @@ class OnlineBaseline:
     @abstractmethod
     def _begin(self) -> None:
         """Make what only this estimator has."""
-
-    def copy(self) -> Self:
-        """Return an estimator that goes on independently; what is only ever replaced is shared."""
-        other = shallow(self)
-        other.front_end = self.front_end.copy()
-        return other
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         watch = Stopwatch()

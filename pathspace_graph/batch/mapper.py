@@ -27,7 +27,7 @@ from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, joint_cov
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
-from pathspace_graph.lengths import POSE as POSE_LENGTHS
+from pathspace_graph.lengths import POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import known_noise, size_of_vehicle, with_inflated_priors, with_size
 from pathspace_graph.mapping.orange import OrangeCones, Sighting

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from typing import ClassVar, Final
+from typing import Final
 
 import gtsam
 import numpy as np
@@ -104,8 +104,6 @@ def names(keys: IntArray) -> str:
 
 class Layout:
     """Columns of a flat vector by ascending keys (K,): their widths (K,) and first columns (K,)."""
-
-    constant: ClassVar[bool] = True  # nothing changes but what is cached
 
     def __init__(self, keys: IntArray) -> None:
         self.keys = keys

@@ -14,7 +14,7 @@ from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, label_from_name
-from pathspace_graph.lengths import POSE
+from pathspace_graph.lengths import POSE_LENGTHS
 
 from . import parsing as limits
 from .brief import Brief, pictures
@@ -78,7 +78,7 @@ MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to d
 class Odometry(Brief):
     """Measured body twists, each of which is held until the next."""
 
-    LENGTHS: ClassVar = {"twist": POSE}
+    LENGTHS: ClassVar = {"twist": POSE_LENGTHS}
 
     t: Array
     """Stamps (N,) in s, strictly increasing."""
@@ -145,7 +145,7 @@ class Truth(Brief):
     """What a simulator or a survey knows, for evaluation only; what is not known has no rows."""
 
     LENGTHS: ClassVar = {
-        **{"poses": POSE, "cones": 1, "sensor": (0, 1, 0, 0, 1), "noise": (1, 1, 0, 0, 0, 0)},
+        **{"poses": POSE_LENGTHS, "cones": 1, "sensor": (0, 1, 0, 0, 1), "noise": (1, 1, 0, 0, 0, 0)},
         **{"bend": (-1, 1), "rays": (1, 0, 0)},
     }
 
@@ -181,7 +181,7 @@ class Log:
 
     LENGTHS: ClassVar = {
         **dict.fromkeys(("odometry", "cycles", "sensor", "measured", "truth"), 0),
-        "odometry_sigma": POSE,
+        "odometry_sigma": POSE_LENGTHS,
     }
 
     odometry: Odometry

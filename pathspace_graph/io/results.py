@@ -16,7 +16,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
-from pathspace_graph.lengths import POSE, scaled
+from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
 from .brief import Brief, frames
 from .files import atomic_folder, write_json
@@ -77,7 +77,7 @@ CYCLE_COLUMNS: Final = {  # columns of `cycles.csv` with their types; any furthe
 class CycleRecord:
     """One row of `cycles.csv` (FORMATS)."""
 
-    LENGTHS: ClassVar = {"jump": POSE, "notice": 0, "reason": 0}
+    LENGTHS: ClassVar = {"jump": POSE_LENGTHS, "notice": 0, "reason": 0}
 
     cycle: int
     """Number of the perception cycle, from 0."""
@@ -116,8 +116,8 @@ class CycleRecord:
 class VehicleState(Brief):
     """What an estimator believes of the vehicle: its pose, and the calibration of its odometry."""
 
-    LENGTHS: ClassVar = {"pose": POSE, "sensor": (0, 1, 0, 0, 1)}
-    COVARIANCES: ClassVar = {"covariance": (*POSE, 0, 0), "sensor_covariance": (0, 1, 0, 0, 1)}
+    LENGTHS: ClassVar = {"pose": POSE_LENGTHS, "sensor": (0, 1, 0, 0, 1)}
+    COVARIANCES: ClassVar = {"covariance": (*POSE_LENGTHS, 0, 0), "sensor_covariance": (0, 1, 0, 0, 1)}
 
     pose: Array
     """Pose [x, y, theta] (3,) in m and rad, map frame; theta isn't wrapped."""
@@ -181,7 +181,7 @@ class RunResult:
 
     LENGTHS: ClassVar = {
         **dict.fromkeys(("map", "cycles", "lap_maps", "snapshots", "vehicle", "noise"), 0),
-        **{"trajectory": POSE, "smoothed": POSE, "reach": (1, 2, 0), "scale": 1},
+        **{"trajectory": POSE_LENGTHS, "smoothed": POSE_LENGTHS, "reach": (1, 2, 0), "scale": 1},
     }
 
     estimator: str

@@ -20,6 +20,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .closing import go_on_from
 from .drive_record import DriveRecord
 from .lap_solver import LapSolver, Outcome
+from .revisit import lay_on
 
 REST: Final = 10.0  # distance for which only the road is mapped after a failure (m)
 LEARNED: Final = "the drive contradicts the calibration, which is learned"
@@ -90,11 +91,23 @@ class Drive:
         smoother = road.smoother
         return self.solver.outcome(road.next_cycle - 1, smoother.times, smoother.first_cycle, spent)
 
+    def close(self, road: Road, solved: LapMarginal, returned_by: Revisit | None) -> Array:
+        """Close the loop of an open road by the batch that a return has begun; return the jump (3,)."""
+        self.closed_by = returned_by
+        return self.go_on_from(road, solved)
+
     def go_on_from(self, road: Road, solved: LapMarginal) -> Array:
         """Replace map and prior of a road by a batch's; return the jump (3,) of the newest pose."""
         jump = go_on_from(road.smoother, solved)
         self.lap_seconds = solved.seconds
         self.replace_poses(road, np.concatenate([solved.poses[: solved.first_kept], road.poses]))
+        return jump
+
+    def lay_on(self, road: Road, revisit: Revisit) -> Array:
+        """Lay an open road on its earlier pass; return the jump (3,) of the newest pose."""
+        jump = lay_on(road, self.record, revisit)
+        self.revisits = (*self.revisits, revisit)
+        road.place_orange(self.record.corrected)
         return jump
 
     def replace_poses(self, road: Road, poses: Array) -> None:

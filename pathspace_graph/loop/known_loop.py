@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -37,8 +37,6 @@ class Loop:
     mapped: Mapping[int, BoolArray]  # whether each of these lies between detected cones (`is_mapped`)
 
     begins: Mapping[int, float]  # parameter of the first of them (m)
-
-    constant: ClassVar[bool] = True
 
     def at(self, stations: Array) -> Array:
         """Return the points of the middle at stations of any shape, as complex numbers x + i y."""

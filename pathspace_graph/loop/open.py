@@ -19,7 +19,7 @@ from .drive import Drive, Phase, Step
 from .known_loop import evidence_of
 from .lap_solver import Outcome
 from .returns import ReturnFinder
-from .revisit import Revisits, lay_on
+from .revisit import Revisits
 from .worker import Unsolved
 
 OWN_PRIOR: Final = "the map goes on from the window's own prior"  # begins the notice where no batch came
@@ -74,7 +74,10 @@ class Open:
             outcome = drive.outcome(road, spent)
             return Step(self) if outcome is None else self.take(road, drive, outcome)
         revisit = self.revisits.find(road, drive.record, reading.noise)
-        return Step(self) if revisit is None else self._lay_on(road, drive, revisit)
+        if revisit is None:
+            return Step(self)
+        notice = "" if drive.revisits else REVISITED  # it is said once
+        return Step(self, drive.lay_on(road, revisit), notice)
 
     def _begin_batch(self, road: Road, drive: Drive, reading: Reading, found: RefinedMotion | None) -> None:
         """Send the lap to a batch where the newest detections, cones or curves lie on earlier ones.
@@ -101,13 +104,6 @@ class Open:
             drive.record.give_up("the lap has too many cones for a batch")
         return drive.record.unsolvable is None
 
-    def _lay_on(self, road: Road, drive: Drive, revisit: Revisit) -> Step:
-        """Lay the open map on an earlier pass; the notice says so once."""
-        jump, is_first = lay_on(road, drive.record, revisit), not drive.revisits
-        drive.revisits = (*drive.revisits, revisit)
-        road.place_orange(drive.record.corrected)
-        return Step(self, jump, REVISITED if is_first else "")
-
     # --- closing -----------------------------------------------------------------------------------------
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
@@ -120,8 +116,7 @@ class Open:
         if outcome.objection:
             return Step(self, notice=joined([STAYS_OPEN, outcome.objection], ": "))
         road.smoother.settle()
-        jump = drive.go_on_from(road, outcome)
-        drive.closed_by = self.returned_by
+        jump = drive.close(road, outcome, self.returned_by)
         return Step(Closed(road, drive), jump)
 
     def _close_by_prior(self, road: Road, drive: Drive, found: RefinedMotion) -> Step:

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from pathspace_graph.batch.start import REVISIT_INTERVAL
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import (
     compose,
@@ -55,7 +56,6 @@ from .closing import SIGMA_STEP
 from .drive_record import DriveRecord
 
 REVISIT_ATTEMPTS: Final = 3.0  # least distance of two attempts (m along the path)
-REVISIT_INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
 RETURN: Final = 30.0  # least length of the path between both passes (m)
 RADIUS: Final = 4.0  # largest distance of both passes, as the map has them (m)
 DIVERGED: Final = 8.0  # distance that the ways to the place must have had, as seen from the place (m)

@@ -13,8 +13,7 @@ from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.graph.variables import name, pose_key
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import LapBatches, VehicleState
-from pathspace_graph.lengths import POSE as POSE_LENGTHS
-from pathspace_graph.lengths import scaled, times
+from pathspace_graph.lengths import POSE_LENGTHS, scaled, times
 from pathspace_graph.loop.drive import Drive, Phase
 from pathspace_graph.loop.lost import Lost
 from pathspace_graph.mapping.motion import vehicle_state

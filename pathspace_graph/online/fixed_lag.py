@@ -45,12 +45,6 @@ class _Before:
         front_end, road = mapper.front_end.copy(), mapper.road.copy()
         return cls(front_end, road, mapper.drive.copy(), mapper.phase.copy(), mapper.health)
 
-    def give_back(self, mapper: "FixedLagMapper") -> None:
-        """Set a mapper back; what was before stays, for another failure."""
-        mapper.front_end, mapper.road = self.front_end.copy(), self.road.copy()
-        mapper.drive, mapper.phase = self.drive.copy(), self.phase.copy()
-        mapper.health = self.health
-
 
 class FixedLagMapper(MapperEstimate):
     """Both boundaries of a track, mapped cycle by cycle as splines in one factor graph with the poses.
@@ -104,15 +98,13 @@ class FixedLagMapper(MapperEstimate):
         and takes it again with less, as the notice says, and `failures` counts.
         """
         factors = tuple(factors)
-        cycle, unused = self._admit(odometry, detections, factors), self._unused
-        if unused is not None:
-            cycle = replace(cycle, odometry=unused.followed_by(cycle.odometry))
+        cycle = self._admit(odometry, detections, factors)
         before = _Before.of(self)
         try:
             result = self._process(cycle, factors)
         except Exception as error:  # a vehicle drives on, whatever has failed
             if strict:
-                before.give_back(self)
+                self._go_back(before)
                 raise
             result = self._without(before, cycle, factors, error)
         else:
@@ -158,7 +150,7 @@ class FixedLagMapper(MapperEstimate):
         blind = replace(cycle, detections=seen.where(np.zeros(len(seen.labels), bool)))
         attempts = {"the loop is left as it is": cycle, "its detections are not used": blind}
         for consequence, attempt in attempts.items():
-            before.give_back(self)
+            self._go_back(before)
             self.drive.rest(self.road)
             try:
                 result = self._process(attempt, factors)
@@ -166,9 +158,15 @@ class FixedLagMapper(MapperEstimate):
                 continue
             self._unused = None
             return replace(result, notice=joined([failed, consequence, result.notice]))
-        before.give_back(self)
+        self._go_back(before)
         self._unused = cycle.odometry
         return self._result(cycle.detections.t, {}, None, f"{failed}; the cycle is not used")
+
+    def _go_back(self, before: _Before) -> None:
+        """Take a cycle back; what was before stays, for another failure."""
+        self.front_end, self.road = before.front_end.copy(), before.road.copy()
+        self.drive, self.phase = before.drive.copy(), before.phase.copy()
+        self.health = before.health
 
     def _admit(
         self, odometry: Odometry, detections: Detections, factors: Sequence[gtsam.NonlinearFactor]
@@ -178,7 +176,8 @@ class FixedLagMapper(MapperEstimate):
         except SettingsError:
             self.front_end.gate.refuse()
             raise
-        return self.front_end.admit(odometry, detections)
+        cycle, unused = self.front_end.admit(odometry, detections), self._unused
+        return cycle if unused is None else replace(cycle, odometry=unused.followed_by(cycle.odometry))
 
     def finish(self) -> None:
         """Take the result of a batch that is under way, where the drive is over and no cycle follows.

@@ -15,7 +15,7 @@ from pathspace_graph.front_end.measurement import DRIFT, LEAST_NOISE
 from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_UNKNOWN, TwistRecord
 from pathspace_graph.io.log import CALIBRATION, Log
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
-from pathspace_graph.lengths import POSE, Length, Text, joined, scaled
+from pathspace_graph.lengths import POSE_LENGTHS, Length, Text, joined, scaled
 from pathspace_graph.spline.crossing import Crossing, crossed_boundaries
 
 from .hint import Hint, told
@@ -160,7 +160,7 @@ def _odometry(log: Log) -> list[Hint]:
 
 def _scatter(component: int, value: float, stated: float) -> Text:
     """Return that a component of the twist scatters by a value where another one is stated."""
-    (name, unit), power = list(TWIST.items())[component], POSE[component]
+    (name, unit), power = list(TWIST.items())[component], POSE_LENGTHS[component]
     template = "{name} scatters by {value:.2g} {unit}, where {stated:.2g} is stated"
     return Text(template, name=name, unit=unit, value=Length(value, power), stated=Length(stated, power))
 

@@ -33,7 +33,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.lengths import POSE, Length, Text, joined, scaled, times
+from pathspace_graph.lengths import POSE_LENGTHS, Length, Text, joined, scaled, times
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.diagnosis import diagnose, measured_line
 from pathspace_graph.plausibility.judge import hints
@@ -326,7 +326,7 @@ def test_what_an_estimator_is_asked_for_has_the_size_of_the_scene(name: str) -> 
     assert asked >= {"map", "outline", "vehicle_state", "noise_used"}
     for method in asked:
         known, found = getattr(one, method)(), getattr(ten, method)()
-        assert_same(found, times(known, POSE, 10.0))
+        assert_same(found, times(known, POSE_LENGTHS, 10.0))
     if isinstance(one, FixedLagMapper):
         assert_same(ten.ahead(50.0, 10.0), scaled(one.ahead(5.0), 10.0))
 

@@ -16,7 +16,6 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.path import CARRIED_TO, DrivenPath, PathAhead
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 
-from ...scenes.digest import digest
 from .scenes import detections_of, straight_rows
 
 Array = NDArray[np.float64]
@@ -143,17 +142,3 @@ def test_each_confirmed_cone_is_observed_once() -> None:
     _, expansion = expanded(straight_rows(), np.array([[16.5, 2.0], [18.5, 2.0]]), times=6)
     assert len(expansion.observed[LEFT]) == 2 and len(expansion.observed[RIGHT]) == 0
     np.testing.assert_allclose(np.sort(np.array(expansion.observed[LEFT])[:, 0]), [16.5, 18.5], atol=1e-9)
-
-
-def test_what_is_observed_later_is_not_in_a_copy() -> None:
-    state = straight_rows()
-    _, expansion = expanded(state, np.array([[16.0, 2.0]]))
-    copy = expansion.copy()
-    before = digest(copy)
-    assert before == digest(expansion)
-    seen = detections_of(np.array([[6.0, 2.0], [10.0, 2.0]]))
-    for k in range(3):
-        expansion.observe(state, replace(seen, t=0.5 + 0.1 * k))
-    free, path_ahead = np.zeros(0, bool), path_along_x(30.0, state.settings)
-    assert LEFT in expansion.expand(state, detections_of(np.zeros((0, 2))), path_ahead, free)
-    assert digest(copy) == before and len(expansion.observed[LEFT]) > len(copy.observed[LEFT])

@@ -12,7 +12,6 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 
-from ...scenes.digest import digest
 from .scenes import COVARIANCE, around, begin, bend, straight_rows
 
 Array = NDArray[np.float64]
@@ -126,15 +125,3 @@ def test_a_lost_vehicle_is_found_again_on_a_closed_curve() -> None:
     state.pose_u[LEFT] = expected + 30.0
     state.locate_vehicle()
     assert state.pose_u[LEFT] % 60.0 == pytest.approx(expected % 60.0, abs=1e-3)
-
-
-def test_what_the_filter_does_leaves_its_copy_as_it_was() -> None:
-    state = straight_rows()
-    copy = state.copy()
-    before = digest(copy)
-    assert before == digest(state)
-    state.belief.update(np.array([0]), lambda x: x, np.array([0.1]), np.eye(1))
-    state.replace(RIGHT, state.curves[RIGHT].with_points(np.zeros((4, 2))), np.eye(4), 0.1)
-    state.pose_u[LEFT] = 9.0
-    state.extend(LEFT, np.array([16.0, 2.0]), COVARIANCE)
-    assert digest(copy) == before and copy.curves[LEFT].size == 4
