@@ -88,7 +88,7 @@ def test_a_length_of_a_wrong_type_is_named() -> None:
     log, result = drive()
     with pytest.raises(SettingsError, match=r"step: expected a number of at least .*, found 'far'"):
         result.map.centre_line("far")  # type: ignore[arg-type]
-    with pytest.raises(SettingsError, match=r"distance: expected a number \(m\), found None"):
+    with pytest.raises(SettingsError, match=r"distance: expected a positive number \(m\), found None"):
         FixedLagMapper(None, log.odometry_sigma).ahead(None)  # type: ignore[arg-type]
 
 

@@ -112,3 +112,12 @@ def test_late_detections_stand_behind_those_of_their_cycle(kind: type[DetectionC
     assert table.label.tolist() == [LEFT, RIGHT, UNKNOWN, RIGHT, UNKNOWN, LEFT, LEFT, LEFT]
     assert table.append(cycle(RIGHT), 1) == slice(3, 4)
     assert table.cycle.tolist() == [0, 0, 0, 1, 2, 2, 2, 3, 3]
+
+
+@pytest.mark.parametrize("column", ["boundary", "u", "used", "station", "changed"])
+def test_associations_of_a_copy_change_alone(column: str) -> None:
+    table = DetectionTable.of(CYCLES)
+    other, known = table.copy(), getattr(table, column).copy()
+    getattr(other, column)[:] = known == 0
+    assert (getattr(other, column) != known).any()
+    np.testing.assert_array_equal(getattr(table, column), known)

@@ -260,7 +260,7 @@ def test_an_earlier_snapshot_is_kept_as_a_backup(file: Path) -> None:
     before = file.read_bytes()
     FixedLagMapper(odometry_sigma=ODOMETRY_SIGMA).save(file)
     assert file.with_name("mapper.snap.~1~").read_bytes() == before
-    assert FixedLagMapper.restore(file).smoother.next_cycle == 0
+    assert FixedLagMapper.restore(file).road.smoother.next_cycle == 0
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.5, 0.999])

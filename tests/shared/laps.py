@@ -1,4 +1,4 @@
-"""Laps that online mappers close: each is solved once a session, in place of by a process of every worker."""
+"""Laps that online mappers close: each is solved once a session, by the process of one worker."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ IN_A_PROCESS = worker.submit
 
 
 def solved(lap: OpenLap) -> LapMarginal:
-    """Returns a marginal of its own for each caller, as another process does."""
-    content = pickle.dumps(lap)
-    return pickle.loads(once(lambda: pickle.dumps(solve_lap(pickle.loads(content))), "lap", content))  # type: ignore[no-any-return]
+    """Returns a marginal of its own for each caller; what a test patches does not reach the process."""
+    marginal = once(lambda: pickle.dumps(IN_A_PROCESS(solve_lap, lap).result()), "lap", pickle.dumps(lap))
+    return pickle.loads(marginal)  # type: ignore[no-any-return]
 
 
 def submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """In place of `worker.submit`: a lap is solved at once, and all other work is done by the process."""
+    """In place of `worker.submit`: a lap that was solved before is not handed to the process again."""
     future: Future[Any] = loky.Future()
     if work is worker.nothing:
         future.set_result(None)
