@@ -32,9 +32,9 @@ def test_what_was_measured_is_said(
     printed = capsys.readouterr().out
     (line,) = (line for line in printed.splitlines() if line.startswith("measured: "))
     assert "m along and" in line
-    assert "ms early" in line
+    assert "ms newer than their stamps" in line
     assert "degrees to the right" in line
-    assert "ranges +" in line
+    assert "% too long" in line
     run("online", tmp_path / "log", "--out", tmp_path / "map")
     printed = capsys.readouterr().out
     assert "measured: odometry" in printed

@@ -72,7 +72,9 @@ def variance_of_residual(mapper: FixedLagMapper) -> float:
     On a straight along x the gradient is (0, 1, AHEAD) by the pose, and minus the basis by the control
     points' y. The next pose is the last one with one cycle of odometry.
     """
-    step = integrate_twists(np.full(CYCLE, DT), ahead(SPEED, CYCLE * DT), mapper.odometry_sigma)
+    step = integrate_twists(
+        np.full(CYCLE, DT), ahead(SPEED, CYCLE * DT), mapper.front_end.noise.known.odometry
+    )
     x = mapper.poses[-1, 0] + step.delta[0] + AHEAD
     keys = mapper.control_keys(LEFT)
     spline = mapper.boundaries[LEFT].spline(mapper.control_points(LEFT))
@@ -87,7 +89,7 @@ def variance_of_residual(mapper: FixedLagMapper) -> float:
 def test_the_gate_is_three_sigmas_of_detection_pose_and_curve_together() -> None:
     """The odometry of the cycle is so poor that the detection's own uncertainty is half of the variance."""
     mapper = driven()
-    mapper.odometry_sigma[:] = [0.25, 6.0, 0.035]
+    mapper.front_end.noise.known.odometry[:] = [0.25, 6.0, 0.035]
     variance = variance_of_residual(mapper)
     assert variance > 1.8 * OWN_VARIANCE
     shares = [-1.5, -1.03, -0.97, -0.3, 0.0, 0.5, 0.97, 1.03, 1.5]
