@@ -176,6 +176,7 @@ OWN = "pathspace_graph.mapping.path"
         (Calls(DrivenPath), f"found {OWN}.DrivenPath"),
         (Calls(MapperSettings), "found pathspace_graph.settings.mapper.MapperSettings"),
         (Calls(new, "os", "system"), "found 'os.system'"),
+        (Calls(new, "pathlib", "Path"), "found 'pathlib.Path'"),
         (Calls(new, "pathspace_graph.io.files", "Path"), "found 'pathspace_graph.io.files.Path'"),
         (Calls(new, OWN, "np"), f"found '{OWN}.np'"),
         (Calls(new, OWN, "Text"), f"found '{OWN}.Text'"),

@@ -14,7 +14,7 @@ from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop import map_repair
+from pathspace_graph.loop import closed, map_repair
 from pathspace_graph.loop.drive import Drive
 from pathspace_graph.loop.known_loop import KnownLoop
 from pathspace_graph.loop.map_repair import REPAIRED, ContradictedStretch, carried, led_through, newest_lap
@@ -115,11 +115,15 @@ def test_the_record_has_the_pose_of_every_cycle_in_the_frame_of_the_mended_map()
     assert np.hypot(*(poses - true_poses(clean()))[:, :2].T).max() < 0.3
 
 
-def test_a_map_that_does_not_explain_the_contradictions_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("why", ["it explains too few", "its boundaries cross"])
+def test_a_map_that_does_not_explain_the_contradictions_or_is_worse_is_refused(
+    why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is asked for more of them than there are."""
-    monkeypatch.setattr(map_repair, "EXPLAINED", 2.0)
+    """It is asked to explain more of them than there are, or its boundaries are said to cross."""
+    if why == "it explains too few":
+        monkeypatch.setattr(map_repair, "EXPLAINED", 2.0)
+    else:
+        monkeypatch.setattr(closed, "_crosses", lambda *road_drive_splines: len(road_drive_splines) > 2)
     mapper, results = map_log(holed(), *map_beginning(holed(), LAP))
     jumps = [result.t for result in results if result.jump is not None]
     assert len(jumps) == 1  # the swap of the open lap
