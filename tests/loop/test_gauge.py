@@ -134,6 +134,20 @@ def test_the_map_is_held_after_the_laps_that_were_set_and_its_shape_is_not() -> 
     assert np.trace(claimed) > np.trace(free.road.smoother.covariance(known.keys))
 
 
+def test_the_gauge_is_held_that_many_laps_after_the_swap() -> None:
+    mapper, at = run(np.inf, 0.3 * mid()), dict[str, float]()
+    mapper.settings = mapper.road.settings = with_laps(0.4)
+    while "held" not in at:
+        newest = mapper.road.smoother.next_cycle
+        result = replay(mapper, *next(islice(split_odometry(log()), newest, None)))
+        if result.jump is not None:
+            at["swap"] = mapper.road.path.length
+        if mapper.road.smoother.held is not None:
+            at["held"] = mapper.road.path.length
+    longest = max(boundary.length for boundary in mapper.road.boundaries.values())
+    assert 0.4 * longest < at["held"] - at["swap"] < 0.4 * longest + 2.0
+
+
 def held_since() -> float:
     """The stamp by which the gauge was held: one more lap after the swap, and a little more."""
     return 0.7 * log().cycles[-1].t
