@@ -15,8 +15,8 @@ from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop import closed, map_repair
+from pathspace_graph.loop.closed import Closed
 from pathspace_graph.loop.drive import Drive
-from pathspace_graph.loop.known_loop import KnownLoop
 from pathspace_graph.loop.map_repair import REPAIRED, ContradictedStretch, carried, led_through, newest_lap
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
@@ -173,7 +173,10 @@ def test_cones_are_carried_by_the_pose_next_to_them() -> None:
 
 
 def test_known_gaps_are_gone_after_mending() -> None:
-    assert KnownLoop().of(repaired()[0].road.smoother).with_gaps() == []
+    """The phase has laid out the map with its hole before, and lays out the one that has replaced it."""
+    mapper, _ = repaired()
+    assert isinstance(mapper.phase, Closed)
+    assert mapper.phase.known_loop.of(mapper.road.smoother).with_gaps() == []
 
 
 # --- a whole drive ---------------------------------------------------------------------------------------
