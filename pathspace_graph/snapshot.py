@@ -7,7 +7,9 @@ of our own classes without its constructor, and `MAKERS`. The version of the pac
 
 import io
 import pickle
+import pickletools
 import sys
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import cached_property
@@ -41,6 +43,16 @@ ROOMS: Final = tuple(  # rooms and modules whose classes estimators are made of
     )
 )
 DTYPES: Final = ("<f8", "<i8", "|b1", "<i4", "<u8", "|u1", "|i1")
+OPERATIONS: Final = frozenset(
+    (
+        *("PROTO", "FRAME", "MARK", "MEMOIZE", "BINGET", "LONG_BINGET", "REDUCE", "BUILD", "STOP"),
+        *("NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT"),
+        *("SHORT_BINBYTES", "BINBYTES", "SHORT_BINUNICODE", "BINUNICODE", "STACK_GLOBAL"),
+        *("EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_LIST", "APPEND", "APPENDS"),
+        *("EMPTY_DICT", "SETITEM", "SETITEMS", "EMPTY_SET", "ADDITEMS", "FROZENSET"),
+    )
+)
+"""Operations of pickles that `save` writes."""
 FORMAT_ERRORS: Final = (  # of a file that does not fit together; they include Recursion- and UnicodeError
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, MemoryError),
     *(OSError, EOFError, ImportError, pickle.UnpicklingError),
@@ -61,6 +73,7 @@ def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
     file = Path(path)
     content = _verified(file)
     try:
+        _check_operations(content)
         trial, found = (_Unpickler(io.BytesIO(content)).load() for _ in range(2))
         if type(found) is not kind:
             raise TypeError(f"found a {type(found).__name__}")
@@ -69,6 +82,18 @@ def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
         told = " ".join(str(error).split())
         raise InputError(file, f"expected a {kind.__name__}: {type(error).__name__}: {told}"[:400]) from error
     return found
+
+
+def _check_operations(content: bytes) -> None:
+    """Raise an UnpicklingError where a pickle has an operation that `save` does not write.
+
+    Others reserve memory by a number in the file, or warn of a text.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for operation, _, at in pickletools.genops(content):
+            if operation.name not in OPERATIONS:
+                raise pickle.UnpicklingError(f"expected no {operation.name}, found one at byte {at}")
 
 
 def _verified(file: Path) -> bytes:

@@ -209,6 +209,17 @@ def test_what_is_no_pickle_is_refused_in_one_line(content: bytes, tmp_path: Path
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [(b"Nr\xff\xff\xff\x07.", "LONG_BINPUT"), (b"S'\\_'\n.", "STRING"), (b"c\n\n.", "GLOBAL")],
+)
+def test_an_operation_that_is_never_written_is_refused(content: bytes, found: str, tmp_path: Path) -> None:
+    """One of these would reserve a gigabyte of memory, and one would warn."""
+    write(tmp_path / "a.snap", content)
+    with pytest.raises(InputError, match=f"expected no {found}, found one at byte"):
+        restore(tmp_path / "a.snap", DrivenPath, id)
+
+
 def test_no_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.snap", tmp_path):
         with pytest.raises(InputError, match="expected a snapshot, found"):
