@@ -45,7 +45,7 @@ class Closed:
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
     ) -> tuple[Phase, Health]:
         """Judge the estimate and the map by the tested detections; a vehicle may be lost from here on."""
-        smoother, is_whole = road.smoother, set(road.boundaries) == set(BOUNDARIES)
+        smoother, is_whole = road.smoother, road.has_both_boundaries
         known = self.known_loop if is_whole else None
         health = drive.monitor.update(evidence_of(smoother, classified.tested, known, reading))
         if health.condition == GOOD and self._boundaries_cross:
@@ -85,8 +85,7 @@ class Closed:
 
     def _repair(self, road: Road, drive: Drive, reading: Reading) -> None:
         """Send the drive to a batch where cones contradict the map."""
-        is_whole = set(road.boundaries) == set(BOUNDARIES)
-        if not is_whole or drive.record.unsolvable is not None:
+        if not road.has_both_boundaries or drive.record.unsolvable is not None:
             return
         t, driven = reading.detections.t, road.path.length
         if self.map_repair.is_due(self.known_loop, road.smoother, t, driven):

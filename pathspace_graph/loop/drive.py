@@ -100,7 +100,8 @@ class Drive:
         """Replace map and prior of a road by a batch's; return the jump (3,) of the newest pose."""
         jump = go_on_from(road.smoother, solved)
         self.lap_seconds = solved.seconds
-        self.replace_poses(road, np.concatenate([solved.poses[: solved.first_kept], road.poses]))
+        self.record.replaced(np.concatenate([solved.poses[: solved.first_kept], road.poses]))
+        road.place_orange(self.record.corrected)
         return jump
 
     def lay_on(self, road: Road, revisit: Revisit) -> Array:
@@ -109,11 +110,6 @@ class Drive:
         self.revisits = (*self.revisits, revisit)
         road.place_orange(self.record.corrected)
         return jump
-
-    def replace_poses(self, road: Road, poses: Array) -> None:
-        """Replace the poses (P, 3) of all cycles, and place by them what is only seen from poses."""
-        self.record.replaced(poses)
-        road.place_orange(self.record.corrected)
 
 
 @dataclass(frozen=True, eq=False)

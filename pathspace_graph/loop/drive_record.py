@@ -25,6 +25,7 @@ from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings
 
 T = TypeVar("T")
+C = TypeVar("C", bound=DetectionColumns)
 
 
 def bend(poses: Array, known: Mapping[int, Array]) -> Array:
@@ -146,9 +147,7 @@ class DriveRecord:
             chosen = [self._measured[k] for k in cycles.tolist()]
             twists = np.array([one.motion.odometry.twist for one in chosen]).reshape(-1, POSE)
             table = DetectionColumns.of([one.seen.with_others(one.orange) for one in chosen], twists=twists)
-            known = noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
-            table = replace(table, measured=known.points_vehicle, covariance=known.covariances)
-            table = replace(table, cycle=cycles[table.cycle])
+            table = replace(_for_map(table, noise), cycle=cycles[table.cycle])
             table.correct(sensor)
             return table
 
@@ -162,6 +161,10 @@ class DriveRecord:
         motions = noise.motions_of_lap([one.motion for one in cycles])
         chain = chained([*self.stamps], motions, settings.odometry)
         table = DetectionTable.of([one.seen for one in cycles], twists=chain.twists)
-        seen = noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
-        table = replace(table, measured=seen.points_vehicle, covariance=seen.covariances)
-        return OpenLap(settings, chain, table, first_kept, start)
+        return OpenLap(settings, chain, _for_map(table, noise), first_kept, start)
+
+
+def _for_map(table: C, noise: NoiseLearner) -> C:
+    """Return a table as it counts in a map, with the noise that is known now."""
+    known = noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
+    return replace(table, measured=known.points_vehicle, covariance=known.covariances)

@@ -6,7 +6,6 @@ from typing import Final, Self
 from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, Health, HealthMonitor
-from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -57,23 +56,24 @@ class Lost:
         if drive.rests(road):
             self.new_road = None
             return Step(self)
-        health = self._map_new_road(road, drive, reading)
+        sees_road = self._map_new_road(road, drive, reading)
         found = self.search.find(road)
         if found is None:
-            step = self._on_new_road(health)
-        else:
-            first_cycle = max(self.search.first_cycle, road.smoother.first_cycle)
-            drive.monitor.restart()
-            jump = start_anew(road.smoother, first_cycle, found)
-            step = Step(self.closed, jump, FOUND, Health(DEGRADED, FOUND))
-        return step
+            return self._go_on(self.search.is_off_map and sees_road)
+        first_cycle = max(self.search.first_cycle, road.smoother.first_cycle)
+        drive.monitor.restart()
+        jump = start_anew(road.smoother, first_cycle, found)
+        return Step(self.closed, jump, FOUND, Health(DEGRADED, FOUND))
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
         """Leave the map as it is."""
         return Step(self)
 
-    def _map_new_road(self, road: Road, drive: Drive, reading: Reading) -> Health:
-        """Map the road beside the vehicle as an open one, with the calibration as it is known."""
+    def _map_new_road(self, road: Road, drive: Drive, reading: Reading) -> bool:
+        """Map the road beside the vehicle as an open one, with the calibration as it is known.
+
+        Return whether both boundaries are there, and the estimate is good.
+        """
         if self.new_road is None:
             self.new_road, self._monitor = Road(_as_known(road, drive)), HealthMonitor()
         new = self.new_road
@@ -85,17 +85,12 @@ class Lost:
         new.expand()
         new.update()
         new.marginalize()
-        return health
+        ends = [boundary.confirmed_end for boundary in new.boundaries.values()]
+        return new.has_both_boundaries and min(ends) > ROAD and health.condition == GOOD
 
-    def _on_new_road(self, health: Health) -> Step:
-        """Return whether the vehicle has left the map: no place of it agrees, but there is a good road."""
-        ends = (
-            [boundary.confirmed_end for boundary in self.new_road.boundaries.values()]
-            if self.new_road
-            else []
-        )
-        sees_road = len(ends) == len(BOUNDARIES) and min(ends) > ROAD and health.condition == GOOD
-        before, is_new = self._health, self.search.is_off_map and sees_road
+    def _go_on(self, is_new: bool) -> Step:
+        """Go on searching; on new road, where no place of the map agrees, the vehicle is not lost."""
+        before = self._health
         self._health = Health(DEGRADED, NEW_ROAD) if is_new else self._lost
         notice = NEW_ROAD if is_new and before == self._lost else ""
         return Step(self, notice=notice, health=self._health)

@@ -7,7 +7,6 @@ from typing import Final, Self
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotated
@@ -172,10 +171,14 @@ class DetectionTable(DetectionColumns):
 
     def copy(self) -> Self:
         """Return a table whose associations can change independently; other columns are only replaced."""
-        other = shallow(self)
-        for column in ("boundary", "u", "used", "station", "changed"):
-            vars(other)[column] = vars(self)[column].copy()
-        return other
+        return replace(
+            self,
+            changed=self.changed.copy(),
+            boundary=self.boundary.copy(),
+            u=self.u.copy(),
+            used=self.used.copy(),
+            station=self.station.copy(),
+        )
 
     @property
     def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array]:

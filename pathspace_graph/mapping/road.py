@@ -12,6 +12,7 @@ import gtsam
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Detections
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
@@ -116,6 +117,10 @@ class Road:
     def boundaries(self) -> dict[int, Boundary]:
         """Return the curves by label."""
         return self.smoother.map.state.boundaries
+
+    @property
+    def has_both_boundaries(self) -> bool:
+        return set(self.boundaries) == set(BOUNDARIES)
 
     @property
     def poses(self) -> Array:

@@ -7,7 +7,6 @@ import numpy as np
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import TOLERANCES, FootPoints
-from pathspace_graph.graph.inactive import Attached
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import pose_keys
@@ -35,11 +34,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
     def __init__(self, settings: MapperSettings) -> None:
         super().__init__(smoother_settings(settings), CurveMap(settings))
         self.window.exact = True
-        self.attach(self.map)
-
-    def attach(self, *attached: Attached) -> None:
-        """Move these together with the open map."""
-        self.attached += attached
+        self.attached = [self.map]
 
     def settle(self) -> None:
         """Relinearize only what moves from now on: once the loop has closed, hardly anything does."""
