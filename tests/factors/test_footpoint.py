@@ -96,7 +96,7 @@ def test_no_point_of_a_dense_grid_is_nearer(
     longest_step = np.linalg.norm(np.diff(grid, axis=0), axis=1).max() * 10
     assert (found <= to_grid.min(axis=1) + longest_step).all()
     # between two points of the search's own grid, a nearer piece of a polygon may be missed
-    assert (found <= to_grid.min(axis=1) + 1e-6).mean() > 0.75
+    assert (found <= to_grid.min(axis=1) + 1e-6).mean() > (0.9 if tables.degree > 1 else 0.75)
 
 
 @settings(max_examples=80, deadline=None)
