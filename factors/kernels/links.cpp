@@ -1,9 +1,44 @@
-// Links of the inactive map (`graph/inactive.py`).
+// Relative factors and the links of the inactive map (`graph/relative.py`, `graph/inactive.py`).
 
 #include "common.hpp"
 
 namespace kernels {
 namespace {
+
+Columns relative_block(const Array& root, const Array& right, const Array& local, const Array& values,
+                       const Array& change, const py::handle& keys) {
+  const Index r = root.shape(0), q = local.shape(0), width = q + 3;
+  expect(root.size() == r * q && right.size() == r && values.size() == width && change.size() == width);
+  const Ints turning = keys.attr("turning").cast<Ints>(), headings = keys.attr("headings").cast<Ints>();
+  const double* frame = values.data() + q;
+  const Turn turn(frame[2]);
+  std::vector<double> there(values.data(), frame), off(q);
+  to_frame(there.data(), turning, headings, frame, turn);
+  for (Index j = 0; j < q; ++j) off[j] = there[j] - local.data()[j];
+  Columns block(Shape{r, width + 1});
+  std::vector<double> row(width);
+  double* J = row.data();
+  for (Index i = 0; i < r; ++i) {
+    const double* A = root.data() + i * q;
+    double sum = -right.data()[i], by[3] = {0.0, 0.0, 0.0}, now = 0.0;
+    for (Index j = 0; j < q; ++j) sum += A[j] * off[j];
+    std::copy_n(A, q, J);
+    for (Index k = 0; k < turning.size(); ++k) {
+      const Index x = turning.data()[k];
+      J[x] = A[x] * turn.c - A[x + 1] * turn.s, J[x + 1] = A[x] * turn.s + A[x + 1] * turn.c;
+      by[0] -= J[x], by[1] -= J[x + 1];
+      by[2] += A[x] * there[x + 1] - A[x + 1] * there[x];
+    }
+    for (Index k = 0; k < headings.size(); ++k) by[2] -= A[headings.data()[k]];
+    std::copy_n(by, 3, J + q);
+    for (Index j = 0; j < width; ++j) {
+      now += J[j] * change.data()[j];
+      block.mutable_data()[i + j * r] = J[j];
+    }
+    block.mutable_data()[i + width * r] = now - sum;
+  }
+  return block;
+}
 
 struct Part {  // the variables that have left with a link, or those that it depends on:
                // graph.variables:Layout
@@ -134,6 +169,7 @@ py::tuple origin_by_active(const Array& values, const py::list& links, const Int
 }  // namespace
 
 void add_links(py::module_& module) {
+  module.def("relative_block", &relative_block);
   module.def("link_means", &link_means);
   module.def("origin_by_active", &origin_by_active);
 }

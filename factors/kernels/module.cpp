@@ -15,6 +15,7 @@
 namespace kernels {
 
 void add_foot_points(py::module_& module);
+void add_layouts(py::module_& module);
 void add_rows(py::module_& module);
 void add_links(py::module_& module);
 void add_detections(py::module_& module);
@@ -30,6 +31,7 @@ PYBIND11_MODULE(_kernels, module) {
   module.doc() = "Compiled functions of arrays, which _kernels.pyi describes.";
   module.attr("COMPILER") = COMPILER;
   kernels::add_foot_points(module);
+  kernels::add_layouts(module);
   kernels::add_rows(module);
   kernels::add_links(module);
   kernels::add_detections(module);

@@ -1,89 +1,21 @@
-// Rows of a window: replaced, dropped, and summed into the system of a step (`graph/rows.py`).
+// Rows of a window: kept, replaced, dropped, and summed into the system of a step (`graph/rows.py`).
 
-#include "common.hpp"
+#include "rows.hpp"
 
 namespace kernels {
 namespace {
 
-struct Layout {  // graph.variables:Layout
-  explicit Layout(const py::handle& layout)
-      : keys(layout.attr("keys").cast<Ints>()),
-        starts(layout.attr("starts").cast<Ints>()),
-        widths(layout.attr("widths").cast<Ints>()) {
-    expect(starts.size() == size() && widths.size() == size());
-  }
-  Index size() const { return keys.shape(0); }
-
-  // The place of a key, which is -1 where the layout does not hold it.
-  Index find(Index key) const {
-    const Index* last = keys.data() + size();
-    const Index* place = std::lower_bound(keys.data(), last, key);
-    return place == last || *place != key ? -1 : place - keys.data();
-  }
-  Index place(Index key) const {
-    const Index found = find(key);
-    if (found < 0) throw py::value_error("expected rows on known variables, found others");
-    return found;
-  }
-
-  Ints keys, starts, widths;
-};
-
-struct Rows {  // graph.rows:Rows
-  explicit Rows(const py::handle& rows)
-      : keys(rows.attr("keys").cast<Ints>()),
-        jacobian(rows.attr("jacobian").cast<Array>()),
-        residual(rows.attr("residual").cast<Array>()),
-        owner(rows.attr("owner").cast<Ints>()) {
-    expect(keys.shape(0) == size() && jacobian.shape(0) == size() && owner.size() == size());
-  }
-  Rows(Index rows, Index k, Index width)
-      : keys(Shape{rows, k}), jacobian(Shape{rows, width}), residual(rows), owner(rows) {}
-
-  Index size() const { return residual.shape(0); }
-  Index width() const { return jacobian.shape(1); }
-  bool same_keys(Index row, Index other) const {
-    const Index k = keys.shape(1);
-    return std::equal(keys.data() + row * k, keys.data() + (row + 1) * k, keys.data() + other * k);
-  }
-  void set(Index at, const Rows& from, Index row) {
-    const Index k = keys.shape(1);
-    std::copy_n(from.keys.data() + row * k, k, keys.mutable_data() + at * k);
-    std::copy_n(from.jacobian.data() + row * width(), width(), jacobian.mutable_data() + at * width());
-    residual.mutable_data()[at] = from.residual.data()[row];
-    owner.mutable_data()[at] = from.owner.data()[row];
-  }
-  py::tuple parts() const { return py::make_tuple(keys, jacobian, residual, owner); }
-
-  Ints keys;
-  Array jacobian, residual;
-  Ints owner;
-};
-
-// Which of a row's keys each of its columns is by, and which entry of that variable.
-struct Pattern {
-  Pattern() = default;
-  explicit Pattern(const py::handle& rows) {
-    Index number = 0;
-    for (const py::handle& width : rows.attr("widths")) {
-      for (Index j = 0; j < width.cast<Index>(); ++j) key.push_back(number), entry.push_back(j);
-      ++number;
-    }
-  }
-  std::vector<Index> key, entry;
-};
-
 // The columns of one row after another; the keys of neighbouring rows are mostly the same.
 class RowColumns {
  public:
-  RowColumns(const Layout& layout, const Rows& rows, const py::handle& own)
+  RowColumns(const Layout& layout, const Rows& rows, const Pattern& pattern)
       : layout_(layout),
         rows_(rows),
+        pattern_(pattern),
         k_(rows.keys.shape(1)),
         wanted_(k_),
         begin_(k_),
         columns_(rows.width()) {
-    if (rows.size()) pattern_ = Pattern(own);
     expect(rows.size() == 0 || pattern_.key.size() == columns_.size());
   }
 
@@ -115,15 +47,15 @@ class RowColumns {
  private:
   const Layout& layout_;
   const Rows& rows_;
-  Pattern pattern_;
+  const Pattern& pattern_;
   Index k_;
   std::vector<Index> wanted_, begin_, columns_;
 };
 
-void add_rows(double* H, double* g, Index n, const py::handle& own, const Layout& layout,
-              const double* change) {
-  const Rows rows(own);
-  RowColumns columns(layout, rows, own);
+void add_group(double* H, double* g, Index n, const Group& group, const Layout& layout,
+               const double* change) {
+  const Rows& rows = group.rows;
+  RowColumns columns(layout, rows, group.pattern);
   const Index width = rows.width();
   std::vector<Index> places(width * (width + 1) / 2);
   for (Index i = 0; i < rows.size(); ++i) {
@@ -162,7 +94,7 @@ void add_factor(double* H, double* g, Index n, const Ints& keys, const Columns& 
   }
 }
 
-py::tuple summed(const py::handle& own_layout, const py::list& factors, const py::sequence& groups,
+py::tuple summed(const py::handle& own_layout, const py::list& factors, const py::sequence& stores,
                  const Array& change) {
   const Layout layout(own_layout);
   const Index n = change.shape(0);
@@ -176,23 +108,18 @@ py::tuple summed(const py::handle& own_layout, const py::list& factors, const py
     const py::tuple own = factor.cast<py::tuple>();
     add_factor(H, g, n, own[0].cast<Ints>(), own[1].cast<Columns>(), layout, change.data());
   }
-  for (const py::handle& rows : groups) add_rows(H, g, n, rows, layout, change.data());
+  for (const py::handle& store : stores)
+    for (const Group& group : store.cast<const RowStore&>().groups())
+      add_group(H, g, n, group, layout, change.data());
   return py::make_tuple(hessian, gradient);
 }
 
-// The rows `[A b]` of some groups on the variables that they hold, and the places of these variables.
-py::tuple block_of(const py::handle& own_layout, const py::sequence& groups) {
-  const Layout layout(own_layout);
-  std::vector<Rows> all;
-  std::vector<Pattern> patterns;
-  for (const py::handle& rows : groups) {
-    all.emplace_back(rows);
-    patterns.push_back(all.back().size() ? Pattern(rows) : Pattern());
-    expect(all.back().size() == 0 || Index(patterns.back().key.size()) == all.back().width());
-  }
+// The rows `[A b]` of groups on the variables that they hold, and the places of these variables.
+py::tuple block_on(const Layout& layout, const std::vector<Group>& all) {
   Index height = 0, width = 0;
   std::vector<Index> first(layout.size(), -1), held;
-  for (const Rows& rows : all) {
+  for (const Group& group : all) {
+    const Rows& rows = group.rows;
     height += rows.size();
     const Index k = rows.keys.shape(1);
     const Index* own = rows.keys.data();
@@ -205,8 +132,8 @@ py::tuple block_of(const py::handle& own_layout, const py::sequence& groups) {
   double* at = block.mutable_data();
   std::fill_n(at, height * (width + 1), 0.0);
   for (std::size_t g = 0; g < all.size(); ++g) {
-    const Rows& rows = all[g];
-    const Pattern& pattern = patterns[g];
+    const Rows& rows = all[g].rows;
+    const Pattern& pattern = all[g].pattern;
     const Index k = rows.keys.shape(1);
     std::vector<Index> begin(k);
     for (Index i = 0; i < rows.size(); ++i, ++at) {
@@ -221,11 +148,22 @@ py::tuple block_of(const py::handle& own_layout, const py::sequence& groups) {
   return py::make_tuple(Ints(Shape{static_cast<Index>(held.size())}, held.data()), block);
 }
 
+py::tuple block_of(const py::handle& own_layout, const py::sequence& groups) {
+  std::vector<Group> all;
+  for (const py::handle& own : groups) {
+    const Rows rows(own);
+    all.push_back({rows, rows.size() ? Pattern(own) : Pattern()});
+    expect(rows.size() == 0 || Index(all.back().pattern.key.size()) == rows.width());
+  }
+  return block_on(Layout(own_layout), all);
+}
+
 Ints columns_of(const py::handle& own_layout, const py::handle& own) {
   const Layout layout(own_layout);
   const Rows rows(own);
   Ints out(Shape{rows.size(), rows.width()});
-  RowColumns columns(layout, rows, own);
+  const Pattern pattern = rows.size() ? Pattern(own) : Pattern();
+  RowColumns columns(layout, rows, pattern);
   for (Index i = 0; i < rows.size(); ++i) {
     const std::vector<Index>& at = columns.of(i);
     std::copy(at.begin(), at.end(), out.mutable_data() + i * rows.width());
@@ -233,11 +171,9 @@ Ints columns_of(const py::handle& own_layout, const py::handle& own) {
   return out;
 }
 
-Array moved_residual(const py::handle& own_layout, const py::handle& own, const Array& change) {
-  const Layout layout(own_layout);
-  const Rows rows(own);
+Array residual_after(const Layout& layout, const Rows& rows, const Pattern& pattern, const Array& change) {
   Array out(rows.size());
-  RowColumns columns(layout, rows, own);
+  RowColumns columns(layout, rows, pattern);
   for (Index i = 0; i < rows.size(); ++i) {
     const std::vector<Index>& at = columns.known(i);
     const double* J = rows.jacobian.data() + i * rows.width();
@@ -248,6 +184,11 @@ Array moved_residual(const py::handle& own_layout, const py::handle& own, const 
   return out;
 }
 
+Array moved_residual(const py::handle& own_layout, const py::handle& own, const Array& change) {
+  const Rows rows(own);
+  return residual_after(Layout(own_layout), rows, rows.size() ? Pattern(own) : Pattern(), change);
+}
+
 std::vector<bool> owned_by(const Rows& rows, const Ints& owners) {
   std::vector<bool> is(rows.size());
   for (Index i = 0; i < rows.size(); ++i)
@@ -255,126 +196,167 @@ std::vector<bool> owned_by(const Rows& rows, const Ints& owners) {
   return is;
 }
 
-py::tuple parted(const py::handle& rows, const Ints& gone) {
-  const Rows all(rows);
-  const std::vector<bool> goes = owned_by(all, gone);
+bool holds(const Rows& rows, Index row, const Ints& ascending) {
+  const Index k = rows.keys.shape(1);
+  const Index* own = rows.keys.data() + row * k;
+  const Index* first = ascending.data();
+  return std::any_of(own, own + k,
+                     [&](Index one) { return std::binary_search(first, first + ascending.size(), one); });
+}
+
+Ints as_array(const std::vector<Index>& values) { return Ints(Shape{Index(values.size())}, values.data()); }
+
+// The rows that stay, and those that leave, in their order.
+std::pair<Rows, Rows> parted(const Rows& all, const std::vector<bool>& goes) {
   const Index count = std::count(goes.begin(), goes.end(), true), k = all.keys.shape(1);
   Rows stay(all.size() - count, k, all.width()), leave(count, k, all.width());
   for (Index i = 0, kept = 0; i < all.size(); ++i)
     goes[i] ? leave.set(i - kept, all, i) : stay.set(kept++, all, i);
-  return py::make_tuple(stay.parts(), leave.parts());
-}
-
-py::tuple replaced(const py::handle& rows, const Ints& gone, const py::handle& fresh,
-                   const py::handle& layout, const Array& change) {
-  const Rows old(rows), added(fresh);
-  const std::vector<bool> goes = owned_by(old, gone);
-  const Array residual = moved_residual(layout, fresh, change);
-  Index at = old.size() - std::count(goes.begin(), goes.end(), true);
-  Rows out(at + added.size(), added.keys.shape(1), added.width());
-  for (Index i = 0; i < added.size(); ++i) {
-    out.set(at + i, added, i);
-    out.residual.mutable_data()[at + i] = residual.data()[i];
-  }
-  at = 0;
-  for (Index i = 0; i < old.size(); ++i)
-    if (!goes[i]) out.set(at++, old, i);
-  return out.parts();
-}
-
-Ints owners_holding(const py::handle& own_rows, const Ints& ascending) {
-  const Rows rows(own_rows);
-  const Index k = rows.keys.shape(1);
-  const Index* first = ascending.data();
-  const Index* last = first + ascending.shape(0);
-  std::vector<Index> found;
-  for (Index i = 0; i < rows.size(); ++i) {
-    const Index* own = rows.keys.data() + i * k;
-    if (std::any_of(own, own + k, [&](Index one) { return std::binary_search(first, last, one); }))
-      found.push_back(rows.owner.data()[i]);
-  }
-  return Ints(Shape{static_cast<Index>(found.size())}, found.data());
-}
-
-Columns relative_block(const Array& root, const Array& right, const Array& local, const Array& values,
-                       const Array& change, const py::handle& keys) {
-  const Index r = root.shape(0), q = local.shape(0), width = q + 3;
-  expect(root.size() == r * q && right.size() == r && values.size() == width && change.size() == width);
-  const Ints turning = keys.attr("turning").cast<Ints>(), headings = keys.attr("headings").cast<Ints>();
-  const double* frame = values.data() + q;
-  const Turn turn(frame[2]);
-  std::vector<double> there(values.data(), frame), off(q);
-  to_frame(there.data(), turning, headings, frame, turn);
-  for (Index j = 0; j < q; ++j) off[j] = there[j] - local.data()[j];
-  Columns block(Shape{r, width + 1});
-  std::vector<double> row(width);
-  double* J = row.data();
-  for (Index i = 0; i < r; ++i) {
-    const double* A = root.data() + i * q;
-    double sum = -right.data()[i], by[3] = {0.0, 0.0, 0.0}, now = 0.0;
-    for (Index j = 0; j < q; ++j) sum += A[j] * off[j];
-    std::copy_n(A, q, J);
-    for (Index k = 0; k < turning.size(); ++k) {
-      const Index x = turning.data()[k];
-      J[x] = A[x] * turn.c - A[x + 1] * turn.s, J[x + 1] = A[x] * turn.s + A[x + 1] * turn.c;
-      by[0] -= J[x], by[1] -= J[x + 1];
-      by[2] += A[x] * there[x + 1] - A[x + 1] * there[x];
-    }
-    for (Index k = 0; k < headings.size(); ++k) by[2] -= A[headings.data()[k]];
-    std::copy_n(by, 3, J + q);
-    for (Index j = 0; j < width; ++j) {
-      now += J[j] * change.data()[j];
-      block.mutable_data()[i + j * r] = J[j];
-    }
-    block.mutable_data()[i + width * r] = now - sum;
-  }
-  return block;
-}
-
-Ints spread(const Ints& starts, const Ints& widths) {
-  const Index count = starts.shape(0);
-  expect(widths.size() == count);
-  Index total = 0;
-  for (Index i = 0; i < count; ++i) total += widths.data()[i];
-  Ints out(total);
-  Index* at = out.mutable_data();
-  for (Index i = 0; i < count; ++i)
-    for (Index j = 0; j < widths.data()[i]; ++j) *at++ = starts.data()[i] + j;
-  return out;
-}
-
-py::tuple laid_out(const Ints& keys, Index sensor_key, Index first_pose, const py::tuple& sizes,
-                   const Ints& bounds) {
-  const Index count = keys.shape(0);
-  const Index point = sizes[0].cast<Index>(), sensor = sizes[1].cast<Index>(), pose = sizes[2].cast<Index>();
-  Ints widths(count), starts(count);
-  Index total = 0;
-  for (Index i = 0; i < count; ++i) {
-    const Index key = keys.data()[i];
-    starts.mutable_data()[i] = total;
-    total += widths.mutable_data()[i] = key >= first_pose ? pose : key == sensor_key ? sensor : point;
-  }
-  py::list begins(bounds.shape(0));
-  for (Index b = 0; b < bounds.shape(0); ++b) {
-    const Index place = std::lower_bound(keys.data(), keys.data() + count, bounds.data()[b]) - keys.data();
-    begins[b] = place < count ? starts.data()[place] : total;
-  }
-  return py::make_tuple(widths, starts, total, begins);
+  return {stay, leave};
 }
 
 }  // namespace
+
+Pattern::Pattern(const py::handle& rows) {
+  for (const py::handle& width : rows.attr("widths")) add(width.cast<Index>());
+}
+
+Pattern::Pattern(const Layout& layout, const Rows& rows) {
+  for (Index j = 0; j < rows.keys.shape(1); ++j) add(layout.widths.data()[layout.place(rows.keys.data()[j])]);
+  expect(Index(key.size()) == rows.width());
+}
+
+void Pattern::add(Index width) {
+  for (Index j = 0; j < width; ++j) key.push_back(Index(widths.size())), entry.push_back(j);
+  widths.push_back(width);
+}
+
+RowStore::RowStore(const py::sequence& groups) {
+  for (const py::handle& own : groups) {
+    if (Rows(own).size() == 0) continue;
+    groups_.push_back({Rows(own), Pattern(own)});
+    const auto& [rows, pattern] = groups_.back();
+    expect(Index(pattern.key.size()) == rows.width() && Index(pattern.widths.size()) == rows.keys.shape(1));
+  }
+}
+
+py::list RowStore::parts() const {
+  py::list parts;
+  for (const Group& group : groups_) parts.append(group.rows.parts());
+  return parts;
+}
+
+Ints RowStore::owners() const {
+  std::vector<Index> found;
+  for (const Group& group : groups_)
+    found.insert(found.end(), group.rows.owner.data(), group.rows.owner.data() + group.rows.size());
+  return as_array(found);
+}
+
+Ints RowStore::holding(const Ints& keys) const {
+  std::vector<Index> found;
+  for (const Group& group : groups_)
+    for (Index i = 0; i < group.rows.size(); ++i)
+      if (holds(group.rows, i, keys)) found.push_back(group.rows.owner.data()[i]);
+  return as_array(found);
+}
+
+py::array_t<bool> RowStore::stale(const Ints& owners, const Ints& keys) const {
+  const Index* first = owners.data();
+  const Index* last = first + owners.size();
+  py::array_t<bool> out(owners.size());
+  std::vector<char> has(owners.size(), 0), moved(owners.size(), 0);
+  for (const Group& group : groups_) {
+    for (Index i = 0; i < group.rows.size(); ++i) {
+      const Index* place = std::lower_bound(first, last, group.rows.owner.data()[i]);
+      if (place == last || *place != group.rows.owner.data()[i]) continue;
+      has[place - first] = 1;
+      if (!moved[place - first]) moved[place - first] = holds(group.rows, i, keys);
+    }
+  }
+  for (Index k = 0; k < owners.size(); ++k) out.mutable_data()[k] = !has[k] || moved[k];
+  return out;
+}
+
+void RowStore::replace(const Ints& owners, const py::sequence& fresh, const py::handle& own_layout,
+                       const Array& change) {
+  const Layout layout(own_layout);
+  std::vector<std::pair<Pattern, std::vector<Rows>>> added;
+  for (const py::handle& own : fresh) {
+    const Rows rows(own);
+    if (rows.size() == 0) continue;
+    const Pattern pattern(layout, rows);
+    auto same = std::find_if(added.begin(), added.end(),
+                             [&](const auto& one) { return one.first.widths == pattern.widths; });
+    if (same == added.end()) same = added.insert(added.end(), {pattern, {}});
+    same->second.push_back(rows);
+  }
+  for (const Group& group : groups_)
+    if (std::none_of(added.begin(), added.end(),
+                     [&](const auto& one) { return one.first.widths == group.pattern.widths; }))
+      added.push_back({group.pattern, {}});
+  std::vector<Group> groups;
+  for (const auto& [pattern, parts] : added) {
+    const auto old = std::find_if(groups_.begin(), groups_.end(), [&, &own = pattern](const Group& one) {
+      return one.pattern.widths == own.widths;
+    });
+    const std::vector<bool> goes = old == groups_.end() ? std::vector<bool>() : owned_by(old->rows, owners);
+    Index at = 0, size = std::count(goes.begin(), goes.end(), false);
+    for (const Rows& rows : parts) size += rows.size();
+    if (size == 0) continue;
+    Rows out(size, Index(pattern.widths.size()), Index(pattern.key.size()));
+    for (Index i = 0; i < Index(goes.size()); ++i)
+      if (!goes[i]) out.set(at++, old->rows, i);
+    for (const Rows& rows : parts) {
+      const Array residual = residual_after(layout, rows, pattern, change);
+      for (Index i = 0; i < rows.size(); ++i, ++at) {
+        out.set(at, rows, i);
+        out.residual.mutable_data()[at] = residual.data()[i];
+      }
+    }
+    groups.push_back({out, pattern});
+  }
+  groups_ = groups;
+}
+
+void RowStore::drop(const Ints& owners) {
+  std::vector<Group> groups;
+  for (const Group& group : groups_) {
+    const Rows stay = parted(group.rows, owned_by(group.rows, owners)).first;
+    if (stay.size()) groups.push_back({stay, group.pattern});
+  }
+  groups_ = groups;
+}
+
+py::tuple RowStore::pop(Index owner, const py::handle& layout) {
+  const Ints owners(Shape{1}, &owner);
+  std::vector<Group> groups, popped;
+  for (const Group& group : groups_) {
+    const auto [stay, leave] = parted(group.rows, owned_by(group.rows, owners));
+    if (stay.size()) groups.push_back({stay, group.pattern});
+    if (leave.size()) popped.push_back({leave, group.pattern});
+  }
+  const py::tuple block = block_on(Layout(layout), popped);
+  groups_ = groups;
+  return block;
+}
 
 void add_rows(py::module_& module) {
   module.def("summed", &summed);
   module.def("block_of", &block_of);
   module.def("moved_residual", &moved_residual);
-  module.def("parted", &parted);
-  module.def("relative_block", &relative_block);
-  module.def("replaced", &replaced);
-  module.def("owners_holding", &owners_holding);
-  module.def("laid_out", &laid_out);
   module.def("columns_of", &columns_of);
-  module.def("spread", &spread);
+  py::class_<RowStore>(module, "RowStore")
+      .def(py::init<const py::sequence&>(), py::arg("groups") = py::tuple())
+      .def("__bool__", [](const RowStore& store) { return !store.empty(); })
+      .def("copy", [](const RowStore& store) { return RowStore(store); })
+      .def("owners", &RowStore::owners)
+      .def("parts", &RowStore::parts)
+      .def("holding", &RowStore::holding)
+      .def("stale", &RowStore::stale)
+      .def("replace", &RowStore::replace)
+      .def("drop", &RowStore::drop)
+      .def("pop", &RowStore::pop);
 }
 
 }  // namespace kernels

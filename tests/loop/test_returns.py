@@ -36,7 +36,7 @@ def searched(finder: ReturnFinder, cycle: int, length: float) -> None:
 
 
 def test_a_cycle_tries_one_way_at_most_and_each_way_has_its_turn(tried: list[str]) -> None:
-    """At two metres a cycle, curves and cones are due in each one: they alternate, and shape comes between."""
+    """Where curves and cones are due in each cycle they alternate, and shape comes between."""
     finder, counts = ReturnFinder(SETTINGS), []
     for cycle in range(60):
         searched(finder, cycle, 100.0 + 2.0 * cycle)
