@@ -37,8 +37,8 @@ from .start import start_odometry
 from .stations import StationMatches
 from .system import BatchSystem, Evaluation, curve_gauge
 
-FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)  # so that it is in time
-FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)
+FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, tolerance=10.0)  # so that it is in time
+FROM_ODOMETRY: Final = Effort(rounds=24, tolerance=10.0)
 
 
 @dataclass(frozen=True, eq=False)

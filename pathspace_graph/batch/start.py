@@ -41,7 +41,7 @@ from .simplification import boundary_of, exact_settings, fit_through
 from .system import BatchSystem
 
 ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the passes of a place together
-ALIGN_TOLERANCE: Final = 1e-2  # largest move of a step at which they are together (m, rad)
+ALIGN_TOLERANCE: Final = 0.1  # largest move of a step at which they are together (m, rad)
 REVISIT_INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
 LAP_SHARE: Final = 0.7  # least share of a lap between two passes
 START_MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
@@ -147,11 +147,16 @@ class AlignedOdometry:
         return float(np.sqrt(square.mean() / POSE))
 
 
-def aligned_odometry(chain: LogOdometry, revisits: Sequence[Revisit]) -> AlignedOdometry:
-    """Return the optimum of odometry and revisits, by Gauss-Newton from dead reckoning."""
-    variables, poses = Variables(), chain.dead_reckoned(chain.calibration_mean)
-    variables.insert(np.array([CALIBRATION_KEY]), chain.calibration_mean)
-    variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
+def aligned_odometry(
+    chain: LogOdometry, revisits: Sequence[Revisit], begin: AlignedOdometry | None = None
+) -> AlignedOdometry:
+    """Return the optimum of odometry and revisits, by Gauss-Newton from another one or dead reckoning."""
+    if begin is None:
+        variables, poses = Variables(), chain.dead_reckoned(chain.calibration_mean)
+        variables.insert(np.array([CALIBRATION_KEY]), chain.calibration_mean)
+        variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
+    else:
+        variables = begin.variables.copy()
     aligned = AlignedOdometry(chain, revisits, variables)
     for _ in range(ALIGN_STEPS):
         step = aligned.system().step(np.zeros(CALIBRATION_SIZE))
@@ -183,7 +188,7 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
         return table.where(np.flatnonzero(table.in_cycles(cycles)))
 
     closing, reckoned = settings.closing, aligned_odometry(chain, ())
-    poses = reckoned.poses
+    aligned, poses = reckoned, reckoned.poses
     driven, revisits, due, lap = path_lengths(poses), list[Revisit](), closing.min_path, np.inf
     for newest in range(len(poses)):
         is_last = newest == len(poses) - 1 and driven[newest] > closing.min_path
@@ -201,7 +206,8 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
         if not revisits:
             lap = length_of_lap(reckoned.poses, revisit)
         revisits.append(revisit)
-        poses = aligned_odometry(chain, revisits).poses
+        aligned = aligned_odometry(chain, revisits, aligned)
+        poses = aligned.poses
         due = driven[newest] + REVISIT_INTERVAL
     return tuple(revisits)
 

@@ -37,8 +37,12 @@ def owners(cycles: IntArray, side: IntArray | int = 0) -> IntArray:
 
 
 def linear_graph(groups: Sequence[Rows], variables: Variables) -> gtsam.GaussianFactorGraph:
-    """Return the rows as a graph whose unknowns are the changes from the variables' values."""
-    return graph_of(*jacobian_factors(groups, variables.layout).values())
+    """Return the rows as a graph whose unknowns are the changes from the variables' values.
+
+    Its factors are squared already: GTSAM takes longer to do that while it eliminates.
+    """
+    factors = jacobian_factors(groups, variables.layout).values()
+    return graph_of(*map(gtsam.HessianFactor, factors))
 
 
 def fix_map(groups: Sequence[Rows]) -> list[Rows]:
