@@ -177,8 +177,15 @@ def eliminated_system(graph: gtsam.GaussianFactorGraph, kept: Layout) -> tuple[A
 def _eliminated(
     graph: gtsam.GaussianFactorGraph, others: Layout, count: int
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
-    """Return the conditionals of `count` poses, the root last, and the graph that remains on the others."""
-    order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, others.keys.tolist(), False)
+    """Return the conditionals of `count` poses, the root last, and the graph that remains on the others.
+
+    The first pose is the root: its prior makes it certain. A distant root of a long drive has so much less
+    information than its children that GTSAM takes it for free.
+    """
+    keys = keys_of(graph)
+    first = keys[np.isin(keys, others.keys, invert=True)][:1]
+    last = [*first.tolist(), *others.keys.tolist()]
+    order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, last, True)
     poses = gtsam.Ordering([order.at(k) for k in range(count)])
     try:
         tree, remaining = graph.eliminatePartialMultifrontal(poses)
