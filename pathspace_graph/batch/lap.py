@@ -9,7 +9,6 @@ The batch of a lap begins at odometry and the revisit that ended the lap, and th
 """
 
 import time
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Final
 
@@ -123,7 +122,7 @@ def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem
     """Return the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
     start, settings = lap.start, own_settings(lap.settings)
     revisits = [start] if isinstance(start, Revisit) else []
-    system = BatchSystem(deepcopy(lap.detections), lap.chain, settings, revisits)
+    system = BatchSystem(lap.detections.copy(), lap.chain, settings, revisits)
     if isinstance(start, Revisit):
         state, usual = start_odometry(system), FROM_ODOMETRY
     else:

@@ -7,7 +7,9 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.errors import SingularSystemError
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.front_end.log_odometry import half_square
 from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
@@ -70,16 +72,16 @@ class Optimizer:
         gate = self.settings.gate
         first_gate = gate if self.system.revisits else LOOSE_GATE
         state = self.align_poses(state, POSE_STEPS, first_gate)
-        state = reknot(state, detections, settings, dense=True)
-        at, _ = self.run(state, first_gate, self.effort.rough_rounds, rough=True)
-        state = reknot(at.state, detections, settings, dense=True)
-        curves = state.boundaries.values()
-        stations = settings.stations and len(curves) > 0 and all(curve.periodic for curve in curves)
-        if stations:
-            for matched in (False, True):  # the first match is on curves that did not know of their cones
-                at, _ = self.run(state, gate, rounds, rough=True, stations=matched)
-                state = at.state
-        return self.run(state, gate, rounds, stations=stations)
+        start = reknot(state, detections, settings, dense=True)
+        at, _ = self.run(start, first_gate, self.effort.rough_rounds, rough=True)
+        again = reknot(at.state, detections, settings, dense=True)
+        curves = [*again.boundaries.values()]
+        if not (settings.stations and curves and all(curve.periodic for curve in curves)):
+            return self.run(again, gate, rounds)
+        if [curve.size for curve in curves] != [curve.size for curve in start.boundaries.values()]:
+            at, _ = self.run(again, gate, rounds, rough=True)
+        at, _ = self.run(at.state, gate, rounds, rough=True, stations=True)
+        return self.run(at.state, gate, rounds, stations=True)  # the cones are other ones beside this optimum
 
     def align_poses(self, state: State, steps: int, gate: float) -> State:
         """Return the state after Gauss-Newton steps of the poses alone, beside its map and calibration."""
@@ -164,10 +166,7 @@ class Optimizer:
         return at, decrease
 
     def _trial(self, at: Evaluation, rows: Sequence[Rows]) -> tuple[Evaluation | None, float]:
-        """Return the problem after a damped step, or None if the cost has grown, and the predicted decrease.
-
-        With gradient g, information H and the damping D, it is `1/2 g' (H + D)^-1 g`.
-        """
+        """Return the problem after a damped step, None if the cost has grown, and the predicted decrease."""
         state, system = at.state, self.system
         damped = [*rows, *system.damping(state, self.damping.weight)]
         try:
@@ -175,7 +174,7 @@ class Optimizer:
             step = problem.step(np.zeros(problem.map.size))
         except SingularSystemError:
             return None, np.inf
-        decrease = -0.5 * float(gradient(rows, state.variables.layout) @ step)
+        decrease = predicted_decrease(rows, state.variables.layout, step)
         trial = system.evaluate(system.retract(state, step))
         if trial.cost > at.cost:
             return None, decrease
@@ -199,9 +198,10 @@ def extrapolation_factor(step: Array, before: Array) -> float:
     return 1.0 / (1.0 - share) if CREEP_SHARES[0] < abs(share) < CREEP_SHARES[1] else 1.0
 
 
-def gradient(groups: Sequence[Rows], layout: Layout) -> Array:
-    """Return the gradient `J' r` (n,) of all rows, by the columns of the layout."""
-    groups = [rows for rows in groups if len(rows)]
-    columns = np.concatenate([rows.columns(layout).ravel() for rows in groups])
-    slopes = np.concatenate([(rows.jacobian * rows.residual[:, None]).ravel() for rows in groups])
-    return np.asarray(np.bincount(columns, slopes, layout.size), np.float64)
+def predicted_decrease(groups: Sequence[Rows], layout: Layout, step: Array) -> float:
+    """Return `1/2 |r|^2 - 1/2 |J d + r|^2` of all rows after a step d (n,): the gain of the linear problem.
+
+    An undamped step has `1/2 g' H^-1 g`, with gradient g and information H: 1/2 where it is one sigma long.
+    """
+    after = (kernels.moved_residual(layout, rows, -step) for rows in groups if len(rows))
+    return half_square(groups) - sum(0.5 * float(residual @ residual) for residual in after)
