@@ -22,7 +22,7 @@ from .system import LOOSE_GATE, BatchSystem, Biweight, Evaluation, moved
 
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 SETTLED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
-POSE_STEPS: Final = 3  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
+POSE_STEPS: Final = 1  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
 TOLERANCE_DECREASE: Final = 0.05  # most decrease of the cost that the last step predicts; one sigma has 1/2
 ROUGH_TOLERANCE: Final = 100.0  # its factor before the last optimization, on knots or stations that change
 CREEP_SHARES: Final = (0.3, 0.97)  # of a step in the one before, between which it is extrapolated
