@@ -38,9 +38,9 @@ class Convergence:
     steps: int  # Levenberg-Marquardt steps, including rejected ones
     cost: float  # half the sum of squares with robust losses at the end
     gradient: float
-    """Norm `sqrt(g' H^-1 g)` of the gradient g before the last step, with H the information of all variables:
-    the length of that step in joint sigmas. A slow common motion of the whole map counts as much in it as
-    that of a control point."""
+    """Norm `sqrt(g' H^-1 g)` of the gradient g, with H the information of all variables: the length of the
+    last step in joint sigmas, or of the next one where it did not converge. A slow common motion of the whole
+    map counts as much in it as that of a control point."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,7 @@ class Optimizer:
             converged = not searching and decrease <= tolerance
             gate *= GATE_FACTOR
         reason = "nothing changes any more" if converged else "no round left"
+        decrease = decrease if converged else self._undamped_decrease(at)
         norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
         return at, Convergence(converged, reason, done, self.steps, at.cost, norm)
 
@@ -165,6 +166,11 @@ class Optimizer:
         self.damping.reset()
         return at, decrease
 
+    def _undamped_decrease(self, at: Evaluation) -> float:
+        problem = self.system.eliminated(at)
+        step = problem.step(np.zeros(problem.map.size))
+        return predicted_decrease(self.system.rows(at), at.state.variables.layout, step)
+
     def _trial(self, at: Evaluation, rows: Sequence[Rows]) -> tuple[Evaluation | None, float]:
         """Return the problem after a damped step, None if the cost has grown, and the predicted decrease."""
         state, system = at.state, self.system
@@ -174,7 +180,9 @@ class Optimizer:
             step = problem.step(np.zeros(problem.map.size))
         except SingularSystemError:
             return None, np.inf
-        decrease = predicted_decrease(rows, state.variables.layout, step)
+        decrease = np.inf
+        if self.damping.is_light:  # a step is short as well where the damping holds it
+            decrease = predicted_decrease(rows, state.variables.layout, step)
         trial = system.evaluate(system.retract(state, step))
         if trial.cost > at.cost:
             return None, decrease

@@ -179,20 +179,21 @@ def _eliminated(
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
     """Return the conditionals of `count` poses, the root last, and the graph that remains on the others.
 
-    The first pose is the root: its prior makes it certain. A distant root of a long drive has so much less
-    information than its children that GTSAM takes it for free.
+    GTSAM may take poses for free that are certain relative to each other alone, as those of a vehicle that
+    rests far from its start. Eliminated from the last pose to the first, they hang on those before them.
     """
-    keys = keys_of(graph)
-    first = keys[np.isin(keys, others.keys, invert=True)][:1]
-    last = [*first.tolist(), *others.keys.tolist()]
-    order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, last, True)
-    poses = gtsam.Ordering([order.at(k) for k in range(count)])
+    order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, others.keys.tolist(), False)
+    poses = [order.at(k) for k in range(count)]
     try:
-        tree, remaining = graph.eliminatePartialMultifrontal(poses)
-    except RuntimeError as error:
-        raise SingularSystemError(
-            "expected poses that the graph determines, found one that is free"
-        ) from error
+        tree, remaining = graph.eliminatePartialMultifrontal(gtsam.Ordering(poses))
+    except RuntimeError:
+        try:
+            in_turn = gtsam.Ordering(sorted(poses, reverse=True))
+            tree, remaining = graph.eliminatePartialMultifrontal(in_turn)
+        except RuntimeError as error:
+            raise SingularSystemError(
+                "expected poses that the graph determines, found one that is free"
+            ) from error
     net = gtsam.GaussianBayesNet()
     for conditional in reversed(factors_of(graph_of(tree))):  # a tree gives its root first
         net.push_back(cast("gtsam.GaussianConditional", conditional))
@@ -209,6 +210,11 @@ class Damping:
     @property
     def exhausted(self) -> bool:
         return self.weight > self._most
+
+    @property
+    def is_light(self) -> bool:
+        """Whether no more than in a first step."""
+        return self.weight <= self._first
 
     def lower(self) -> None:
         self.weight = max(0.1 * self.weight, self._least)
