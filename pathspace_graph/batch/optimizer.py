@@ -72,16 +72,16 @@ class Optimizer:
         gate = self.settings.gate
         first_gate = gate if self.system.revisits else LOOSE_GATE
         state = self.align_poses(state, POSE_STEPS, first_gate)
-        start = reknot(state, detections, settings, dense=True)
-        at, _ = self.run(start, first_gate, self.effort.rough_rounds, rough=True)
-        again = reknot(at.state, detections, settings, dense=True)
-        curves = [*again.boundaries.values()]
+        state = reknot(state, detections, settings, dense=True)
+        at, _ = self.run(state, first_gate, self.effort.rough_rounds, rough=True)
+        state = reknot(at.state, detections, settings, dense=True)
+        curves = [*state.boundaries.values()]
         if not (settings.stations and curves and all(curve.periodic for curve in curves)):
-            return self.run(again, gate, rounds)
-        if [curve.size for curve in curves] != [curve.size for curve in start.boundaries.values()]:
-            at, _ = self.run(again, gate, rounds, rough=True)
-        at, _ = self.run(at.state, gate, rounds, rough=True, stations=True)
-        return self.run(at.state, gate, rounds, stations=True)  # the cones are other ones beside this optimum
+            return self.run(state, gate, rounds)
+        for stations in (False, True):
+            at, _ = self.run(state, gate, rounds, rough=True, stations=stations)
+            state = at.state
+        return self.run(state, gate, rounds, stations=True)  # more detections are of one cone beside it
 
     def align_poses(self, state: State, steps: int, gate: float) -> State:
         """Return the state after Gauss-Newton steps of the poses alone, beside its map and calibration."""
