@@ -152,9 +152,11 @@ def _misfit(
     sigma = sigma_across(foot.normal_unit, detections.covariance[rows], poses, sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
     if boundary.periodic and not whole:  # it belongs to the nearest stretch, which another pass may be beside
-        nearest = boundary.find_anywhere(control_points, points)
-        distance = np.hypot(*(points - nearest.position).T) + settings.growth.merge_radius
-        possible &= ~nearest.interior | (np.abs(foot.distance) < distance)
+        room = settings.growth.merge_radius
+        far = np.flatnonzero(possible & (np.abs(foot.distance) >= room))
+        nearest = boundary.find_anywhere(control_points, points[far])
+        distance = np.hypot(*(points[far] - nearest.position).T) + room
+        possible[far] = ~nearest.interior | (np.abs(foot.distance[far]) < distance)
     return np.where(possible, np.abs(foot.distance) / sigma, np.inf), foot.u
 
 
@@ -223,10 +225,6 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
         own = np.minimum(apart, boundary.length - apart) < PASS_STRETCH
         cones = along_drive(cones, state.poses[lap], own, label)
     return without_folds(cones, boundary.periodic)
-
-
-def cone_counts(state: State, detections: DetectionTable, settings: MapperSettings) -> list[int]:
-    return [len(cones_of_curve(state, detections, label, settings).u) for label in state.boundaries]
 
 
 def first_parameter(state: State, label: int) -> float:

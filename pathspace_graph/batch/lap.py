@@ -9,7 +9,6 @@ The batch of a lap begins at odometry and the revisit that ended the lap, and th
 """
 
 import time
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Final
 
@@ -37,8 +36,8 @@ from .start import start_odometry
 from .stations import StationMatches
 from .system import BatchSystem, Evaluation, curve_gauge
 
-FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, knot_passes=1, tolerance=10.0)  # so that it is in time
-FROM_ODOMETRY: Final = Effort(rounds=24, knot_passes=1, tolerance=10.0)
+FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, tolerance=10.0)  # so that it is in time
+FROM_ODOMETRY: Final = Effort(rounds=24, tolerance=10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +122,7 @@ def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem
     """Return the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
     start, settings = lap.start, own_settings(lap.settings)
     revisits = [start] if isinstance(start, Revisit) else []
-    system = BatchSystem(deepcopy(lap.detections), lap.chain, settings, revisits)
+    system = BatchSystem(lap.detections.copy(), lap.chain, settings, revisits)
     if isinstance(start, Revisit):
         state, usual = start_odometry(system), FROM_ODOMETRY
     else:

@@ -3,7 +3,6 @@
 Simplification: the optimum's curves on few knots, their covariance, and how far cones lie from them.
 """
 
-from copy import deepcopy
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Final
 
@@ -203,7 +202,7 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
         new, new_points = few.boundaries[label], few.control_points(label)
         F = new_from_old(boundary, state.control_points(label), new, new_points)
         change[map_block(few, label), map_block(state, label)] = np.kron(F, np.eye(POINT))
-    detections = deepcopy(detections)
+    detections = detections.copy()
     locate_poses(few)
     associate(few, detections, settings, settings.batch.gate, strict=True)
     return Simplified(few, change, detections, scatter_of_cones(few, detections, settings))

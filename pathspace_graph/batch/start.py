@@ -13,7 +13,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.se2 import path_lengths, rotated, to_map
+from pathspace_graph.factors.se2 import path_lengths, relative, rotated, to_map, wrap_angle
 from pathspace_graph.front_end.front_end import JudgedLog
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph
@@ -41,7 +41,8 @@ from .simplification import boundary_of, exact_settings, fit_through
 from .system import BatchSystem
 
 ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the passes of a place together
-ALIGN_TOLERANCE: Final = 1e-2  # largest move of a step at which they are together (m, rad)
+ALIGN_TOLERANCE: Final = 0.1  # largest move of a step at which they are together (m, rad)
+OFF: Final = 0.3  # most misfit of a revisit (sigmas of `NEARBY`) beside which the next one is searched for
 REVISIT_INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
 LAP_SHARE: Final = 0.7  # least share of a lap between two passes
 START_MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
@@ -147,11 +148,16 @@ class AlignedOdometry:
         return float(np.sqrt(square.mean() / POSE))
 
 
-def aligned_odometry(chain: LogOdometry, revisits: Sequence[Revisit]) -> AlignedOdometry:
-    """Return the optimum of odometry and revisits, by Gauss-Newton from dead reckoning."""
-    variables, poses = Variables(), chain.dead_reckoned(chain.calibration_mean)
-    variables.insert(np.array([CALIBRATION_KEY]), chain.calibration_mean)
-    variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
+def aligned_odometry(
+    chain: LogOdometry, revisits: Sequence[Revisit], begin: AlignedOdometry | None = None
+) -> AlignedOdometry:
+    """Return the optimum of odometry and revisits, by Gauss-Newton from another one or dead reckoning."""
+    if begin is None:
+        variables, poses = Variables(), chain.dead_reckoned(chain.calibration_mean)
+        variables.insert(np.array([CALIBRATION_KEY]), chain.calibration_mean)
+        variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
+    else:
+        variables = begin.variables.copy()
     aligned = AlignedOdometry(chain, revisits, variables)
     for _ in range(ALIGN_STEPS):
         step = aligned.system().step(np.zeros(CALIBRATION_SIZE))
@@ -173,17 +179,16 @@ def all_cones(judged: JudgedLog) -> DetectionColumns:
 def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
     """Return the revisits of a whole drive by its cones: the first return to its beginning, and later ones.
 
-    Before the first return the poses are dead reckoned, so it has to be sure. Each revisit aligns the poses,
-    and the next is searched for `REVISIT_INTERVAL` metres later, nearby.
+    Before the first return the poses are dead reckoned, so it has to be sure. A revisit that they contradict
+    aligns them, and the next is searched for `REVISIT_INTERVAL` metres later, nearby.
     """
-
     chain, settings, table = judged.chain, judged.settings, all_cones(judged)
 
     def seen_in(cycles: IntArray) -> DetectionColumns:
         return table.where(np.flatnonzero(table.in_cycles(cycles)))
 
     closing, reckoned = settings.closing, aligned_odometry(chain, ())
-    poses = reckoned.poses
+    aligned, poses = reckoned, reckoned.poses
     driven, revisits, due, lap = path_lengths(poses), list[Revisit](), closing.min_path, np.inf
     for newest in range(len(poses)):
         is_last = newest == len(poses) - 1 and driven[newest] > closing.min_path
@@ -201,9 +206,18 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
         if not revisits:
             lap = length_of_lap(reckoned.poses, revisit)
         revisits.append(revisit)
-        poses = aligned_odometry(chain, revisits).poses
+        if _is_off(revisit, poses):
+            aligned = aligned_odometry(chain, revisits, aligned)
+            poses = aligned.poses
         due = driven[newest] + REVISIT_INTERVAL
     return tuple(revisits)
+
+
+def _is_off(revisit: Revisit, poses: Array) -> bool:
+    """Return whether poses (P, 3) contradict a revisit so much that they are no place to search the next."""
+    off = relative(poses[revisit.earlier], poses[revisit.later]) - revisit.local
+    off[2] = wrap_angle(off[2])
+    return float(off @ NEARBY.information @ off) > OFF**2
 
 
 def _return_again(seen_in: SeenIn, poses: Array, lap: float, settings: MapperSettings) -> Revisit | None:

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.footpoint import refine_joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints, refine_joint_foot_points
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
@@ -25,6 +25,8 @@ from .association import headings
 from .stations import StationMatches, match_stations
 
 LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
+SETTLE_FEET: Final = 16  # most refinements of the foot points before a step
+SETTLED_FOOT: Final = 1e-3  # most move of a foot point that has arrived (m along the curve)
 SIGMA_SLIDE: Final = 2.0
 """Standard deviation of a control point's slide along its curve from beside its first pose (m), where
 stations hold it there."""
@@ -203,18 +205,35 @@ class BatchSystem:
         A round holds the sigmas, and whether a foot point is inside its curve: the cost does not jump where
         an open end slides past a detection.
         """
-        detections, curves = self.detections, state.curves
+        detections = self.detections
         rows = np.flatnonzero(detections.used)
-        points, u = detections.points_map(rows, state.variables), detections.u[rows]
-        curve, s = curves.labels.searchsorted(detections.boundary[rows]), curves.boundaries[0].settings
-        stretch = u, u - s.refine_room, np.minimum(u + s.refine_room, curves.trusted[curve])
-        foot = refine_joint_foot_points(
-            curves.spans, state.map_points, points, curve, *stretch, s.refine_iterations
-        )
+        points = detections.points_map(rows, state.variables)
+        foot = self._feet(state, rows, points)
         seen = rows_across(state, detections, rows, points, foot, self.settings.spline.sigma_model)
         if hold:
             self._sigma[rows] = np.where(foot.interior, seen.sigma, np.inf)
         return replace(seen, sigma=self._sigma[rows]), foot.u
+
+    def _feet(self, state: State, rows: IntArray, points: Array) -> FootPoints:
+        """Return the foot points of used detections (m,) at points (m, 2), from those that they have on."""
+        detections, curves = self.detections, state.curves
+        u, s = detections.u[rows], curves.boundaries[0].settings
+        curve = curves.labels.searchsorted(detections.boundary[rows])
+        stretch = u, u - s.refine_room, np.minimum(u + s.refine_room, curves.trusted[curve])
+        return refine_joint_foot_points(
+            curves.spans, state.map_points, points, curve, *stretch, s.refine_iterations
+        )
+
+    def settle(self, state: State) -> None:
+        """Refine the foot points of the used detections until they stay."""
+        detections, rows = self.detections, np.flatnonzero(self.detections.used)
+        for _ in range(SETTLE_FEET if state.boundaries else 0):
+            before = detections.u[rows]
+            u = self._feet(state, rows, detections.points_map(rows, state.variables)).u
+            detections.refine(rows, u)
+            rows = rows[np.abs(u - before) > SETTLED_FOOT]
+            if len(rows) == 0:
+                break
 
     def _along(self, state: State, matches: StationMatches) -> DetectionRows:
         """Return the matched detections that are in use, with the sigmas that they were matched by."""

@@ -37,8 +37,12 @@ def owners(cycles: IntArray, side: IntArray | int = 0) -> IntArray:
 
 
 def linear_graph(groups: Sequence[Rows], variables: Variables) -> gtsam.GaussianFactorGraph:
-    """Return the rows as a graph whose unknowns are the changes from the variables' values."""
-    return graph_of(*jacobian_factors(groups, variables.layout).values())
+    """Return the rows as a graph whose unknowns are the changes from the variables' values.
+
+    Its factors are squared already: GTSAM takes longer to do that while it eliminates.
+    """
+    factors = jacobian_factors(groups, variables.layout).values()
+    return graph_of(*map(gtsam.HessianFactor, factors))
 
 
 def fix_map(groups: Sequence[Rows]) -> list[Rows]:
@@ -173,15 +177,23 @@ def eliminated_system(graph: gtsam.GaussianFactorGraph, kept: Layout) -> tuple[A
 def _eliminated(
     graph: gtsam.GaussianFactorGraph, others: Layout, count: int
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
-    """Return the conditionals of `count` poses, the root last, and the graph that remains on the others."""
+    """Return the conditionals of `count` poses, the root last, and the graph that remains on the others.
+
+    GTSAM may take poses for free that are certain relative to each other alone, as those of a vehicle that
+    rests far from its start. Eliminated from the last pose to the first, they hang on those before them.
+    """
     order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, others.keys.tolist(), False)
-    poses = gtsam.Ordering([order.at(k) for k in range(count)])
+    poses = [order.at(k) for k in range(count)]
     try:
-        tree, remaining = graph.eliminatePartialMultifrontal(poses)
-    except RuntimeError as error:
-        raise SingularSystemError(
-            "expected poses that the graph determines, found one that is free"
-        ) from error
+        tree, remaining = graph.eliminatePartialMultifrontal(gtsam.Ordering(poses))
+    except RuntimeError:
+        try:
+            in_turn = gtsam.Ordering(sorted(poses, reverse=True))
+            tree, remaining = graph.eliminatePartialMultifrontal(in_turn)
+        except RuntimeError as error:
+            raise SingularSystemError(
+                "expected poses that the graph determines, found one that is free"
+            ) from error
     net = gtsam.GaussianBayesNet()
     for conditional in reversed(factors_of(graph_of(tree))):  # a tree gives its root first
         net.push_back(cast("gtsam.GaussianConditional", conditional))
@@ -198,6 +210,11 @@ class Damping:
     @property
     def exhausted(self) -> bool:
         return self.weight > self._most
+
+    @property
+    def is_light(self) -> bool:
+        """Whether no more than in a first step."""
+        return self.weight <= self._first
 
     def lower(self) -> None:
         self.weight = max(0.1 * self.weight, self._least)

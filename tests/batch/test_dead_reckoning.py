@@ -14,6 +14,7 @@ from pathspace_graph.factors.se2 import path_lengths, relative, wrap_angle
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.rows import OdometryChain
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
@@ -61,6 +62,20 @@ def test_the_drift_of_the_odometry_is_taken_out() -> None:
     assert np.hypot(*(reckoned - truth)[-1, :2]) > 2.0
     assert np.hypot(*(aligned.poses - truth)[:, :2].T).max() < 0.7
     np.testing.assert_allclose(aligned.calibration[1], BIAS, rtol=0.3)
+
+
+def test_a_vehicle_that_rests_far_from_its_start_is_not_taken_for_free() -> None:
+    """Its last poses are certain relative to each other, by far more than relative to the first one."""
+    deltas = np.repeat([[0.8, 0.0, 0.02], [0.0, 0.0, 0.0]], [220, 20], axis=0)
+    sigmas = np.repeat([[0.14, 0.05, 0.02], [5e-4, 5e-4, 5e-5]], [220, 20], axis=0)
+    odometry = OdometryChain()
+    odometry.deltas, odometry.by_calibration = deltas, np.zeros((240, 3, 2))
+    odometry.whiteners = np.array([np.diag(1.0 / sigma) for sigma in sigmas])
+    prior, still = np.diag([1e8, 1e8, 1e10]), np.zeros((241, 3))
+    chain = LogOdometry(np.arange(241.0), still[0], prior, odometry, still, np.zeros(2), np.full(2, 1e-3))
+    aligned = aligned_odometry(chain, ())
+    np.testing.assert_allclose(aligned.poses, chain.dead_reckoned(np.zeros(2)), atol=1e-9)
+    np.testing.assert_allclose(aligned.covariances[-1, 2, 2], 1e-10 + (sigmas[:, 2] ** 2).sum(), rtol=1e-4)
 
 
 def test_what_is_aligned_is_a_minimum_of_odometry_and_revisits() -> None:

@@ -141,7 +141,7 @@ def test_the_mean_of_the_marginal_is_near_the_optimum_by_its_own_covariance() ->
 
 
 def test_few_rounds_do_not_converge() -> None:
-    _, _, convergence = lap_optimum(open_lap(), Effort(rough_rounds=1, rounds=1, knot_passes=1))
+    _, _, convergence = lap_optimum(open_lap(), Effort(rough_rounds=1, rounds=1))
     assert not convergence.converged
 
 

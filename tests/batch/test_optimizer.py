@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.association import associate
 from pathspace_graph.batch.optimizer import (
     GATE_FACTOR,
     LOOSE_GATE,
@@ -13,8 +16,9 @@ from pathspace_graph.batch.optimizer import (
     Effort,
     Optimizer,
     extrapolation_factor,
+    predicted_decrease,
 )
-from pathspace_graph.batch.system import BatchSystem
+from pathspace_graph.batch.system import BatchSystem, Evaluation
 from pathspace_graph.graph.elimination import Damping
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
@@ -62,24 +66,50 @@ def test_it_ends_where_nothing_changes_any_more() -> None:
     np.testing.assert_allclose(again.state.poses, at.state.poses, atol=5e-3)
 
 
+def decrease_and_step(system: BatchSystem, at: Evaluation) -> tuple[float, Array]:
+    """Returns the undamped step at a state, and the decrease of the cost that it predicts."""
+    problem = system.eliminated(at)
+    step = problem.step(np.zeros(problem.map.size))
+    return predicted_decrease(system.rows(at), at.state.variables.layout, step), step
+
+
 def test_the_predicted_decrease_is_that_of_a_linear_problem() -> None:
-    """Near the optimum an undamped step makes the cost smaller by just that."""
+    """Near the optimum an undamped step makes the cost smaller by just that: `1/2 g' H^-1 g`."""
     system, state = noisy()
-    optimizer = Optimizer(system)
-    at, convergence = optimizer.run(state, BATCH.gate, 40)
-    assert optimizer.predicted_decrease(at) <= TOLERANCE_DECREASE
-    np.testing.assert_allclose(convergence.gradient, np.sqrt(2.0 * optimizer.predicted_decrease(at)))
+    at, _ = Optimizer(system).run(state, BATCH.gate, 40)
     off = np.random.default_rng(4).normal(0.0, 1e-3, len(at.state.variables.values))
     beside = system.evaluate(system.retract(at.state, off))
-    problem = system.eliminated(beside)
-    step = problem.step(np.zeros(problem.map.size))
+    predicted, step = decrease_and_step(system, beside)
     decrease = beside.cost - system.evaluate(system.retract(beside.state, step)).cost
-    np.testing.assert_allclose(optimizer.predicted_decrease(beside), decrease, rtol=0.1)
+    np.testing.assert_allclose(predicted, decrease, rtol=0.1)
+    _, vector = system.linear_graph(beside).hessian(beside.state.variables.layout.ordering)
+    np.testing.assert_allclose(predicted, 0.5 * vector @ step, rtol=1e-6)
+
+
+def test_it_ends_with_a_step_of_a_small_part_of_a_sigma() -> None:
+    """The next one would be shorter."""
+    system, state = noisy()
+    at, convergence = Optimizer(system).run(state, BATCH.gate, 40)
+    assert convergence.gradient <= np.sqrt(2.0 * TOLERANCE_DECREASE)
+    assert np.sqrt(2.0 * decrease_and_step(system, at)[0]) < convergence.gradient
+
+
+def test_associations_that_hardly_change_are_searched_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+
+    def counted(*arguments: Any) -> None:
+        searched.append(arguments)
+        associate(*arguments)
+
+    monkeypatch.setattr("pathspace_graph.batch.optimizer.associate", counted)
+    system, state = noisy()
+    _, convergence = Optimizer(system, Effort(tolerance=1e-4)).run(state, BATCH.gate, 40)
+    assert 1 <= len(searched) < convergence.rounds
 
 
 def test_a_tolerance_ends_it_sooner() -> None:
     rounds = []
-    for tolerance in (1.0, 100.0):
+    for tolerance in (1e-4, 100.0):
         system, state = noisy()
         _, convergence = Optimizer(system, Effort(tolerance=tolerance)).run(state, BATCH.gate, 40)
         rounds.append(convergence.rounds)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import associate, locate_poses
-from pathspace_graph.batch.optimizer import gradient
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import start_odometry
 from pathspace_graph.batch.system import BatchSystem, Biweight, moved
@@ -63,7 +62,6 @@ def test_the_gradient_is_that_of_the_cost() -> None:
         costs = [system.evaluate(moved(state, s * h * direction)).cost for s in (1.0, -1.0)]
         slope = (costs[0] - costs[1]) / (2.0 * h)
         np.testing.assert_allclose(-negative_gradient @ direction, slope, rtol=1e-4)
-    np.testing.assert_allclose(gradient(system.rows(at), layout), -negative_gradient, atol=1e-7)
 
 
 def test_the_step_is_that_of_gtsam() -> None:
