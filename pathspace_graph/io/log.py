@@ -126,6 +126,9 @@ class Detections(Brief):
         )
 
 
+KINDS: Final = ("cones", "line")  # detections of things that stay where they are, or points of a line
+
+
 @dataclass(frozen=True)
 class SensorInfo:
     """What is known of the sensor; None where the log does not say."""
@@ -138,6 +141,8 @@ class SensorInfo:
     """Field of view, the whole angle, rad."""
     rate: float | None = None
     """Perception cycles per second, Hz."""
+    kind: str | None = None
+    """One of KINDS."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -226,7 +231,6 @@ def read_log(folder: Path | str) -> Log:
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
     header = Header(folder / LOG_FILE)
     odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
-    sensor = [name for name in vars(SensorInfo()) if name in header.section("sensor")]
     truth = header.section("truth")
     true_errors = {
         name: np.array([header.numbers("truth", entry).item() for entry in entries])
@@ -237,11 +241,17 @@ def read_log(folder: Path | str) -> Log:
         odometry=odometry,
         cycles=_cycles(table, float(odometry.t[0]), float(odometry.t[-1])),
         odometry_sigma=header.numbers("odometry", "sigma", 3, POSITIVE),
-        sensor=SensorInfo(**{name: header.numbers("sensor", name, 1, POSITIVE).item() for name in sensor}),
+        sensor=_read_sensor(header),
         source={key: str(value) for key, value in header.section("source").items()},
         **header.noise(),
         truth=_read_truth(folder, len(table), true_errors),
     )
+
+
+def _read_sensor(header: Header) -> SensorInfo:
+    numbers = [name for name in ("range_max", "fov", "rate") if name in header.section("sensor")]
+    values = {name: header.numbers("sensor", name, 1, POSITIVE).item() for name in numbers}
+    return SensorInfo(**values, kind=header.word("sensor", "kind", KINDS))
 
 
 def _table(folder: Path, name: str) -> Table:
@@ -388,7 +398,11 @@ def _sections(log: Log) -> dict[str, dict[str, Any]]:
         truth |= {} if values is None else dict(zip(entries, values.tolist(), strict=True))
     return {
         "odometry": {"sigma": [float(value) for value in log.odometry_sigma]},
-        "sensor": {name: float(value) for name, value in vars(log.sensor).items() if value is not None},
+        "sensor": {
+            name: value if isinstance(value, str) else float(value)
+            for name, value in vars(log.sensor).items()
+            if value is not None
+        },
         **noise_sections(log.odometry_stated, log.detections_stated, log.measured),
         "source": {toml_text(key): value for key, value in log.source.items()},
         **({"truth": truth} if truth else {}),
