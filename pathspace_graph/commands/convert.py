@@ -98,7 +98,7 @@ class Convert:
         rule = LabelRule(self.labels, self.label_field)
         with progress("converting"):
             record = windowed(self._read(source, rule), self.window, source)
-            log = with_measured_noise(to_log(record, self.frames, self.noise, source))
+            log = with_measured_noise(to_log(record, self.frames, self.noise, source, self.window.spacing))
             write_checked(log, out, source)
         report(record.notes, rule, log, out)
         tell(hints(log))
@@ -114,8 +114,8 @@ class Convert:
 
 def with_measured_noise(log: Log) -> Log:
     """Return a log whose noise is measured where nobody has stated it."""
-    if log.odometry_stated and log.detections_stated:
-        return log
+    if log.sensor.kind == "line" or (log.odometry_stated and log.detections_stated):
+        return log  # cones tell the noise
     scale = scale_of(log)
     measured = scaled(measure_log(scaled(log, 1.0 / scale)), scale)
     if measured is None:

@@ -92,6 +92,11 @@ class Frames:
             raise SettingsError(f"{expected}, found {' '.join(f'{value:g}' for value in mounting)}")
 
     @property
+    def sides(self) -> NDArray[np.float64]:
+        """Return by what a point [x, y] (2,) of the sensor is multiplied, so that y points to the left."""
+        return np.array([1.0, 1.0 if self.y == "left" else -1.0])
+
+    @property
     def flip(self) -> NDArray[np.float64]:
         """Return by what a twist [vx, vy, wz] (3,) is multiplied, so that its y axis points to the left."""
         return np.array([1.0, 1.0, 1.0] if (self.y_odometry or self.y) == "left" else [1.0, -1.0, -1.0])
@@ -109,6 +114,10 @@ class Window:
     """Time after the first odometry at which the log begins (s)."""
     end: float = inf
     """Time after the first odometry at which the log ends (s)."""
+    spacing: float | None = None
+    """Distance of points along a line, a kerb or a wall (m), to which dense ones are thinned and polylines
+    interpolated. It says that all detections are of lines. Without it those of a LaserScan and of polylines
+    are, at a tenth of their median range."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.start < self.end:
@@ -116,6 +125,8 @@ class Window:
             raise SettingsError(f"--start, --end: expected times of at least 0 in this order, {found}")
         if self.range_max is not None and not 0.0 < self.range_max < inf:
             raise SettingsError(f"--range-max: expected a positive number, found {self.range_max:g}")
+        if self.spacing is not None and not 0.0 < self.spacing < inf:
+            raise SettingsError(f"--spacing: expected a positive number, found {self.spacing:g}")
         if not isfinite(self.time_offset):
             raise SettingsError(f"--time-offset: expected a number, found {self.time_offset:g}")
 
