@@ -159,8 +159,8 @@ def _with_lines(record: Recording, odometry: Odometry, frames: Frames, spacing: 
 def _without_lines(record: Recording) -> Recording:
     """Return a record of points that stand alone, without polylines beside them."""
     scans = [scan.where(scan.lines == ALONE) for scan in record.scans]
-    left_out = count(record.scans) - count(scans)
-    record.notes["points of polylines beside cones were left out (--spacing takes both as lines)"] += left_out
+    notes, left_out = record.notes, count(record.scans) - count(scans)
+    notes["points of polylines beside cones were left out (--spacing takes both as lines)"] += left_out
     return replace(record, scans=scans)
 
 
