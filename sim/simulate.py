@@ -146,8 +146,10 @@ def _bend(sensor: SensorSettings) -> FloatArray | None:
 
 
 def _sensor_info(settings: SimulationSettings) -> SensorInfo:
-    sensor, kind = settings.sensor, "line" if settings.line.spacing else None
-    return SensorInfo(sensor.range_max, sensor.fov, sensor.rate, kind)
+    sensor = settings.sensor
+    return SensorInfo(
+        sensor.range_max, sensor.fov, sensor.rate, kind="line" if settings.line.spacing else None
+    )
 
 
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:

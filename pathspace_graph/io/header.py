@@ -61,7 +61,7 @@ class Header:
             raise InputError(self.file, f"expected {what} as [{path}] {name}, found {shown(value)}")
         return np.array(values, dtype=float)
 
-    def word(self, path: str, name: str, known: tuple[str, ...]) -> str | None:
+    def word(self, path: str, name: str, known: tuple[str, ...]) -> Any:
         """Return an entry that is one of the known words, or None where there is none."""
         value = self.section(path).get(name)
         if value is None or value in known:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, get_args
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS
+from pathspace_graph.settings.mapper import Kind
 
 from . import parsing as limits
 from .brief import Brief, pictures
@@ -126,7 +127,7 @@ class Detections(Brief):
         )
 
 
-KINDS: Final = ("cones", "line")  # detections of things that stay where they are, or points of a line
+KINDS: Final = get_args(Kind)
 
 
 @dataclass(frozen=True)
@@ -141,8 +142,8 @@ class SensorInfo:
     """Field of view, the whole angle, rad."""
     rate: float | None = None
     """Perception cycles per second, Hz."""
-    kind: str | None = None
-    """One of KINDS."""
+    kind: Kind | None = None
+    """What detections are of."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
