@@ -18,7 +18,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
-from .kind import of_line
+from .lines import merged, of_line
 from .log_odometry import LogOdometry, chained
 from .measurement import measure
 from .motion import MotionCheck
@@ -81,6 +81,7 @@ class FrontEnd:
         noise, check, sides = self.noise, self._motion, self._sides
         of_orange = is_orange(detections)
         cones, orange = detections.where(~of_orange), detections.where(of_orange)
+        cones = merged(cones, of_line(cones.labels, self._settings))
         checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
         is_line = of_line(cones.labels, self._settings)
         motion = check.update(odometry, checked, noise.is_settled, is_line)

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose, move_points, relative
 from pathspace_graph.io.log import Detections, Log, Odometry
@@ -21,7 +21,7 @@ from pathspace_graph.settings.mapper import Kind, MapperSettings
 
 COMPARED: Final = 2  # nearest detections of a side that are compared: noise and drift grow with the range
 PARTNERS: Final = 10  # nearest detections of an earlier cycle among which each of them has its partner
-MOVED: Final = 0.2  # least way between both cycles, over the gap: at rest a line is seen at the same places
+MOVED: Final = 0.25  # least way between both cycles, over the gap: at rest a line is seen at the same places
 LONGEST: Final = 1.5  # longest time between them (s), over which odometry hardly drifts
 MOST_AWAY: Final = 1.5  # largest distance that counts, over half the gap
 FEWEST: Final = (
@@ -138,10 +138,3 @@ def with_kind(settings: MapperSettings, log: Log) -> MapperSettings:
     """Return settings with the kind of a log's sensor where they leave it open; lines have no stations."""
     kind = settings.kind or log.sensor.kind or kind_of(log)
     return replace(settings, kind=kind, stations=settings.stations and kind != "line")
-
-
-def of_line(labels: IntArray, settings: MapperSettings) -> BoolArray:
-    """Return which detections (m,) are points of a line: all where both sides are, whatever the label."""
-    if settings.kind == "line":
-        return np.ones(len(labels), bool)
-    return np.isin(labels, settings.lines)

@@ -15,7 +15,6 @@ from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation, to_map
 
 LINE_REACH: Final = 1.5  # reach of a line by that of a cone: its points are spread over the gap of points
-MOST_POINTS: Final = 40  # points of a cycle that are matched and remembered, which bounds the time
 LEAST_POINTS: Final = 2.0  # least sum of weights of the points that tell a line
 LEAST_SPREAD: Final = 0.3  # least standard deviation of these along the line, by the reach
 LEAST_SHAPE: Final = 4.0  # least ratio of their variances along and across it: others are no line
@@ -45,13 +44,6 @@ class Targets(NamedTuple):
     weights: Array  # (m,) sums of the weights of these points
     normals: Array  # (m, 2) unit vectors across the line; zero for cones
     matched: BoolArray  # (m,) whether there is a line, or a cone
-
-
-def thinned(is_line: BoolArray) -> BoolArray:
-    """Return which detections (m,) are matched: all of cones, and at most `MOST_POINTS` of a line, evenly."""
-    kept, line = ~is_line, np.flatnonzero(is_line)
-    kept[line[:: -(-len(line) // MOST_POINTS) or 1]] = True
-    return kept
 
 
 def targets_on_lines(placed: Array, recent: Array, reach: float, farthest: float) -> Targets:

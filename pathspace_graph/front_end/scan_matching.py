@@ -23,7 +23,7 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
 
-from .line_matching import HEADING_TOLD, Limits, match_lines, squares_at, thinned
+from .line_matching import HEADING_TOLD, Limits, match_lines, squares_at
 
 LEARNED_ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
 SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
@@ -164,13 +164,10 @@ LIMITS: Final = Limits(FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED
 def match_with_lines(
     recent: RecentDetections, lines: RecentDetections, seen: Seen, start: Array, reaches: Sequence[float]
 ) -> Match:
-    """Lay detections on recent ones, of cones and of lines, from a pose (3,); those of lines are thinned."""
-    kept = thinned(seen.is_line)
+    """Lay detections on recent ones, of cones and of lines, from a pose (3,)."""
     points = recent.points, lines.points
-    pose, information, matched, square = match_lines(points, seen.where(kept), start, reaches, LIMITS)
-    is_matched = np.zeros(len(kept), bool)
-    is_matched[kept] = matched
-    return Match(pose, information, is_matched, square / max(int(matched.sum()), 1), by_lines=True)
+    pose, information, matched, square = match_lines(points, seen, start, reaches, LIMITS)
+    return Match(pose, information, matched, square / max(int(matched.sum()), 1), by_lines=True)
 
 
 def misfit_with_lines(recent: RecentDetections, lines: RecentDetections, seen: Seen, pose: Array) -> float:
@@ -302,7 +299,7 @@ class ScanMatcher:
 
     def remember(self, detections: Detections, twist: Array, pose: Array, is_line: BoolArray) -> None:
         """Remember a cycle that was seen from a pose (3,), in motion by a twist (3,)."""
-        for recent, chosen in ((self.recent, ~is_line), (self.recent_lines, is_line & thinned(is_line))):
+        for recent, chosen in ((self.recent, ~is_line), (self.recent_lines, is_line)):
             measured = detections.points_vehicle[chosen]
             recent.add(detections.t, measured, by_errors(measured, twist), pose)
 
