@@ -1,4 +1,4 @@
-"""The vehicle's sensors: noisy odometry and detected cones."""
+"""The vehicle's sensors: noisy odometry, and a detector of cones."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -51,14 +51,14 @@ class OdometryNoise:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """What the cone detector sees, and its errors."""
+    """What the sensor sees, and its errors."""
 
     rate: float = 10.0
     """Perception cycles per second (Hz)."""
     range_max: float = 15.0
-    """Greatest true range of a detected cone (m)."""
+    """Greatest true range of a detection (m)."""
     range_min: float = 0.5
-    """Least true range of a detected cone (m)."""
+    """Least true range of a detection (m)."""
     fov: float = float(np.deg2rad(110.0))
     """Field of view, the whole angle (rad)."""
     range_sigma: float = 0.05
