@@ -10,14 +10,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from pathspace_graph.cli import main
 from pathspace_graph.convert.lines import DrivenWay, along_lines, are_lines, lines_of, resampled, thinned
 from pathspace_graph.convert.messages import ALONE, DENSE, Points, points_of
 from pathspace_graph.convert.recording import MessageStream
 from pathspace_graph.convert.settings import Frames, LabelRule
+from pathspace_graph.estimators import make_online
 from pathspace_graph.io.log import Log, Odometry, read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.run import run_online
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import sampled
 
 from ..scenes.corridor import BEAMS, MOUNTING, RANGE_MAX, Corridor, corridor, write_json_lines
 from .bags import Messages, Written, write_bag
@@ -239,6 +244,20 @@ def test_the_walls_of_a_corridor_have_their_sides(scene: Corridor, tmp_path: Pat
         true = np.where(to_left < to_right, LEFT, RIGHT)
         np.testing.assert_array_equal(cycle.labels[labelled], true[labelled])
     assert known > 0.9 * sum(counts[::10])
+
+
+@pytest.mark.slow
+def test_the_corridor_is_mapped(tmp_path: Path) -> None:
+    """A lap of 60 m closes, and both walls are mapped within a decimetre."""
+    scene = corridor(laps=2)
+    log = converted(write_json_lines(scene, tmp_path / "car.jsonl"), tmp_path / "log", "--from", "jsonl")
+    settings = MapperSettings()
+    result = run_online(log, make_online("fixed-lag", settings, log), name="fixed-lag")
+    assert result.map.closed
+    for name, wall in (("left", scene.left), ("right", scene.right)):
+        curve = sampled(result.map.boundaries[name].spline, 0.02)
+        assert KDTree(curve).query(wall)[0].max() < 0.15
+        assert result.map.boundaries[name].size <= 40
 
 
 def test_a_bag_of_scans_is_the_same_log(scene: Corridor, tmp_path: Path) -> None:
