@@ -14,9 +14,10 @@ from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
 from .messages import ALONE, Points
-from .settings import Frames
+from .settings import LEAST_SPACING, Frames
 
 SPACING_SHARE: Final = 0.15  # spacing by the median range, which has the size of the scene
+MOST_SAMPLES: Final = 1_000_000  # of the way driven
 STRETCH: Final = 2.0  # reach along the way, before and behind, by the range of a point
 FARTHEST: Final = 3.0  # distance from the way by that of the median point, beyond which it is of no boundary
 NEXT_LINE: Final = 1.5  # distance of a polyline from the way by that of the nearest one on its side
@@ -31,7 +32,7 @@ def are_lines(scans: list[Points], spacing: float | None) -> bool:
 def default_spacing(scans: list[Points]) -> float:
     """Return the spacing (m) of a record that states none."""
     points = np.concatenate([np.zeros((0, 2)), *(scan.points for scan in scans)])
-    return SPACING_SHARE * float(np.median(np.hypot(*points.T)))
+    return max(SPACING_SHARE * float(np.median(np.hypot(*points.T))), LEAST_SPACING)
 
 
 def lines_of(
@@ -142,7 +143,7 @@ class DrivenWay:
         moves = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
         poses = np.vstack([np.zeros(3), moves])
         s = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-        at = np.linspace(0.0, s[-1], int(np.ceil(s[-1] / step)) + 1)
+        at = np.linspace(0.0, s[-1], int(min(np.ceil(s[-1] / step), MOST_SAMPLES)) + 1)
         moved = np.diff(s, prepend=-1.0) > 0.0
         points = np.column_stack([np.interp(at, s[moved], poses[moved, k]) for k in range(2)])
         return cls(odometry.t, poses, s, points, at)

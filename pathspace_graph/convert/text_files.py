@@ -301,9 +301,13 @@ def _points_of_polylines(polylines: list[dict[str, Any]], rule: LabelRule) -> Po
 
 
 def _points_of_scan(scan: dict[str, Any], rule: LabelRule) -> Points:
-    limits = {"range_min": 0.0, "range_max": np.inf}
     ranges = [np.nan if value is None else float(value) for value in scan["ranges"]]
-    return scan_points(SimpleNamespace(**{**limits, **scan, "ranges": ranges}))
+    fields = {key: float(scan[key]) for key in ("angle_min", "angle_increment")}
+    fields |= {
+        "range_min": float(scan.get("range_min", 0.0)),
+        "range_max": float(scan.get("range_max", np.inf)),
+    }
+    return scan_points(SimpleNamespace(ranges=ranges, **fields))
 
 
 _READERS: Final[

@@ -297,6 +297,36 @@ def test_json_lines_hold_polylines(tmp_path: Path) -> None:
     assert main(["convert", str(tmp_path / "drive.jsonl"), *options]) == 2
 
 
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"scan": {"ranges": [1.0]}},
+        {"scan": {"angle_min": 0.0, "angle_increment": "x", "ranges": [1.0]}},
+        {"scan": [1.0]},
+        {"polylines": [[[0.0, 1.0]]]},
+        {"polylines": [{"points": [[0.0, 1.0, 2.0]]}]},
+    ],
+)
+def test_a_wrong_line_is_named(
+    entry: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = ['{"t": 0.0, "twist": [1.0, 0.0, 0.0]}', json.dumps({"t": 0.1, **entry})]
+    (tmp_path / "drive.jsonl").write_text("\n".join(lines))
+    source = str(tmp_path / "drive.jsonl")
+    assert main(["convert", source, "--from", "jsonl", "--out", str(tmp_path / "log")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert (
+        "row 2: expected a line with t, and with twist [vx, vy, wz], detections, polylines or a scan" in said
+    )
+
+
+def test_points_at_the_sensor_itself_have_a_spacing() -> None:
+    scans = [Points.of(np.zeros((3, 2)), np.full(3, UNKNOWN), lines=DENSE)]
+    found = lines_of(np.array([1.0]), scans, AHEAD, Frames(), None, Counter())
+    assert len(found[0].labels) == 1
+
+
 def test_a_column_numbers_the_polylines_of_a_csv_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -313,7 +343,7 @@ def test_a_column_numbers_the_polylines_of_a_csv_file(
     assert "80 points of lines are 1 m apart (--spacing), of 40 that were recorded" in capsys.readouterr().out
     refused = ["convert", str(tmp_path), "--from", "csv", "--out", str(tmp_path / "bad"), "--spacing", "0"]
     assert main(refused) == 2
-    assert "--spacing: expected a positive number, found 0" in capsys.readouterr().err
+    assert "--spacing: expected at least 0.001 m, found 0" in capsys.readouterr().err
 
 
 def test_polylines_beside_cones_are_left_out_unless_a_spacing_is_stated(
