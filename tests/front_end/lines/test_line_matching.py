@@ -14,7 +14,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.lines import line_drive
+from ...scenes.lines import line_drive
 
 AT = np.arange(0.0, 15.0, 0.4)
 CORRIDOR = np.concatenate([np.column_stack([AT, np.full(len(AT), side)]) for side in (2.0, -2.0)])

@@ -13,7 +13,7 @@ from pathspace_graph.io.log import Detections, Odometry, SensorInfo
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.lines import line_drive
+from ...scenes.lines import line_drive
 
 SPEED, PERIOD, SIGMA = 10.0, 0.1, 0.05
 Row = Callable[[int, float], np.ndarray]  # x (k,) of a row's points, vehicle frame, in a cycle at x (m)
