@@ -102,7 +102,8 @@ def width_and_gap(detections: Detections) -> tuple[float, float]:
     usable = (np.abs(detections.points_vehicle) < SCENE_FARTHEST).all(axis=1)  # the gate drops the others
     near = detections.where(np.asarray(usable))
     points, covariances, sides = near.points_vehicle, near.covariances, side_of(near)
-    rows = [nearest_cones(points[sides == s], covariances[sides == s], SCENE_NEAREST) for s in BOUNDARIES]
+    own = [np.flatnonzero(sides == label) for label in BOUNDARIES]
+    rows = [points[rows[nearest_cones(points[rows], covariances[rows], SCENE_NEAREST)]] for rows in own]
     if min(map(len, rows)) < SCENE_FEWEST:
         return np.nan, np.nan
     nearest = [np.asarray(KDTree(row).query(row, k=2)[0])[:, 1] for row in rows]
@@ -119,8 +120,8 @@ def side_of(detections: Detections) -> IntArray:
     return np.where(detections.points_vehicle[:, 1] > 0.0, LEFT, RIGHT)
 
 
-def nearest_cones(points: Array, covariances: Array, most: int) -> Array:
-    """Return the nearest detections (k, 2) of cones, each cone once, vehicle frame, the nearest first."""
+def nearest_cones(points: Array, covariances: Array, most: int) -> list[int]:
+    """Return the nearest detections of cones, each cone once, by index, the nearest first."""
     chosen: list[int] = []
     for k in np.argsort(np.hypot(*points.T)).tolist():
         apart = ((points[chosen] - points[k]) ** 2).sum(axis=1)
@@ -129,7 +130,7 @@ def nearest_cones(points: Array, covariances: Array, most: int) -> Array:
             chosen.append(k)
         if len(chosen) == most:
             break
-    return np.asarray(points[chosen])
+    return chosen
 
 
 def _nearest(widths: list[float], gaps: list[float]) -> float:

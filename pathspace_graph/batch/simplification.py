@@ -160,18 +160,28 @@ class Scatter:
         return np.asarray(self.sigma(label, u) / np.sqrt((basis**2).sum(axis=1)))
 
 
-def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperSettings) -> Scatter:
-    """Return the scatter of the detected cones about the curves of the state."""
+def scatter_about(
+    state: State, optimum: State, detections: DetectionTable, settings: MapperSettings
+) -> Scatter:
+    """Return the scatter of the detected cones about the curves of the state.
+
+    Of a line, it is that of the curve of the optimum, which follows it everywhere.
+    """
     seen, unseen, places, lengths = [], [], {}, {}
     for label, boundary in state.boundaries.items():
+        lengths[label] = boundary.length if boundary.periodic else np.inf
+        if label in settings.lines:
+            points = sampled(optimum.spline(label), NEED_STEP)
+            foot = boundary.find_anywhere(state.control_points(label), points)
+            seen.append(foot.distance)
+            unseen.append(foot.distance)
+            places[label] = foot.u
+            continue
         cones = cones_of_curve(state, detections, label, settings)
         foot, share = feet_of_cones(state, cones, label), boundary.size / max(len(cones.u), 1)
         seen.append(foot.distance)
-        is_line = label in settings.lines  # which is seen everywhere
-        predicted = cross_validated(cones.points, boundary.periodic, settings, share)
-        unseen.append(foot.distance if is_line else predicted)
+        unseen.append(cross_validated(cones.points, boundary.periodic, settings, share))
         places[label] = foot.u
-        lengths[label] = boundary.length if boundary.periodic else np.inf
     return Scatter(_rms(seen), _rms(unseen), places, lengths)
 
 
@@ -226,7 +236,7 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
     detections = deepcopy(detections)
     locate_poses(few)
     associate(few, detections, settings, settings.batch.gate, strict=True)
-    return Simplified(few, change, detections, scatter_of_cones(few, detections, settings))
+    return Simplified(few, change, detections, scatter_about(few, state, detections, settings))
 
 
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:

@@ -33,6 +33,10 @@ ENOUGH: Final = (
 )
 CONES: Final = 0.32  # median distance over half the gap up to which they are cones
 LINE: Final = 0.4  # from which on they are points of a line; between, it cannot be told
+ON_LINE: Final = (
+    3.0  # median distance across the line (sigmas) up to which they are on it: nothing is garbled
+)
+LEAST_SIGMA: Final = 1e-3  # least standard deviation of that distance (m)
 _OF_LINES: Final[dict[tuple[int, ...], Kind]] = {
     (): "cones",
     (LEFT,): "line-left",
@@ -47,17 +51,22 @@ class SideKind:
     def __init__(self) -> None:
         self._gaps: list[float] = []
         self._away: list[float] = []  # distances from the partners, over half the gap
+        self._across: list[float] = []  # distances from the line through the partners (sigmas)
         self._past: list[tuple[float, Array, Array]] = []  # stamp, pose (3,) and points (k, 2) of cycles
 
-    def see(self, t: float, pose: Array, points: Array) -> None:
-        """Compare points (k, 2) of a cycle, vehicle frame, nearest first, with those of an earlier one."""
+    def see(self, t: float, pose: Array, points: Array, sigmas: Array) -> None:
+        """Compare points (k, 2) of a cycle with those of an earlier one.
+
+        They are in the vehicle frame, the nearest first, with standard deviations (k,) of a coordinate (m).
+        """
         self._past = [one for one in self._past if one[0] >= t - LONGEST]
         if len(points) > 1:
             self._gaps.append(float(np.median(_from_nearest(points[:COMPARED], points))))
-            self._compare(pose, points[:COMPARED], float(np.median(self._gaps)))
+            gap = float(np.median(self._gaps))
+            self._compare(pose, points[:COMPARED], sigmas[:COMPARED], gap)
             self._past.append((t, pose, points))
 
-    def _compare(self, pose: Array, points: Array, gap: float) -> None:
+    def _compare(self, pose: Array, points: Array, sigmas: Array, gap: float) -> None:
         for _, earlier, partners in reversed(self._past):
             way = relative(earlier, pose)
             if np.hypot(way[0], way[1]) < MOVED * gap:
@@ -66,6 +75,8 @@ class SideKind:
             seen = np.hypot(*placed.T) < np.hypot(*partners[-1])
             away = np.hypot(*(placed[seen, None] - partners).transpose(2, 0, 1)).min(axis=1)
             self._away += np.minimum(away / (0.5 * gap), MOST_AWAY).tolist()
+            across = _from_line(placed[seen], partners) / np.maximum(2.0**0.5 * sigmas[seen], LEAST_SIGMA)
+            self._across += across.tolist()
             return
 
     @property
@@ -78,8 +89,10 @@ class SideKind:
         """Whether they are points of a line; None where that cannot be told."""
         if not self.is_final:
             return None
-        away = float(np.median(self._away))
-        return None if CONES < away < LINE else away > LINE
+        away, across = float(np.median(self._away)), float(np.median(self._across))
+        if away < CONES:
+            return False
+        return True if away > LINE and across < ON_LINE else None
 
 
 def _from_nearest(points: Array, others: Array) -> Array:
@@ -87,6 +100,14 @@ def _from_nearest(points: Array, others: Array) -> Array:
     distances = np.hypot(*(points[:, None] - others).transpose(2, 0, 1))
     distances[np.arange(len(points)), np.arange(len(points))] = np.inf
     return np.asarray(distances.min(axis=1))
+
+
+def _from_line(points: Array, corners: Array) -> Array:
+    """Return the distance (m,) of each point (m, 2) from the line through corners (k, 2), at least two."""
+    begin, step = corners[:-1], np.diff(corners, axis=0)
+    off = points[:, None] - begin
+    share = np.clip((off * step).sum(axis=2) / (step**2).sum(axis=1), 0.0, 1.0)
+    return np.asarray(np.hypot(*(off - share[..., None] * step).transpose(2, 0, 1)).min(axis=1))
 
 
 class KindJudge:
@@ -104,9 +125,11 @@ class KindJudge:
         side = side_of(detections)
         for label, judge in self._sides.items():
             if not judge.is_final:
-                own = side == label
-                points = nearest_cones(detections.points_vehicle[own], detections.covariances[own], PARTNERS)
-                judge.see(detections.t, self._pose, points)
+                own = np.flatnonzero(side == label)
+                points, covariances = detections.points_vehicle[own], detections.covariances[own]
+                near = nearest_cones(points, covariances, PARTNERS)
+                sigmas = np.sqrt(0.5 * np.trace(covariances[near], axis1=1, axis2=2))
+                judge.see(detections.t, self._pose, points[near], sigmas)
 
     @property
     def is_final(self) -> bool:

@@ -48,16 +48,16 @@ class Targets(NamedTuple):
 
 def targets_on_lines(placed: Array, recent: Array, reach: float, farthest: float) -> Targets:
     """Return the lines beside placed points (m, 2), by recent points (n, 2) within a reach (m)."""
-    step = placed[:, None] - recent
-    square = (step**2).sum(axis=2)
+    centre = placed.mean(axis=0)  # about which the moments are summed, or their differences would vanish
+    near, points = placed - centre, recent - centre
+    x, y = points.T
+    square = (near**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * near @ points.T
     weight = np.where(square < (farthest * reach) ** 2, np.exp(-0.5 * square / reach**2), 0.0)
     total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)
-    off = np.einsum("mn,mnk->mk", weight, step) / total[:, None]
-    spread = step - off[:, None]
-    xx, xy, yy = (
-        np.einsum("mn,mn,mn->m", weight, spread[..., i], spread[..., j]) / total
-        for i, j in ((0, 0), (0, 1), (1, 1))
-    )
+    means = weight @ np.column_stack([x, y, x * x, x * y, y * y]) / total[:, None]
+    mean, (xx, xy, yy) = means[:, :2], means[:, 2:].T
+    xx, xy, yy = xx - mean[:, 0] ** 2, xy - mean[:, 0] * mean[:, 1], yy - mean[:, 1] ** 2
+    off = near - mean
     middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     direction = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     tangents = np.column_stack([np.cos(direction), np.sin(direction)])

@@ -8,6 +8,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.mapper import MapperSettings
 
+MOST_CELLS: Final = 1 << 20  # in a row of cells, which is more than any sensor sees
 CELL: Final = 1.0  # side of the cells (m) in which points are merged: an arc of 9 m is 5 mm off their means
 
 
@@ -23,10 +24,9 @@ def merged(detections: Detections, is_line: BoolArray) -> Detections:
     if not is_line.any():
         return detections
     line = detections.where(is_line)
-    keys = np.column_stack([line.labels, np.floor(line.points_vehicle / CELL).astype(np.intp)])
-    _, first, cell, counts = np.unique(
-        keys, axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
+    column, row = np.floor(line.points_vehicle / CELL).astype(np.intp).T
+    keys = (line.labels * MOST_CELLS + column) * MOST_CELLS + row
+    _, first, cell, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
     points = _means(line.points_vehicle, cell, counts)
     covariances = _means(line.covariances.reshape(-1, 4), cell, counts) / counts[:, None]
     mean = Detections(line.t, points, covariances.reshape(-1, 2, 2), line.labels[first])
