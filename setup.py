@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from sysconfig import get_config_var
 
-from pybind11.setup_helpers import Pybind11Extension, build_ext
+from pybind11.setup_helpers import ParallelCompile, Pybind11Extension, build_ext
 from setuptools import setup
 
 NO_COMPILER = "expected a C++ compiler for the kernels, found none: install g++, or pip install ziglang"
@@ -41,13 +41,16 @@ class BuildKernels(build_ext):
         self.spawn([sys.executable, "-m", "ziglang", "c++", *flags, *ext.sources, "-o", str(target)])
 
 
+FOLDER = Path("pathspace_graph/factors/kernels")
 KERNELS = Pybind11Extension(
     "pathspace_graph.factors._kernels",
-    ["pathspace_graph/factors/kernels.cpp"],
+    sorted(map(str, FOLDER.glob("*.cpp"))),
+    depends=sorted(map(str, FOLDER.glob("*.hpp"))),
     cxx_std=17,
     extra_compile_args=["-O3", "-ffp-contract=off"],
 )
 
+ParallelCompile().install()
 setup(
     ext_modules=[KERNELS],
     cmdclass={"build_ext": BuildKernels},

@@ -1,4 +1,4 @@
-"""Compiled functions of arrays (`kernels.cpp`); `tests/oracles` has each in numpy, to which tests hold it.
+"""Compiled functions of arrays (`kernels/`); `tests/oracles` has each in numpy, to which tests hold it.
 
 Arrays of shapes that don't fit each other raise ValueError. Limits are tuples, in the order that is told.
 """
@@ -208,24 +208,49 @@ def block_of(layout: _Layout, groups: Sequence[_Rows]) -> tuple[IntArray, Array]
     ValueError where rows hold variables that the layout does not.
     """
 
-def owners_holding(rows: _Rows, ascending: IntArray) -> IntArray:
-    """Return the owners of rows that hold any of some ascending keys."""
+class RowStore:
+    """Rows `J d + r` with d = value - reference, which are kept until those of their owner are replaced.
 
-def parted(rows: _Rows, gone: IntArray) -> tuple[_Parts, _Parts]:
-    """Return the parts of rows without those of some ascending owners, and the parts of the latter."""
-
-def replaced(rows: _Rows, gone: IntArray, fresh: _Rows, layout: _Layout, change: Array) -> _Parts:
-    """Return the parts of rows without those of some ascending owners, and then those of fresh rows.
-
-    The fresh ones are linearized where a layout's unknowns are `change` (n,). ValueError for rows on others.
+    Keys and owners that are given are ascending.
     """
 
+    def __init__(self, groups: Sequence[_Rows] = ()) -> None: ...
+    def __bool__(self) -> bool:
+        """Return whether there are any rows."""
+
+    def copy(self) -> RowStore:
+        """Return a store that can change independently."""
+
+    def parts(self) -> list[_Parts]:
+        """Return keys, derivatives, residuals and owners of the rows of each widths of variables."""
+
+    def owners(self) -> IntArray:
+        """Return the owners of all rows, which may occur several times."""
+
+    def holding(self, keys: IntArray) -> IntArray:
+        """Return the owners of rows that hold any of some keys (k,)."""
+
+    def stale(self, owners: IntArray, keys: IntArray) -> BoolArray:
+        """Return which owners (k,) have no rows, or hold any of some keys."""
+
+    def replace(self, owners: IntArray, fresh: Sequence[_Rows], layout: _Layout, change: Array) -> None:
+        """Replace all rows of some owners by fresh ones.
+
+        These are linearized where a layout's unknowns are `change` (n,). ValueError for rows on others.
+        """
+
+    def drop(self, owners: IntArray) -> None:
+        """Remove all rows of some owners."""
+
+    def pop(self, owner: int, layout: _Layout) -> tuple[IntArray, Array]:
+        """Remove the rows of an owner; return them as `block_of` does."""
+
 def summed(
-    layout: _Layout, factors: list[tuple[IntArray, Array]], groups: Sequence[_Rows], change: Array
+    layout: _Layout, factors: list[tuple[IntArray, Array]], stores: Sequence[RowStore], change: Array
 ) -> tuple[Array, Array]:
     """Return the lower triangle of H (n, n), by columns, and the negative gradient (n,), at `change` (n,).
 
-    They are sums over factors with `[[L, g], [g', f]]` and over rows `J d + r`, on variables of a layout.
+    They are sums over factors with `[[L, g], [g', f]]` and over all rows of stores, on variables of a layout.
     """
 
 # --- frames of poses -------------------------------------------------------------------------------------

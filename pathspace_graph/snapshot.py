@@ -25,7 +25,9 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors import linear
+from pathspace_graph.factors._kernels import RowStore
 from pathspace_graph.graph.gaussian import factors_of, graph_of
+from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import sizes
 from pathspace_graph.io.files import atomic_file
 from pathspace_graph.io.parsing import read_bytes, shown
@@ -148,6 +150,11 @@ def nothing() -> None:
     """Return None: what a process is about to give is asked for again."""
 
 
+def store_of(*groups: tuple[Any, Any, Any, Any]) -> RowStore:
+    """Return the store of groups of rows, each by keys, derivatives, residuals and owners."""
+    return RowStore([Rows(*parts) for parts in groups])
+
+
 def bayes_net_of(*conditionals: gtsam.GaussianConditional) -> gtsam.GaussianBayesNet:
     """Return a net of conditionals, in this order."""
     net = gtsam.GaussianBayesNet()
@@ -191,6 +198,7 @@ MAKERS: Final[dict[type, tuple[Callable[..., Any], Callable[[Any], Iterable[Any]
     deque: (deque, lambda ring: ([*ring], ring.maxlen)),
     KDTree: (tree_of, lambda tree: (np.array(tree.data),)),
     Future: (nothing, lambda _: ()),
+    RowStore: (store_of, RowStore.parts),
     gtsam.GaussianFactorGraph: (graph_of, factors_of),
     gtsam.GaussianBayesNet: (bayes_net_of, factors_of),
     gtsam.GaussianConditional: (conditional_of, _conditional_parts),

@@ -27,7 +27,6 @@ from .variables import (
     CALIBRATION_KEY,
     CALIBRATION_LETTER,
     INDEX_BITS,
-    NO_KEYS,
     POSE,
     Layout,
     Variables,
@@ -105,11 +104,15 @@ def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.
 def _factor(parts: Sequence[Rows], layout: Layout) -> gtsam.GaussianConditional:
     """Return the factor of rows on the variables of a layout."""
     try:
-        held, block = kernels.block_of(layout, parts)
+        return factor_of_block(layout, *kernels.block_of(layout, parts))
     except ValueError:
         for rows in parts:
             layout.places(rows.keys)  # it says which variable is not known
         raise
+
+
+def factor_of_block(layout: Layout, held: IntArray, block: Array) -> gtsam.GaussianConditional:
+    """Return the factor of rows `[J -r]` (m, n + 1), by columns, on a layout's variables at places (h,)."""
     matrix = gtsam.VerticalBlockMatrix([*layout.widths[held].tolist(), 1], block, False)
     return gtsam.GaussianConditional(layout.keys[held].tolist(), 1, matrix)
 
@@ -118,51 +121,6 @@ def stacked_factor(groups: Sequence[Rows], variables: Variables) -> list[gtsam.G
     """Return a list of one factor that holds all rows, or an empty list where there are no rows."""
     stacked = [replace(rows, owner=np.zeros(len(rows), np.intp)) for rows in groups]
     return [*jacobian_factors(at_reference(stacked, variables), variables.layout).values()]
-
-
-class KeptRows:
-    """Rows `J d + r` with d = value - reference, which are kept until those of their owner are replaced."""
-
-    def __init__(self) -> None:
-        self.groups: list[Rows] = []  # one for each widths of variables, never empty
-
-    @property
-    def owners(self) -> IntArray:
-        """Return the owners of all rows, which may occur several times."""
-        return np.concatenate([NO_KEYS, *(rows.owner for rows in self.groups)])
-
-    def holding(self, keys: IntArray) -> IntArray:
-        """Return the owners of rows that hold any of some ascending keys (k,)."""
-        of_groups = (kernels.owners_holding(rows, keys) for rows in self.groups)
-        return np.concatenate([NO_KEYS, *of_groups])
-
-    def replace(self, owners: IntArray, groups: Sequence[Rows], variables: Variables) -> None:
-        """Replace all rows of some owners by rows that are linearized at the variables' values."""
-        kept, new = {rows.widths: rows for rows in self.groups}, dict[tuple[int, ...], Rows]()
-        for rows in groups:
-            if len(rows):
-                same = rows.widths in new
-                new[rows.widths] = stacked_rows([new[rows.widths], rows]) if same else rows
-        gone, change = np.sort(owners), variables.values - variables.reference
-        self.groups = []
-        for widths in {**new, **kept}:
-            fresh = new[widths] if widths in new else kept[widths].where(slice(0))
-            old = kept[widths] if widths in kept else fresh.where(slice(0))
-            rows = Rows(*kernels.replaced(old, gone, fresh, variables.layout, change))
-            if len(rows):
-                rows.__dict__["widths"] = widths
-                self.groups.append(rows)
-
-    def drop(self, owners: IntArray) -> list[Rows]:
-        """Drop the rows of some owners, and return them."""
-        both = [kernels.parted(rows, np.sort(owners)) for rows in (self.groups if len(owners) else ())]
-        if both:
-            self.groups = [Rows(*kept) for kept, _ in both if len(kept[0])]
-        return [Rows(*dropped) for _, dropped in both if len(dropped[0])]
-
-    def pop(self, owner: int, layout: Layout) -> gtsam.GaussianConditional:
-        """Remove the rows of an owner and return them as a factor."""
-        return _factor(self.drop(np.array([owner])), layout)
 
 
 def among(keys: IntArray, ascending: IntArray) -> BoolArray:
@@ -178,15 +136,15 @@ def stacked_rows(groups: Sequence[Rows]) -> Rows:
 
 
 def newton_system(
-    graph: gtsam.GaussianFactorGraph, groups: Sequence[Rows], layout: Layout, change: Array
+    graph: gtsam.GaussianFactorGraph, stores: Sequence[kernels.RowStore], layout: Layout, change: Array
 ) -> tuple[Array, Array]:
     """Return the lower triangle of H (n, n), stored by columns, and the negative gradient (n,) at `change`.
 
-    They are sums over the graph and over rows `J d + r`, on the variables of a layout. SingularSystemError
+    They are sums over the graph and the rows of stores, on the variables of a layout. SingularSystemError
     where nothing holds one of them, and ValueError where something holds another one.
     """
     factors = [(keys_of_factor(factor), factor.augmentedInformation()) for factor in factors_of(graph)]
-    hessian, gradient = kernels.summed(layout, factors, groups, change)
+    hessian, gradient = kernels.summed(layout, factors, stores, change)
     missing = layout.keys[hessian.diagonal()[layout.starts] == 0.0]
     if len(missing):
         raise SingularSystemError(f"expected a factor on every variable, found none on {names(missing)}")

@@ -198,7 +198,7 @@ class FixedLagSmoother(Generic[M_co]):
         held = self.chain.hold(self.variables) if self.chain is not None else []
         graph = graph_of(self.prior, *user, *held) if user or held else self.prior
         change = self.variables.change(entries)
-        hessian, negative_gradient = newton_system(graph, self.window.groups, layout, change)
+        hessian, negative_gradient = newton_system(graph, self.window.stores, layout, change)
         if sigma_step is not None:
             points = np.arange(layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start)
             hessian[points, points] += sigma_step**-2
@@ -252,8 +252,8 @@ class FixedLagSmoother(Generic[M_co]):
         if whole:
             return factorize(self.linear_graph(whole), self.variables.layout).covariance(keys)
         graph = graph_of(self.absolute_prior(), *self.user_factors.linearized(self.variables))
-        layout, rows = self.layout, self.window.fresh_rows(self.cycles)
-        hessian, _ = newton_system(graph, rows, layout, np.zeros(layout.size))
+        layout, fresh = self.layout, self.window.fresh_rows(self.cycles)
+        hessian, _ = newton_system(graph, [fresh], layout, np.zeros(layout.size))
         return FactoredSystem(layout, cholesky(hessian)).covariance(keys)
 
     def predicted_covariance(self, rows: Rows, together: int = 1) -> Array:
@@ -276,7 +276,7 @@ class FixedLagSmoother(Generic[M_co]):
         """Marginalize the oldest pose, or keep it as a keyframe if inactive variables depend on it."""
         cycle, key = self.first_cycle, pose_key(self.first_cycle)
         user = self.user_factors.remove(np.array([key]), self.variables)
-        factors = graph_of(self.window.measured.pop(cycle, self.variables.layout), *user)
+        factors = graph_of(self.window.pop(cycle), *user)
         if self.submaps is not None:
             self.submaps.add_pose(key, factors, self.variables)
         self.prior = graph_of(self.prior, factors)

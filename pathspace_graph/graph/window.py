@@ -13,12 +13,13 @@ import numpy as np
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors._kernels import RowStore
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.odometry import IntegratedOdometry
 
 from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_form
-from .rows import KeptRows, OdometryChain, Rows, among, at_reference, jacobian_factors, stacked_factor
+from .rows import OdometryChain, Rows, among, at_reference, factor_of_block, jacobian_factors, stacked_factor
 from .variables import (
     CALIBRATION_LETTER,
     NO_KEYS,
@@ -108,27 +109,29 @@ class WindowFactors(Generic[M_co]):
         self.odometry = OdometryChain()  # between each pose of the window and the next
         self.exact = False  # whether the tolerances are zero
         self._lengthened = -1  # the rows of this cycle lack the odometry that leads on from it
-        self.measured = KeptRows()  # of detections, and of the odometry to the next cycle, by cycle
-        self.gauge = KeptRows()  # nonlinear weak priors
-        self.linear_gauge = KeptRows()
+        self.measured = RowStore()  # of detections, and of the odometry to the next cycle, by cycle
+        self.gauge = RowStore()  # nonlinear weak priors
+        self.linear_gauge = RowStore()
         self._tolerances = tolerances
         self._structure: object = None
 
     def copy(self) -> Self:
         """Return factors that can be linearized independently; the map is left to the owner of both."""
         other = shallow(self)
-        other.odometry, other.measured = shallow(self.odometry), shallow(self.measured)
-        other.gauge, other.linear_gauge = shallow(self.gauge), shallow(self.linear_gauge)
+        other.odometry, other.measured = shallow(self.odometry), self.measured.copy()
+        other.gauge, other.linear_gauge = self.gauge.copy(), self.linear_gauge.copy()
         return other
 
     @property
-    def groups(self) -> list[Rows]:
+    def stores(self) -> tuple[RowStore, RowStore, RowStore]:
         """Return all rows as they were linearized last, `J d + r` with d = value - reference."""
-        return [*self.measured.groups, *self.gauge.groups, *self.linear_gauge.groups]
+        return self.measured, self.gauge, self.linear_gauge
 
-    def fresh_rows(self, cycles: IntArray) -> list[Rows]:
+    def fresh_rows(self, cycles: IntArray) -> RowStore:
         """Return the rows of some cycles and the weak priors on the active map points, linearized now."""
-        return at_reference([*self._rows(cycles), *self._weak(False)], self.variables)
+        fresh = RowStore()
+        self._put(fresh, NO_KEYS, [*self._rows(cycles), *self._weak(False)])
+        return fresh
 
     def fresh(self, cycles: IntArray, whole: bool) -> list[gtsam.GaussianFactor]:
         """Return factors of some cycles and weak priors, on all points if `whole`, linearized now."""
@@ -150,7 +153,7 @@ class WindowFactors(Generic[M_co]):
         groups = self._rows(stale)
         if self.map.reached_inactive or any(among(rows.keys, inactive).any() for rows in groups):
             return False
-        self.measured.replace(stale, groups, self.variables)
+        self._put(self.measured, stale, groups)
         self._lengthened = -1
         self.map.linearized(stale)
         self._relinearize_gauge(moved)
@@ -163,13 +166,23 @@ class WindowFactors(Generic[M_co]):
         self.odometry.append(odometry)
         self._lengthened = cycle
 
+    def pop(self, cycle: int) -> gtsam.GaussianConditional:
+        """Remove the rows of a cycle, and return them as a factor."""
+        layout = self.variables.layout
+        return factor_of_block(layout, *self.measured.pop(cycle, layout))
+
     def drop(self, keys: IntArray) -> None:
         """Drop the rows of cycles that hold any of some ascending keys, so that they are linearized again."""
-        self.measured.drop(self.measured.holding(keys))
+        self.measured.drop(np.sort(self.measured.holding(keys)))
 
     def clear(self) -> None:
         """Drop every row, since the map has other variables."""
-        self.measured, self._structure = KeptRows(), None
+        self.measured, self._structure = RowStore(), None
+
+    def _put(self, store: RowStore, owners: IntArray, groups: Sequence[Rows]) -> None:
+        """Replace all rows of some ascending owners by rows that are linearized at the values."""
+        change = self.variables.values - self.variables.reference
+        store.replace(owners, groups, self.variables.layout, change)
 
     def _rows(self, cycles: IntArray) -> list[Rows]:
         return [*self.map.rows(cycles), *self.odometry.rows(self.variables, cycles)]
@@ -195,22 +208,22 @@ class WindowFactors(Generic[M_co]):
     def _stale(self, cycles: IntArray, moved: IntArray) -> IntArray:
         if np.array_equal(moved[-len(cycles) :], self.variables.keys[-len(cycles) :]):
             return cycles  # every pose has moved
-        stale = ~among(cycles, np.sort(self.measured.owners)) | (cycles == self._lengthened)
-        stale |= among(cycles, np.sort(np.append(self.map.changed(), self.measured.holding(moved))))
+        stale = self.measured.stale(cycles, moved) | (cycles == self._lengthened)
+        stale |= among(cycles, np.sort(self.map.changed()))
         return np.asarray(cycles[stale])
 
     def _relinearize_gauge(self, moved: IntArray) -> None:
         if self.map.structure is not self._structure:
-            self.gauge, self.linear_gauge, self._structure = KeptRows(), KeptRows(), self.map.structure
-            self.linear_gauge.replace(NO_KEYS, self.map.linear_gauge(False), self.variables)
-        if (self.exact and len(moved)) or not self.gauge.groups:
-            self.gauge = KeptRows()
-            self.gauge.replace(NO_KEYS, self.map.gauge(False), self.variables)
+            self.gauge, self.linear_gauge, self._structure = RowStore(), RowStore(), self.map.structure
+            self._put(self.linear_gauge, NO_KEYS, self.map.linear_gauge(False))
+        if (self.exact and len(moved)) or not self.gauge:
+            self.gauge = RowStore()
+            self._put(self.gauge, NO_KEYS, self.map.gauge(False))
             return
         stale = np.unique(self.gauge.holding(moved))
         if len(stale):
             weak = [rows.where(among(rows.owner, stale)) for rows in self.map.gauge(False)]
-            self.gauge.replace(stale, weak, self.variables)
+            self._put(self.gauge, stale, weak)
 
 
 class UserFactors:

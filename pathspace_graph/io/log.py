@@ -121,6 +121,8 @@ class Detections(Brief):
 
     def with_others(self, other: Detections) -> Detections:
         """Return these detections followed by other ones of the same cycle."""
+        if len(other.labels) == 0:
+            return self
         names = ("points_vehicle", "covariances", "labels")
         return Detections(
             self.t, *(np.concatenate([getattr(of, name) for of in (self, other)]) for name in names)

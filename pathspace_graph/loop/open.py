@@ -57,20 +57,16 @@ class Open:
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
         """Look for a return, which begins a batch, and go on from the batch or from road met again."""
         learned = drive.inflate_priors(road, reading)
-        rests = drive.rests(road)
-        looks = road.boundaries and not (rests or drive.solver.is_busy)
-        found = self.returns.by_curves(road) if looks else None
-        drive.record.estimated(road)  # after the search, which may have moved the open map
-        step = Step(self) if rests else self._step(road, drive, reading, found, spent)
+        drive.record.estimated(road)
+        step = Step(self) if drive.rests(road) else self._step(road, drive, reading, spent)
         return replace(step, notice=joined([step.notice, learned]))
 
-    def _step(
-        self, road: Road, drive: Drive, reading: Reading, found: RefinedMotion | None, spent: float
-    ) -> Step:
-        if found is not None and not self._is_solvable(road, drive):
-            return self._close_by_prior(road, drive, found)
+    def _step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
         if not drive.solver.is_busy:
-            self._begin_batch(road, drive, reading, found)
+            if not self._is_solvable(road, drive):
+                found = self.returns.by_curves(road)
+                return Step(self) if found is None else self._close_by_prior(road, drive, found)
+            self._begin_batch(road, drive, reading)
         if drive.solver.is_busy:
             outcome = drive.outcome(road, spent)
             return Step(self) if outcome is None else self.take(road, drive, outcome)
@@ -80,21 +76,17 @@ class Open:
         notice = "" if drive.revisits else REVISITED  # it is said once
         return Step(self, drive.lay_on(road, revisit), notice)
 
-    def _begin_batch(self, road: Road, drive: Drive, reading: Reading, found: RefinedMotion | None) -> None:
+    def _begin_batch(self, road: Road, drive: Drive, reading: Reading) -> None:
         """Send the lap to a batch where the newest detections, cones or curves lie on earlier ones.
 
         It closes the loop later, if it agrees; until then the map stays open.
         """
-        record, returns = drive.record, self.returns
-        if road.path.length <= self.settings.closing.min_path or not self._is_solvable(road, drive):
+        if road.path.length <= self.settings.closing.min_path:
             return
         drive.solver.prepare()
-        if found is not None:
-            revisit: Revisit | None = returns.revisit_of(road, record, found)
-        else:
-            revisit = returns.by_cones(road, record, reading.noise) or returns.by_shape(road, record)
+        revisit = self.returns.find(road, drive.record, reading.noise)
         if revisit is not None:
-            returns.rest(road, self.settings.open_lap.retry)
+            self.returns.rest(road, self.settings.open_lap.retry)
             self.returned_by = revisit
             drive.begin_batch(road, reading, revisit)
 

@@ -35,11 +35,12 @@ LONG_PATH: Final = 1000.0
 
 
 class ReturnFinder:
-    """The search for a return of an open road, in three ways, each some metres after its last attempt."""
+    """The search for a return of an open road, in three ways, of which one at most is tried in a cycle."""
 
     def __init__(self, settings: ClosingSettings) -> None:
         self._settings = settings
-        self._tried: dict[str, tuple[float, int]] = {}  # path (m) and cycle of the last attempt in each way
+        self._tried = dict.fromkeys(("curves", "cones", "shape"), (-inf, 0))
+        """Path (m) and cycle of the last attempt in each way."""
         self._rests_until = 0.0  # path (m)
         self._placed_until = 0.0  # path (m) up to which the vehicle is not lost (`is_lost`)
 
@@ -53,10 +54,23 @@ class ReturnFinder:
         """Look for no return for a length (m) from here on; zero ends a rest."""
         self._rests_until = road.path.length + length if length else 0.0
 
+    def find(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
+        """Return the newest pose beside an earlier one, in the way that is due and has waited longest."""
+        for way in sorted(self._tried, key=lambda one: self._tried[one][0]):
+            if not self._is_due(road, way):
+                continue
+            if way == "cones":
+                return self._by_cones(road, record, noise)
+            found = self._by_curves(road) if way == "curves" else recognize(road.smoother)
+            within = BEGINNING if way == "curves" else road.path.length - self._settings.min_path
+            return None if found is None else self._revisit_of(road, record, found, within)
+        return None
+
     def by_curves(self, road: Road) -> RefinedMotion | None:
-        """Return the motion that lays the newest detections on the beginning of the curves."""
-        if not self._is_near_start(road) or not self._is_due(road, "curves", self._settings.check_interval):
-            return None
+        """Return the motion that lays the newest detections on the beginning of the curves, if it is due."""
+        return self._by_curves(road) if self._is_due(road, "curves") else None
+
+    def _by_curves(self, road: Road) -> RefinedMotion | None:
         smoother, path, settings = road.smoother, road.path, self._settings
         smoother.transform_to_origin()
         track, times = smoother.map, smoother.times
@@ -68,28 +82,13 @@ class ReturnFinder:
         found = register(track, times, covariance, path.beginning, settings)
         return found if found is not None and passes_start(track.state, path, found.motion) else None
 
-    def by_cones(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
+    def _by_cones(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
         """Return the newest pose beside an early one, if the newest cones lie on those of the beginning."""
-        is_due = self._is_due(road, "cones", self._settings.check_interval, RETURN_CYCLES)
-        if not is_due or not self._is_near_start(road):
-            return None
         covariance = road.smoother.newest_covariance()
         seen_in = record.seen_in(road.smoother.variables.sensor, noise)
         return return_to_beginning(seen_in, unwrap(record.poses), covariance, road.settings)
 
-    def by_shape(self, road: Road, record: DriveRecord) -> Revisit | None:
-        """Return the newest pose beside an earlier one, if the newest curves match one earlier stretch."""
-        length = road.path.length
-        if not self._is_due(road, "shape", RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)):
-            return None
-        found = recognize(road.smoother)
-        return (
-            None if found is None else self.revisit_of(road, record, found, length - self._settings.min_path)
-        )
-
-    def revisit_of(
-        self, road: Road, record: DriveRecord, found: RefinedMotion, within: float = BEGINNING
-    ) -> Revisit:
+    def _revisit_of(self, road: Road, record: DriveRecord, found: RefinedMotion, within: float) -> Revisit:
         """Return the newest pose, once moved, beside the nearest one `within` the first metres."""
         poses = record.with_window(road)
         newest = poses[-1:].copy()
@@ -100,14 +99,19 @@ class ReturnFinder:
         ends = (earlier, poses[earlier]), (len(poses) - 1, newest[0])
         return relative_pose(*ends, newest[0], information)
 
-    def _is_near_start(self, road: Road) -> bool:
-        return near_start(road.path, road.poses[-1], self._settings)
-
-    def _is_due(self, road: Road, way: str, interval: float, cycles: float = inf) -> bool:
+    def _is_due(self, road: Road, way: str) -> bool:
         """Return whether to look for a return in a way again, some metres or cycles after the last time."""
         length, cycle = road.path.length, road.next_cycle
-        tried, tried_cycle = self._tried.get(way, (-inf, 0))
-        if length < self._rests_until or (length < tried + interval and cycle < tried_cycle + cycles):
+        tried, tried_cycle = self._tried[way]
+        interval = self._settings.check_interval
+        if way == "shape":
+            interval = RECOGNITION_INTERVAL * max(length / LONG_PATH, 1.0)
+        elif not near_start(road.path, road.poses[-1], self._settings):
+            return False
+        waited = way == "cones" and cycle >= tried_cycle + RETURN_CYCLES
+        if length < self._rests_until or (length < tried + interval and not waited):
+            return False
+        if way == "curves" and not road.boundaries:
             return False
         self._tried[way] = length, cycle
         return True

@@ -194,10 +194,17 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         return max(behind) * settings.spline.spacing >= settings.far.stretch
 
     def _needed(self, label: int, room: float = 0.0) -> IntArray:
-        """Return the control points (k,) that the window sees until the next cycle, and `room` (m) ahead."""
+        """Return the control points (k,) that the window sees until the next cycle, and `room` (m) ahead.
+
+        Detections in use may lie farther behind than a pose sees, since the road that they were seen from has
+        moved since.
+        """
         boundary, pose_u = self.map.state.boundaries[label], self.map.state.pose_u[label]
         gate, slide = self.map.settings.gate, self.map.settings.spline.refine_room
-        low = float(pose_u.min()) - gate.view_behind - slide
+        low = float(pose_u.min()) - gate.view_behind
+        if not boundary.periodic:
+            low = float(self.map.detections.u[self.map.detections.used_on(label)].min(initial=low))
+        low -= slide
         high = float(pose_u.max()) + gate.view_ahead + gate.station_ahead + slide + room
         if boundary.periodic and high - low >= boundary.length:
             return boundary.everything

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
+from types import BuiltinFunctionType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ Arguments = Callable[[np.random.Generator], tuple[Any, ...]]
 COUNT = 17
 """Rows of each argument."""
 
-KERNELS = {name: one for name, one in vars(kernels).items() if callable(one)}
+KERNELS = {name: one for name, one in vars(kernels).items() if isinstance(one, BuiltinFunctionType)}
 ORACLES = {
     name: one
     for module in (cones, curves, footpoint, front_end, measuring, rows)
@@ -51,7 +51,12 @@ def rows_of_a_system(rng: np.random.Generator) -> tuple[Any, ...]:
     """Two groups of rows, and a factor with its keys in any order."""
     layout, rows = rows_with_keys(rng)
     factor = rng.permutation(layout.keys)[:4], np.asfortranarray(information(rng, 13))
-    return layout, [factor], [rows, rows], rng.normal(size=layout.size)
+    return (
+        layout,
+        [factor],
+        [kernels.RowStore([rows]), kernels.RowStore([rows] * 2)],
+        rng.normal(size=layout.size),
+    )
 
 
 def links(rng: np.random.Generator) -> tuple[Any, ...]:
@@ -75,12 +80,6 @@ def links(rng: np.random.Generator) -> tuple[Any, ...]:
         layout.entries(np.concatenate([getattr(k, of).keys for k in both])) for of in ("leaving", "others")
     )
     return rng.normal(size=layout.size), both, frames, *columns
-
-
-def replaced_rows(rng: np.random.Generator) -> tuple[Any, ...]:
-    layout, rows = rows_with_keys(rng)
-    other = Rows(*rows.parts[:3], rng.integers(0, 9, COUNT))
-    return other, np.array([2, 3, 7]), rows, layout, rng.normal(size=layout.size)
 
 
 def rows_with_keys(rng: np.random.Generator) -> tuple[Layout, Rows]:
@@ -189,11 +188,8 @@ def views(rng: np.random.Generator, periodic: bool) -> tuple[Any, ...]:
 
 CASES: dict[str, Arguments] = {
     "summed": rows_of_a_system,
-    "block_of": lambda rng: ((system := rows_of_a_system(rng))[0], system[2]),
-    "replaced": replaced_rows,
+    "block_of": lambda rng: ((system := rows_with_keys(rng))[0], [system[1]] * 2),
     "moved_residual": lambda rng: (*rows_with_keys(rng), rng.normal(size=30)),
-    "parted": lambda rng: (rows_with_keys(rng)[1], np.array([2, 3, 7])),
-    "owners_holding": lambda rng: ((rows := rows_with_keys(rng))[1], rows[0].keys[2:4]),
     "laid_out": lambda rng: (np.sort(rng.integers(0, 50, COUNT)), 5, 40, (2, 5, 3), np.arange(0, 60, 7)),
     "columns_of": some_columns,
     "spread": lambda rng: (rng.integers(0, 99, COUNT), rng.integers(0, 4, COUNT)),

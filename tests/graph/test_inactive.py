@@ -25,7 +25,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import FarSettings, MapperSettings
 
 from ..scenes.drives import bean_track, lap_log, map_log
-from ..scenes.graph import columns_of, random_factor, random_graph, schur
+from ..scenes.graph import columns_of, random_factor, random_graph, rows_in, schur
 from ..scenes.linear_drive import LinearDrive
 
 POINTS = control_keys(0, np.arange(4))
@@ -199,7 +199,7 @@ class Checked(CurveSmoother):
         if len(self.inactive) == 0 or self.chain is not None:
             return
         assert sigma_step is not None
-        kept = jacobian_factors(self.window.groups, self.variables.layout)
+        kept = jacobian_factors(rows_in(*self.window.stores), self.variables.layout)
         graph = graph_of(self.prior, self.inactive.net, *kept.values())
         whole = Layout(keys_of(graph))
         hessian, vector = normal_equations(graph, whole)

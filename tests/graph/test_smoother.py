@@ -20,7 +20,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 
 from ..scenes.drives import ODOMETRY_SIGMA, bean_track, lap_log, true_poses
-from ..scenes.graph import columns_of
+from ..scenes.graph import columns_of, rows_in
 from ..scenes.linear_drive import LinearDrive, LinearTrack
 
 # --- poses that come and go ------------------------------------------------------------------------------
@@ -327,8 +327,8 @@ def rows_of(mapper: FixedLagMapper) -> dict[int, Array]:
     """The rows of each cycle as they were linearized last."""
     kept = mapper.road.smoother.window.measured
     return {
-        owner: np.concatenate([rows.residual[rows.owner == owner] for rows in kept.groups])
-        for owner in np.unique(kept.owners).tolist()
+        owner: np.concatenate([rows.residual[rows.owner == owner] for rows in rows_in(kept)])
+        for owner in np.unique(kept.owners()).tolist()
     }
 
 

@@ -383,9 +383,9 @@ def test_each_way_to_see_a_return_begins_the_batch_with_a_pose_beside_an_early_o
     way: str, sent: list[Slow], stem: Stem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if way != "curves":
-        monkeypatch.setattr(ReturnFinder, "by_curves", lambda *_: None)
+        monkeypatch.setattr(ReturnFinder, "_by_curves", lambda *_: None)
     if way != "cones":
-        monkeypatch.setattr(ReturnFinder, "by_cones", lambda *_: None)
+        monkeypatch.setattr(ReturnFinder, "_by_cones", lambda *_: None)
     monkeypatch.setattr(returns, "recognize", lies_as_it_is if way == "shape" else lambda _: None)
     mapper, truth = stem.mapper(), true_poses(log())
     for cycle in stem.rest(log()):

@@ -9,6 +9,7 @@ import pytest
 
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Odometry
+from pathspace_graph.labels import LEFT
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import ahead, corridor, exact_log, map_log
@@ -32,3 +33,19 @@ def test_a_bias_is_estimated_as_bayes_says() -> None:
     assert mapper.vehicle_state().calibration[1] == pytest.approx(expected, rel=0.2)
     first = mapper.control_points(0)[1]
     np.testing.assert_allclose(first[1], 2.0, atol=0.3)
+
+
+def test_control_points_that_a_detection_holds_stay_active() -> None:
+    """A detection in use may lie behind all that the window's poses see, where the map has moved since.
+
+    Its control points were deactivated and activated again with all after them, in each cycle of the window.
+    """
+    mapper, _ = map_log(exact_log(ahead(10.0, 12.0), *corridor(150.0)))
+    smoother = mapper.road.smoother
+    state, detections = smoother.map.state, smoother.map.detections
+    row = detections.used_on(LEFT)[:1]
+    behind = float(state.pose_u[LEFT].min()) - 40.0
+    assert state.boundaries[LEFT].tables.span_of(behind) < state.active(LEFT)[0]
+    detections.refine(row, np.array([behind]))
+    smoother.deactivate_distant()
+    assert state.boundaries[LEFT].tables.span_of(behind - 2.0) == state.active(LEFT)[0]

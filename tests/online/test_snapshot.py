@@ -177,7 +177,7 @@ def test_a_restored_mapper_goes_on_to_the_same_result(
 ) -> None:
     drive = make()
     if not drive.registers:
-        monkeypatch.setattr(ReturnFinder, "by_curves", lambda *_: None)
+        monkeypatch.setattr(ReturnFinder, "_by_curves", lambda *_: None)
     waiting, restored, last = dict(drive.moments), None, 0
     mapper = FixedLagMapper(drive.settings, drive.log.odometry_sigma)
     for number, cycle in enumerate(split_odometry(drive.log)):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.graph.inactive import Link
 from pathspace_graph.graph.relative import by_frame_of, from_frame, rotations, to_frame
 from pathspace_graph.graph.rows import Parts, Rows, among, stacked_rows
@@ -71,26 +72,55 @@ def block_of(layout: Layout, groups: Sequence[Rows]) -> tuple[IntArray, Array]:
     return held, block
 
 
-def owners_holding(rows: Rows, ascending: IntArray) -> IntArray:
-    """Return the owners of rows that hold any of some ascending keys."""
-    return np.asarray(rows.owner[among(rows.keys, ascending).any(axis=1)])
+class RowStore:
+    """The kernels' `RowStore` in numpy."""
 
+    def __init__(self, groups: Sequence[Rows] = ()) -> None:
+        self.groups = [*groups]  # one for each widths of variables, never empty
 
-def parted(rows: Rows, gone: IntArray) -> tuple[Parts, Parts]:
-    """Return the parts of rows without those of some ascending owners, and the parts of the latter."""
-    own = among(rows.owner, gone)
-    return rows.where(~own).parts, rows.where(own).parts
+    def __bool__(self) -> bool:
+        return bool(self.groups)
 
+    def copy(self) -> RowStore:
+        return RowStore(self.groups)
 
-def replaced(rows: Rows, gone: IntArray, fresh: Rows, layout: Layout, change: Array) -> Parts:
-    """Return the parts of rows without those of some ascending owners, and then those of fresh rows."""
-    if len(fresh):
-        fresh = replace(fresh, residual=moved_residual(layout, fresh, change))
-    return stacked_rows([rows.where(~among(rows.owner, gone)), fresh]).parts
+    def parts(self) -> list[Parts]:
+        return [rows.parts for rows in self.groups]
+
+    def owners(self) -> IntArray:
+        return np.concatenate([NO_KEYS, *(rows.owner for rows in self.groups)])
+
+    def holding(self, keys: IntArray) -> IntArray:
+        held = (rows.owner[among(rows.keys, keys).any(axis=1)] for rows in self.groups)
+        return np.concatenate([NO_KEYS, *held])
+
+    def stale(self, owners: IntArray, keys: IntArray) -> BoolArray:
+        return ~np.isin(owners, self.owners()) | np.isin(owners, self.holding(keys))
+
+    def replace(self, owners: IntArray, fresh: Sequence[Rows], layout: Layout, change: Array) -> None:
+        new = dict[tuple[int, ...], list[Rows]]()
+        for rows in fresh:
+            if len(rows):
+                at_change = replace(rows, residual=moved_residual(layout, rows, change))
+                new.setdefault(rows.widths, []).append(at_change)
+        kept = {rows.widths: rows.where(~np.isin(rows.owner, owners)) for rows in self.groups}
+        groups = []
+        for widths in {**new, **kept}:
+            groups.append(stacked_rows([*([kept[widths]] if widths in kept else []), *new.get(widths, [])]))
+        self.groups = [rows for rows in groups if len(rows)]
+
+    def drop(self, owners: IntArray) -> None:
+        kept = [rows.where(~np.isin(rows.owner, owners)) for rows in self.groups]
+        self.groups = [rows for rows in kept if len(rows)]
+
+    def pop(self, owner: int, layout: Layout) -> tuple[IntArray, Array]:
+        leaving = [rows.where(rows.owner == owner) for rows in self.groups]
+        self.drop(np.array([owner]))
+        return block_of(layout, [rows for rows in leaving if len(rows)])
 
 
 def summed(
-    layout: Layout, factors: list[tuple[IntArray, Array]], groups: Sequence[Rows], change: Array
+    layout: Layout, factors: list[tuple[IntArray, Array]], stores: Sequence[Any], change: Array
 ) -> tuple[Array, Array]:
     """Return the lower triangle of H (n, n), by columns, and the negative gradient (n,), at `change` (n,)."""
     hessian, gradient = np.zeros((len(change), len(change)), order="F"), np.zeros(len(change))
@@ -98,7 +128,7 @@ def summed(
         entries = layout.entries(keys)
         hessian[np.ix_(entries, entries)] += matrix[:-1, :-1]
         gradient[entries] += matrix[:-1, -1] - matrix[:-1, :-1] @ change[entries]
-    for rows in groups:
+    for rows in (Rows(*parts) for store in stores for parts in store.parts()):
         A = np.zeros((len(rows), len(gradient)))
         A[np.arange(len(rows))[:, None], _known_columns(layout, rows)] = rows.jacobian
         hessian += A.T @ A

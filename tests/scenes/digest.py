@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 from scipy.spatial import KDTree
 
+from pathspace_graph.factors._kernels import RowStore
 from pathspace_graph.front_end.gate import Gate
 
 NOT_ESTIMATED = (
@@ -41,7 +42,7 @@ def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
     elif isinstance(value, list | tuple | deque | set | frozenset):
         for entry in sorted(value) if isinstance(value, set | frozenset) else value:
             yield from _parts(entry, seen)
-    elif type(value).__module__.startswith("pathspace_graph") and not isinstance(value, Gate):
+    elif type(value).__module__.startswith("pathspace_graph") and not isinstance(value, Gate | RowStore):
         if id(value) not in seen:
             seen.add(id(value))
             yield type(value).__qualname__.encode()
@@ -51,8 +52,8 @@ def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
             yield from _parts(value.at(k), seen)
     elif isinstance(value, gtsam.GaussianFactor):
         yield repr(list(value.keys())).encode() + value.augmentedInformation().tobytes()
-    elif isinstance(value, KDTree):
-        yield from _parts(np.array(value.data), seen)
+    elif isinstance(value, KDTree | RowStore):
+        yield from _parts(np.array(value.data) if isinstance(value, KDTree) else value.parts(), seen)
     elif not isinstance(value, Gate | Future):
         yield repr(value).encode()
 

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from pathspace_graph.factors._kernels import RowStore
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, Variables, control_keys, pose_keys
@@ -21,6 +22,11 @@ LEFT_KEYS, RIGHT_KEYS, POSE_KEYS = (
 MAP_KEYS = np.concatenate([LEFT_KEYS, RIGHT_KEYS])
 KEYS = np.concatenate([[CALIBRATION_KEY], MAP_KEYS, POSE_KEYS])
 """The keys of the calibration, seven control points and four poses are ascending."""
+
+
+def rows_in(*stores: RowStore) -> list[Rows]:
+    """Returns the rows of stores, a group for each widths of variables."""
+    return [Rows(*parts) for store in stores for parts in store.parts()]
 
 
 def width(key: int) -> int:

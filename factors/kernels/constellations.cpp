@@ -1,0 +1,204 @@
+// Cones laid on earlier ones (`mapping/constellation.py`).
+
+#include "common.hpp"
+
+namespace kernels {
+namespace {
+
+struct ConePoints {  // mapping.constellation:Cones
+  explicit ConePoints(const py::tuple& columns)
+      : point(columns[0].cast<Array>()),
+        covariance(columns[1].cast<Array>()),
+        label(columns[2].cast<Ints>()) {
+    n = label.size();
+    expect(point.size() == 2 * n && covariance.size() == 4 * n);
+  }
+  Array point, covariance;
+  Ints label;
+  Index n;
+};
+
+struct LayLimits {  // mapping.constellation:LIMITS
+  explicit LayLimits(const py::tuple& limits)
+      : sigma(limits[0].cast<double>()),
+        gate(limits[1].cast<double>()),
+        cell(limits[2].cast<double>()),
+        turn(limits[3].cast<double>()),
+        apart(limits[4].cast<double>()),
+        places(static_cast<Index>(limits[5].cast<double>())),
+        gain(limits[6].cast<double>()),
+        failed(limits[7].cast<double>()) {}
+  double sigma, gate, cell, turn, apart;
+  Index places;
+  double gain, failed;
+};
+
+double square3(const double* off, const double* information) {
+  double sum = 0.0;
+  for (int a = 0; a < 3; ++a)
+    for (int b = 0; b < 3; ++b) sum += off[a] * information[3 * a + b] * off[b];
+  return sum;
+}
+
+struct LaidPose {
+  double pose[3], information[9], square, count, away;
+};
+
+struct LayStart {
+  double score, pose[3];
+};
+
+// The mean and the poses that may cost least: each pair of cones votes for a cell and the eight around it.
+std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known, const double* mean,
+                                 const double* prior, const double* reach, const LayLimits& limits) {
+  const Index half = static_cast<Index>(std::ceil(reach[0] / limits.cell)) + 1, width = 2 * half + 1;
+  const Index turns = static_cast<Index>(std::ceil(reach[1] / limits.turn));
+  std::vector<Index> votes(width * width);
+  std::vector<LayStart> starts, best;
+  const auto more = [](const LayStart& a, const LayStart& b) { return a.score > b.score; };
+  for (Index turn = -turns; turn <= turns; ++turn) {
+    const double heading = mean[2] + turn * limits.turn, c = std::cos(heading), s = std::sin(heading);
+    std::fill(votes.begin(), votes.end(), 0);
+    for (Index i = 0; i < seen.n; ++i) {
+      const double x = seen.point.data()[2 * i], y = seen.point.data()[2 * i + 1];
+      const double to[2] = {c * x - s * y, s * x + c * y};
+      for (Index j = 0; j < known.n; ++j) {
+        if (seen.label.data()[i] != known.label.data()[j]) continue;
+        Index at[2];
+        for (int k = 0; k < 2; ++k) {
+          const double move = known.point.data()[2 * j + k] - to[k] - mean[k];
+          at[k] = static_cast<Index>(std::floor(clipped(move / limits.cell + 0.5, -1e9, 1e9))) + half;
+        }
+        if (at[0] <= 0 || at[0] >= 2 * half || at[1] <= 0 || at[1] >= 2 * half) continue;
+        for (Index a = at[0] - 1; a <= at[0] + 1; ++a)
+          for (Index b = at[1] - 1; b <= at[1] + 1; ++b) ++votes[a * width + b];
+      }
+    }
+    best.clear();
+    for (Index k = 0; k < width * width; ++k) {
+      if (votes[k] == 0) continue;
+      const double off[3] = {(k / width - half) * limits.cell, (k % width - half) * limits.cell,
+                             turn * limits.turn};
+      const double score = limits.gain * votes[k] - std::min(square3(off, prior), limits.failed);
+      best.push_back({score, {mean[0] + off[0], mean[1] + off[1], mean[2] + off[2]}});
+    }
+    std::stable_sort(best.begin(), best.end(), more);
+    starts.insert(starts.end(), best.begin(),
+                  best.begin() + std::min<std::size_t>(best.size(), limits.places));
+  }
+  std::stable_sort(starts.begin(), starts.end(), more);
+  starts.insert(starts.begin(), {0.0, {mean[0], mean[1], mean[2]}});
+  return starts;
+}
+
+constexpr double kLayGates[] = {4.0, 4.0, 2.0, 1.0, 1.0, 1.0};
+constexpr double kLayRegular[] = {1e-2, 1e-2, 1.0};
+
+bool lay_in_view(double x, double y, const Array& views) {
+  const double* view = views.data();
+  for (Index k = 0; k < views.shape(0); ++k, view += 5) {
+    const double dx = x - view[0], dy = y - view[1];
+    if (!(dx * dx + dy * dy < view[3] * view[3])) continue;
+    if (std::abs(std::remainder(std::atan2(dy, dx) - view[2], kTurn)) < view[4]) return true;
+  }
+  return false;
+}
+
+// The pose after Gauss-Newton steps on the sum of capped squares, and what the cones say of it there.
+LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Array& views, const double* start,
+                     const double* mean, const double* prior, const LayLimits& limits) {
+  LaidPose out = {};
+  std::copy_n(start, 3, out.pose);
+  const double floor = limits.sigma * limits.sigma;
+  for (int step = 0; step <= 6; ++step) {
+    const double limit = limits.gate * (step < 6 ? kLayGates[step] : 1.0);
+    const Turn turn(out.pose[2]);
+    double A[3][3] = {}, g[3] = {};
+    for (Index i = 0; i < seen.n; ++i) {
+      const double *p = seen.point.data() + 2 * i, *K = seen.covariance.data() + 4 * i;
+      const double arm[2] = {turn.c * p[0] - turn.s * p[1], turn.s * p[0] + turn.c * p[1]};
+      const double cc = turn.c * turn.c, ss = turn.s * turn.s, cs = turn.c * turn.s;
+      const double both = 0.5 * (K[1] + K[2]);
+      const double xx = cc * K[0] - 2.0 * cs * both + ss * K[3], yy = ss * K[0] + 2.0 * cs * both + cc * K[3];
+      const double xy = cs * (K[0] - K[3]) + (cc - ss) * both;
+      double least = kInfinity, weight[4] = {}, off[2] = {};
+      for (Index j = 0; j < known.n; ++j) {
+        if (seen.label.data()[i] != known.label.data()[j]) continue;
+        const double* q = known.covariance.data() + 4 * j;
+        const double total[4] = {xx + q[0] + floor, xy + q[1], xy + q[2], yy + q[3] + floor};
+        const double dx = arm[0] + out.pose[0] - known.point.data()[2 * j];
+        const double dy = arm[1] + out.pose[1] - known.point.data()[2 * j + 1];
+        // the square is at least this, since no eigenvalue exceeds the trace
+        if (!(dx * dx + dy * dy < std::min(least, limit) * (total[0] + total[3]))) continue;
+        double inverse[4];
+        inverse2(total, inverse);
+        const double square =
+            dx * (inverse[0] * dx + inverse[1] * dy) + dy * (inverse[2] * dx + inverse[3] * dy);
+        if (square < least) {
+          least = square, off[0] = dx, off[1] = dy;
+          std::copy_n(inverse, 4, weight);
+        }
+      }
+      if (step == 6 && (least < limit || lay_in_view(arm[0] + out.pose[0], arm[1] + out.pose[1], views)))
+        ++out.count, out.square += std::min(least, limits.gate);
+      if (!(least < limit)) continue;
+      const double share = 1.0 - least / limit, w = step < 6 ? share * share : 1.0;
+      const double by[2][3] = {{1.0, 0.0, -arm[1]}, {0.0, 1.0, arm[0]}};
+      for (int a = 0; a < 3; ++a)
+        for (int r = 0; r < 2; ++r)
+          for (int k = 0; k < 2; ++k) {
+            const double value = w * by[r][a] * weight[2 * r + k];
+            g[a] += value * off[k];
+            for (int b = 0; b < 3; ++b) A[a][b] += value * by[k][b];
+          }
+    }
+    if (step < 6) {
+      for (int a = 0; a < 3; ++a) A[a][a] += kLayRegular[a];
+      solve3(A, g);
+      for (int a = 0; a < 3; ++a) out.pose[a] -= g[a];
+      continue;
+    }
+    std::copy_n(&A[0][0], 9, out.information);
+    double away[3];
+    for (int k = 0; k < 3; ++k) away[k] = out.pose[k] - mean[k];
+    away[2] = std::remainder(away[2], kTurn);
+    out.away = square3(away, prior);
+  }
+  return out;
+}
+
+py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, const Array& views,
+               const Array& mean, const Array& prior, const py::tuple& reach, const py::tuple& tuple) {
+  const ConePoints seen(seen_columns), known(known_columns);
+  const LayLimits limits(tuple);
+  expect(mean.size() == 3 && prior.size() == 9 && views.size() == 5 * views.shape(0));
+  const double within[2] = {reach[0].cast<double>(), reach[1].cast<double>()};
+  std::vector<LayStart> tried;
+  std::vector<LaidPose> found;
+  for (const LayStart& start : lay_starts(seen, known, mean.data(), prior.data(), within, limits)) {
+    const bool is_near = std::any_of(tried.begin(), tried.end(), [&](const LayStart& other) {
+      return std::hypot(start.pose[0] - other.pose[0], start.pose[1] - other.pose[1]) < limits.apart &&
+             std::abs(start.pose[2] - other.pose[2]) < 1.5 * limits.turn;
+    });
+    if (is_near) continue;
+    tried.push_back(start);
+    found.push_back(lay_refined(seen, known, views, start.pose, mean.data(), prior.data(), limits));
+    if (static_cast<Index>(tried.size()) == 3 * limits.places) break;
+  }
+  const Index m = static_cast<Index>(found.size());
+  Array poses({m, Index{3}}), information({m, Index{3}, Index{3}}), squares(m), counts(m), away(m);
+  for (Index k = 0; k < m; ++k) {
+    std::copy_n(found[k].pose, 3, poses.mutable_data() + 3 * k);
+    std::copy_n(found[k].information, 9, information.mutable_data() + 9 * k);
+    squares.mutable_data()[k] = found[k].square;
+    counts.mutable_data()[k] = found[k].count;
+    away.mutable_data()[k] = found[k].away;
+  }
+  return py::make_tuple(poses, information, squares, counts, away);
+}
+
+}  // namespace
+
+void add_constellations(py::module_& module) { module.def("laid", &laid); }
+
+}  // namespace kernels
