@@ -238,7 +238,7 @@ def test_every_shipped_study_is_sound_and_listed(name: str) -> None:
     assert len(read.tracks) * len(read.seeds) >= {
         "acceleration": 10,
         "hard": 16,
-        "lines": 4,
+        "lines": 6,
         "faults": 4,
         "endurance": 4,
         "sizes": 4,
