@@ -38,13 +38,13 @@ ABLATIONS: Final = ("stations", "gauge", "robust", "density", "lag", "relineariz
 """Studies of parts of the method, driven by one estimator on the generated tracks for two laps."""
 ONE_SEED: Final = ("gauge", "robust")  # those with so many variants that they are driven with one seed
 PAGES: Final = {  # tables of each page, from the root of the project
-    "README.md": ("readme-accuracy", "readme-compared", "readme-speed", "readme-real"),
+    "README.md": ("readme-accuracy", "readme-compared", "readme-lines", "readme-speed", "readme-real"),
     "docs/results.md": (
         *("results-speed", "results-tracks", "results-laps", "results-compared", "results-scaling"),
     ),
     "docs/real.md": ("real-runs", "real-maps", "real-measured"),
     "docs/closing.md": ("skidpad",),
-    "docs/studies.md": ("camera", "closing", "hard", "endurance", "reach", "paper"),
+    "docs/studies.md": ("camera", "closing", "hard", "lines", "endurance", "reach", "paper"),
     "docs/reliability.md": ("faults", "recovery", "hints"),
     "docs/ablations.md": ("centerline", *ABLATIONS),
 }
@@ -146,6 +146,17 @@ class Plan:
         study, frame = self._shipped("hard", folder)
         return {"hard": views.lap_columns(frame, tuple(dict.fromkeys([1, 2, study.laps])), CLOSING)}
 
+    def lines(self, folder: Path) -> Views:
+        """Drive the study `lines`, and at its second spacing the landmark graph beside it."""
+        study, frame = self._shipped("lines", folder / "curves")
+        name = list(study.noise)[1]
+        beside = replace(study, estimators=(LANDMARKS,), noise={name: study.noise[name]})
+        frame = pd.concat([frame, self._run(beside, folder / "landmarks")], ignore_index=True)
+        return {
+            "readme-lines": views.compared_table(frame[frame["noise"] == name]),
+            "lines": views.lines_table(frame),
+        }
+
     def endurance(self, folder: Path) -> Views:
         study, frame = self._shipped("endurance", folder)
         shown = [lap for lap in (3, 10, 30, 100) if lap <= study.laps] or [study.laps]
@@ -227,6 +238,7 @@ EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "camera": Plan.camera,
     "faults": Plan.faults,
     "hard": Plan.hard,
+    "lines": Plan.lines,
     "endurance": Plan.endurance,
     "centerline": Plan.centerline,
     **dict.fromkeys(ABLATIONS, Plan.ablation),

@@ -21,6 +21,7 @@ TITLES: Final = {"ate": "trajectory error [m]", "nees": "NEES of the map"}
 CAMERA: Final = (
     *("rmse", "rmse_aligned", "missed", "closed", "nees", "turn_nees", "map_scale_nees", "reported_degraded"),
 )
+LINES: Final = ("rmse", "rmse_aligned", "missed", "closed", "size", "ate", "nees")
 TITLES_CAMERA: Final = TITLES | {"turn_nees": "NEES of the turn", "reported_degraded": "degraded [%]"}
 """Headings in tables that are short of room."""
 FAULTS: Final = {  # columns of the table of faults: value and digits
@@ -141,6 +142,16 @@ def camera_table(frame: pd.DataFrame) -> View:
     oracle = (_figure("l", last.drop_duplicates([*RUN])), *[Figure(None)] * (len(CAMERA) - 1))  # one a drive
     header, rows = _by_part("estimator", parts, CAMERA, TITLES_CAMERA)
     return header, (*rows, ("landmarks, given all", oracle))
+
+
+def lines_table(frame: pd.DataFrame) -> View:
+    """Return the map of each estimator by the points that a sensor of lines gives."""
+    last = last_laps(frame)
+    parts = {
+        f"{noise}, `{estimator}`": part
+        for (noise, estimator), part in last.groupby(["noise", "estimator"], sort=False)
+    }
+    return _by_part("points, estimator", parts, LINES)
 
 
 def study_table(study: Study, frame: pd.DataFrame) -> View:

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.io.log import Log
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.scale import chosen_scale
@@ -77,7 +78,8 @@ def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimato
     """Return an online estimator for a log, which tells the scale where the settings leave it open."""
     check_online(name)
     settings = known_settings(settings)
-    return ONLINE[name](replace(settings, scale=chosen_scale(settings, log)), log.noise)
+    settings = with_kind(replace(settings, scale=chosen_scale(settings, log)), log)
+    return ONLINE[name](settings, log.noise)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:

@@ -12,12 +12,12 @@ import numpy as np
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .errors import check_type, solving
-from .labels import LEFT, RIGHT, UNKNOWN
+from .labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from .lengths import scaled
 from .run import split_odometry
 
@@ -100,10 +100,10 @@ def solved(solve: Callable[[Log, float], R], log: Log, settings: MapperSettings)
 def width_and_gap(detections: Detections) -> tuple[float, float]:
     """Return the width of the road and the gap of its rows (m) in a cycle; NaN where they aren't seen."""
     usable = (np.abs(detections.points_vehicle) < SCENE_FARTHEST).all(axis=1)  # the gate drops the others
-    points, labels = detections.points_vehicle[usable], detections.labels[usable]
-    sides = labels if (labels != UNKNOWN).any() else np.where(points[:, 1] > 0.0, LEFT, RIGHT)
-    covariances = detections.covariances[usable]
-    rows = [_nearest_cones(points[sides == s], covariances[sides == s]) for s in (LEFT, RIGHT)]
+    near = detections.where(np.asarray(usable))
+    points, covariances, sides = near.points_vehicle, near.covariances, side_of(near)
+    own = [np.flatnonzero(sides == label) for label in BOUNDARIES]
+    rows = [points[rows[nearest_cones(points[rows], covariances[rows], SCENE_NEAREST)]] for rows in own]
     if min(map(len, rows)) < SCENE_FEWEST:
         return np.nan, np.nan
     nearest = [np.asarray(KDTree(row).query(row, k=2)[0])[:, 1] for row in rows]
@@ -112,16 +112,25 @@ def width_and_gap(detections: Detections) -> tuple[float, float]:
     return float(np.median(across)), float(np.mean([np.median(gaps) for gaps in nearest]))
 
 
-def _nearest_cones(points: Array, covariances: Array) -> Array:
+def side_of(detections: Detections) -> IntArray:
+    """Return the boundary (m,) of each detection: its label, or the side of the vehicle if none has any."""
+    labels = detections.labels
+    if (labels != UNKNOWN).any():
+        return labels
+    return np.where(detections.points_vehicle[:, 1] > 0.0, LEFT, RIGHT)
+
+
+def nearest_cones(points: Array, covariances: Array, most: int) -> list[int]:
+    """Return the nearest detections of cones, each cone once, by index, the nearest first."""
     chosen: list[int] = []
     for k in np.argsort(np.hypot(*points.T)).tolist():
         apart = ((points[chosen] - points[k]) ** 2).sum(axis=1)
         variance = 0.5 * np.trace(covariances[chosen] + covariances[k], axis1=1, axis2=2)
         if (apart > SCENE_SAME**2 * variance).all():
             chosen.append(k)
-        if len(chosen) == SCENE_NEAREST:
+        if len(chosen) == most:
             break
-    return np.asarray(points[chosen])
+    return chosen
 
 
 def _nearest(widths: list[float], gaps: list[float]) -> float:

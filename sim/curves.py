@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int_]
+BoolArray = NDArray[np.bool_]
 
 
 def ring(points: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The vehicle's sensors: noisy odometry and detected cones."""
+"""The vehicle's sensors: noisy odometry, and a detector of cones."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -11,7 +11,7 @@ from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.io.log import Detections, polar_covariances
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
-from .curves import FloatArray, IntArray
+from .curves import BoolArray, FloatArray, IntArray
 
 FALSE_POSITIVE: Final = -1  # association of a detection that is of no cone
 CAMERAS: Final = 2  # cameras that may see a cone at once
@@ -51,14 +51,14 @@ class OdometryNoise:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """What the cone detector sees, and its errors."""
+    """What the sensor sees, and its errors."""
 
     rate: float = 10.0
     """Perception cycles per second (Hz)."""
     range_max: float = 15.0
-    """Greatest true range of a detected cone (m)."""
+    """Greatest true range of a detection (m)."""
     range_min: float = 0.5
-    """Least true range of a detected cone (m)."""
+    """Least true range of a detection (m)."""
     fov: float = float(np.deg2rad(110.0))
     """Field of view, the whole angle (rad)."""
     range_sigma: float = 0.05
@@ -126,6 +126,21 @@ class SensorSettings:
     def range_sigmas(self, ranges: FloatArray) -> FloatArray:
         return self.range_sigma + self.range_sigma_growth * ranges
 
+    def is_inside(self, ranges: FloatArray, bearings: FloatArray) -> BoolArray:
+        near = (ranges >= self.range_min) & (ranges <= self.range_max)
+        return near & (np.abs(bearings) <= self.fov / 2)
+
+    def probabilities(self, ranges: FloatArray) -> FloatArray:
+        """Return the probabilities of detection at true ranges (m,)."""
+        return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
+
+    def systematic_errors(self, ranges: FloatArray) -> FloatArray:
+        """Return how much longer (m) true ranges (m,) read than they are."""
+        biased = self.range_bias and len(self.range_bias_at) > 0
+        errors = np.interp(ranges, self.range_bias_at, self.range_bias_values) if biased else 0.0
+        beyond = np.maximum(ranges - self.range_bend_from, 0.0)
+        return np.asarray(errors + self.range_bend * beyond**2)
+
 
 def measure_twists(
     twists: FloatArray, dt: float, noise: OdometryNoise, rng: Generator
@@ -149,6 +164,33 @@ def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatAr
     return np.asarray(lfilter([1.0], [1.0, -rho], drawn, axis=0))
 
 
+def seen_from(pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ranges (m,) and bearings (m,) in [-pi, pi) of points (m, 2) from a pose [x, y, theta]."""
+    step = points - pose[:2]
+    bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
+    return np.hypot(step[:, 0], step[:, 1]), (bearings + np.pi) % (2 * np.pi) - np.pi
+
+
+def polar_detections(
+    t: float, ranges: FloatArray, bearings: FloatArray, labels: IntArray, settings: SensorSettings
+) -> Detections:
+    """Return measured ranges and bearings (m,) as a cycle, with the covariances of the sensor's noise."""
+    points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+    along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
+    return Detections(t, points, polar_covariances(bearings, along, across), labels)
+
+
+def false_positives(
+    settings: SensorSettings, rng: Generator
+) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+    """Draw detections of nothing, uniform over the area of the field, with either boundary's label."""
+    count = int(rng.poisson(settings.false_positives))
+    ranges = np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count))
+    bearings = rng.uniform(-settings.fov / 2, settings.fov / 2, count)
+    labels = rng.integers(LEFT, RIGHT, count, endpoint=True)
+    return ranges, bearings, labels, np.full(count, FALSE_POSITIVE)
+
+
 class ConeSensor:
     def __init__(self, cones: FloatArray, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
         blind_rng, self._cone_rng, self._false_rng, self._slow_rng, self._second_rng, self._drop_rng = (
@@ -167,24 +209,22 @@ class ConeSensor:
 
         The second result is the true cone of each detection (m,).
         """
-        parts = zip(self._detect_cones(pose, scale, bias), self._false_positives(), strict=True)
+        parts = zip(
+            self._detect_cones(pose, scale, bias),
+            false_positives(self._settings, self._false_rng),
+            strict=True,
+        )
         ranges, bearings, labels, cones = (np.concatenate(part) for part in parts)
-        points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
-        settings = self._settings
-        along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
-        covariances = polar_covariances(bearings, along, across)
-        kept = slice(0 if self._drop_rng.random() < settings.dropped_cycles else None)
-        return Detections(t, points[kept], covariances[kept], labels[kept]), cones[kept]
+        detections = polar_detections(t, ranges, bearings, labels, self._settings)
+        kept = np.full(len(cones), self._drop_rng.random() >= self._settings.dropped_cycles)
+        return detections.where(kept), cones[kept]
 
     def _detect_cones(
         self, pose: FloatArray, scale: float, bias: float
     ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
         settings, rng = self._settings, self._cone_rng
-        step = self._cones[self._seen] - pose[:2]
-        ranges = np.hypot(step[:, 0], step[:, 1])
-        bearings = (np.arctan2(step[:, 1], step[:, 0]) - pose[2] + np.pi) % (2 * np.pi) - np.pi
-        inside = (ranges <= settings.range_max) & (ranges >= settings.range_min)
-        inside &= np.abs(bearings) <= settings.fov / 2
+        ranges, bearings = seen_from(pose, self._cones[self._seen])
+        inside = settings.is_inside(ranges, bearings)
         cones, ranges, bearings = self._seen[inside], ranges[inside], bearings[inside]
         # every cone in the field draws the same numbers, so that one setting doesn't shift another's
         chance, colour = rng.random((2, len(cones)))
@@ -193,15 +233,10 @@ class ConeSensor:
         labels = self._labels[cones]
         flipped = (colour < settings.wrong_colour) & np.isin(labels, BOUNDARIES)
         labels = np.where(flipped, LEFT + RIGHT - labels, labels)
-        probability = settings.detection_probability - settings.detection_falloff * ranges
-        hit = chance < np.clip(probability, 0.0, 1.0)
+        hit = chance < settings.probabilities(ranges)
         overlap = np.digitize(np.abs(bearings), settings.overlap) == 1
         rows = np.stack([hit, hit & overlap & (again < settings.duplicates)])
-        biased = settings.range_bias and len(settings.range_bias_at) > 0
-        systematic = np.interp(ranges, settings.range_bias_at, settings.range_bias_values) if biased else 0.0
-        beyond = np.maximum(ranges - settings.range_bend_from, 0.0)
-        systematic = systematic + settings.range_bend * beyond**2
-        ranges = (1.0 + scale) * ranges + bias + systematic
+        ranges = (1.0 + scale) * ranges + bias + settings.systematic_errors(ranges)
         errors = self._errors(np.stack([first, second]), cones)
         ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]
         bearings = bearings + settings.bearing_sigma * errors[:, 1]
@@ -220,12 +255,3 @@ class ConeSensor:
         drawn = self._slow_rng.standard_normal(self._slow.shape)
         self._slow = rho * self._slow + np.sqrt(1.0 - rho**2) * drawn
         return np.asarray(errors)
-
-    def _false_positives(self) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
-        """Draw detections of nothing, uniform over the area of the field, with either boundary's label."""
-        settings, rng = self._settings, self._false_rng
-        count = int(rng.poisson(settings.false_positives))
-        ranges = np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count))
-        bearings = rng.uniform(-settings.fov / 2, settings.fov / 2, count)
-        labels = rng.integers(LEFT, RIGHT, count, endpoint=True)
-        return ranges, bearings, labels, np.full(count, FALSE_POSITIVE)

@@ -25,6 +25,7 @@ from .faults import (
     time_at,
     turned_round,
 )
+from .lines import LINE, LineSensor, LineSettings, as_lines
 from .sensor import FALSE_POSITIVE, ConeSensor, OdometryNoise, SensorSettings
 from .track import Track, to_map_frame
 from .vehicle import Drive, VehicleSettings, displacements, drive
@@ -39,6 +40,7 @@ class SimulationSettings:
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
     sensor: SensorSettings = field(default_factory=SensorSettings)
+    line: LineSettings = field(default_factory=LineSettings, repr=False)
     faults: Faults = field(default_factory=Faults, repr=False)
     scale: float = field(default=1.0, repr=False)
     """Factor of all lengths and speeds: 0.1 for a model car of 1:10, 3 for a road."""
@@ -61,7 +63,7 @@ class SimulationSettings:
         """Raise SettingsError where a group that is drawn is neither the default nor a preset."""
         overrun = self.vehicle.overrun
         known = {
-            "sensor": (SensorSettings(), CAMERA),
+            "sensor": (SensorSettings(), CAMERA, LINE),
             "odometry": (OdometryNoise(), INS),
             "vehicle": (VehicleSettings(overrun=overrun), VehicleSettings(overrun=overrun, rate=INS_RATE)),
             "faults.sensor": (SensorFaults(), CAMERA_FAULTS),
@@ -96,13 +98,15 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     lap = track.centre_line.length
     driven = put_down(drive(track, settings.laps, settings.vehicle, wander_rng), lap, faults.vehicle)
     odometry, calibration = measure_odometry(driven, lap, settings.odometry, faults.odometry, odometry_rng)
-    cycles, associations = _perceive(track, driven, settings, *sensor_rngs)
+    seen = as_lines(track) if settings.line.spacing else track
+    cycles, associations = _perceive(seen, lap, driven, settings, *sensor_rngs)
     stamps = np.union1d(driven.t, [cycle.t for cycle in cycles])
     poses = _poses_at(driven, stamps)
     poses[:, 2] = np.pi - (np.pi - poses[:, 2]) % (2 * np.pi)
     errors = np.array([getattr(faults.sensor, name) for name in SENSOR])
     truth = Truth(
-        *(stamps, poses, track.cones, track.cone_labels, associations),
+        *(stamps, poses, seen.cones, seen.cone_labels),
+        associations=None if settings.line.spacing else associations,
         calibration=calibration,
         sensor=errors if errors.any() else None,
         noise=_noise(settings),
@@ -112,7 +116,7 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
         odometry=odometry,
         cycles=tuple(cycles),
         odometry_sigma=np.hypot(settings.odometry.white, settings.odometry.slow),
-        sensor=SensorInfo(settings.sensor.range_max, settings.sensor.fov, settings.sensor.rate),
+        sensor=_sensor_info(settings),
         source=_source(track, settings, seed),
         truth=truth,
     )
@@ -141,10 +145,17 @@ def _bend(sensor: SensorSettings) -> FloatArray | None:
     return np.array([sensor.range_bend, sensor.range_bend_from]) if sensor.range_bend else None
 
 
+def _sensor_info(settings: SimulationSettings) -> SensorInfo:
+    sensor = settings.sensor
+    return SensorInfo(
+        sensor.range_max, sensor.fov, sensor.rate, kind="line" if settings.line.spacing else None
+    )
+
+
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
     source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
     source |= {"scale": str(settings.scale)} if settings.scale != 1.0 else {}
-    for group in ("odometry", "sensor", "vehicle", "faults.sensor", "faults.odometry"):
+    for group in ("odometry", "sensor", "line", "vehicle", "faults.sensor", "faults.odometry"):
         part = attrgetter(group)(settings)
         changed = [entry.name for entry in fields(part) if not entry.repr]
         changed = [name for name in changed if getattr(part, name) != getattr(type(part)(), name)]
@@ -152,13 +163,27 @@ def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, 
     return source if settings.faults == Faults() else source | {"faults": repr(settings.faults)}
 
 
-def _perceive(
-    track: Track, driven: Drive, settings: SimulationSettings, sensor_rng: Generator, colour_rng: Generator
-) -> tuple[list[Detections], IntArray]:
-    """Return the cycles of a sensor that is mounted badly and fails at times, and their associations."""
-    faults, rate, lap = settings.faults.sensor, settings.sensor.rate, track.centre_line.length
+def _sensor(track: Track, settings: SimulationSettings, rng: Generator) -> ConeSensor | LineSensor:
     labels = colours(track, settings.faults.vehicle.wrong_way)
-    sensor = ConeSensor(track.cones, labels, settings.sensor, sensor_rng)
+    if settings.line.spacing:
+        return LineSensor(track, labels, settings.sensor, settings.line, rng)
+    return ConeSensor(track.cones, labels, settings.sensor, rng)
+
+
+def _perceive(
+    track: Track,
+    lap: float,
+    driven: Drive,
+    settings: SimulationSettings,
+    sensor_rng: Generator,
+    colour_rng: Generator,
+) -> tuple[list[Detections], IntArray]:
+    """Return the cycles of a sensor that is mounted badly and fails at times, and their associations.
+
+    A lap is `lap` m long.
+    """
+    faults, rate = settings.faults.sensor, settings.sensor.rate
+    sensor = _sensor(track, settings, sensor_rng)
     stamps = np.arange(int(driven.t[-1] * rate) + 1) / rate
     stamps = stamps[stamps - faults.latency <= driven.t[-1]]
     poses = _poses_at(driven, np.maximum(stamps - faults.latency, 0.0))
@@ -192,7 +217,11 @@ def _poses_at(driven: Drive, stamps: FloatArray) -> FloatArray:
 
 PLAIN: Final = "plain"  # name of the preset that changes nothing
 PRESETS: Final[dict[str, dict[str, dict[str, Any]]]] = {
-    "sensor": {PLAIN: {}, "camera": {"sensor": CAMERA, "faults": Faults(sensor=CAMERA_FAULTS)}},
+    "sensor": {
+        PLAIN: {},
+        "camera": {"sensor": CAMERA, "faults": Faults(sensor=CAMERA_FAULTS)},
+        "line": {"sensor": LINE, "line": LineSettings(spacing=1.0)},
+    },
     "odometry": {PLAIN: {}, "ins": {"odometry": INS, "vehicle": VehicleSettings(rate=INS_RATE)}},
 }
 """Settings that differ from the defaults, by group and name of the preset."""

@@ -26,6 +26,7 @@ SHARP: Final = 0.6  # largest standard deviation of detections that say where a 
 SHARP_SHARE: Final = 0.1  # share of so certain detections below which all of them say it
 MIN_SHARE: Final = 0.1  # least size of a cone's cluster as a share of the median cluster's
 MIN_SHARE_BESIDE: Final = 0.3  # `MIN_SHARE` of a cluster beside a curve, whose detections aren't used
+LINE_STEP: Final = 3.0  # distance along a line of the places that stand for its cones (m)
 ROW_CONES: Final = 4  # least number of cones of a curve, below which none is removed
 POSE_STEP: Final = 1.0  # at which the curve's point nearest to a pose is searched for, m along the curve
 DIRECTION_PENALTY: Final = 100.0  # distance added in quadrature where the curve runs against a heading, m
@@ -193,7 +194,8 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     """Return the cones of a boundary whose curve the state has.
 
     A cone that is often detected beside the curve, but too far from it to be used, belongs to it as well: the
-    curve cuts a corner there. Those of a closed curve are in the order in which the vehicle passed them.
+    curve cuts a corner there. Those of a closed curve are in the order in which the vehicle passed them. A
+    line has no cones: the means of its detections about equally distant places stand for them.
     """
     boundary, begin = state.boundaries[label], first_parameter(state, label)
     rows = np.flatnonzero(detections.label == label)
@@ -206,6 +208,10 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     beside, on_curve, u = used.copy(), used.copy(), detections.u[rows].copy()
     beside[~used], on_curve[~used], u[~used] = _beside(state, points[~used], cycles[~used], label, settings)
     u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
+
+    if label in settings.lines:
+        on_line = points[on_curve], u[on_curve], covariances[on_curve]
+        return points_along(*on_line, boundary.length, boundary.periodic, settings)
 
     def clustered(chosen: BoolArray | IntArray) -> Cones:
         along = points[chosen], u[chosen], covariances[chosen]
@@ -297,6 +303,29 @@ def cluster(
     """
     radius, weight = settings.growth.merge_radius, 1.0 / np.trace(covariances, axis1=1, axis2=2)
     peaks = _peaks(u, weight, length, periodic, SEPARATION * radius)
+    return _about(peaks, radius, points, u, covariances, length, periodic, settings)
+
+
+def points_along(
+    points: Array, u: Array, covariances: Array, length: float, periodic: bool, settings: MapperSettings
+) -> Cones:
+    """Return the means of detections (m, 2) of a line about places that are `LINE_STEP` apart."""
+    count = max(int(length / LINE_STEP), 1)
+    places = length * (np.arange(count) + 0.5) / count
+    return _about(places, 0.5 * length / count, points, u, covariances, length, periodic, settings)
+
+
+def _about(
+    peaks: Array,
+    radius: float,
+    points: Array,
+    u: Array,
+    covariances: Array,
+    length: float,
+    periodic: bool,
+    settings: MapperSettings,
+) -> Cones:
+    """Return the weighted means of detections (m, 2) within a radius (m) of peaks (k,) along a curve."""
     if len(peaks) == 0:
         return Cones(np.zeros((0, 2)), peaks, np.zeros(0, np.intp))
     after = peaks.searchsorted(u)

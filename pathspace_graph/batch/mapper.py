@@ -13,6 +13,7 @@ from pathspace_graph.errors import SettingsError, SolveError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
+from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
@@ -135,16 +136,22 @@ class BatchMapper:
         SettingsError if there is no online mapper to begin with, and SolveError where the log leaves no way
         to an optimum.
         """
-        return solved(partial(self._solve, start, on_round), log, self.settings)
+        settings = with_kind(self.settings, log)
+        return solved(partial(self._solve, settings, start, on_round), log, settings)
 
     def _solve(
-        self, start: Start | None, on_round: Callable[[], None] | None, log: Log, scale: float
+        self,
+        settings: MapperSettings,
+        start: Start | None,
+        on_round: Callable[[], None] | None,
+        log: Log,
+        scale: float,
     ) -> BatchResult:
         watch, noise = Stopwatch(), known_noise(self.odometry_sigma, scale)
-        judged = judge_log(log, noise, own_settings(self.settings))
+        judged = judge_log(log, noise, own_settings(settings))
         watch.lap("integrate")
-        start = start or self.settings.batch.start
-        begun, online = self._search(log, judged, noise, start, on_round, watch)
+        start, given = start or settings.batch.start, replace(settings, scale=scale)
+        begun, online = self._search(log, judged, replace(settings, scale=1.0), noise, start, on_round, watch)
         found, known = _with_wider_priors(begun)
         watch.lap("optimum")
         at, convergence, settings = found.at, found.convergence, found.system.settings
@@ -156,7 +163,7 @@ class BatchMapper:
         records, laps = _records(few, judged.chain, sum(watch.laps.values()))
         return BatchResult(
             estimator=NAME,
-            settings=settings_dict(replace(self.settings, scale=scale)),
+            settings=settings_dict(given),
             map=replace(_map(few, joint), points=_orange(judged, at.state)),
             scatter=few.scatter,
             trajectory_t=judged.chain.stamps,
@@ -181,6 +188,7 @@ class BatchMapper:
         self,
         log: Log,
         judged: JudgedLog,
+        settings: MapperSettings,
         noise: KnownNoise,
         start: Start,
         on_round: Callable[[], None] | None,
@@ -198,7 +206,7 @@ class BatchMapper:
         if self.online is None:
             raise SettingsError("start online: expected an online mapper to begin with, found none")
         watch.lap("optimum")
-        mapper = self.online(replace(self.settings, scale=1.0), noise)
+        mapper = self.online(settings, noise)
         state, online = start_online(log, mapper)
         watch.lap("start")
         found = None

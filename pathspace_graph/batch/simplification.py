@@ -14,14 +14,16 @@ from pathspace_graph.graph.variables import CONTROL_LETTERS, POINT, Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import ExactSplineSettings, MapperSettings, SplineSettings
-from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.boundary import Boundary, sampled
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import chosen_breaks, fit_spline, refit
+from pathspace_graph.spline.knots import chosen_breaks, fewest_breaks, fit_spline, refit
 
 from .association import ROW_CONES, associate, cones_of_curve, feet_of_cones, locate_poses
 
 MIN_SIZE_SHARE: Final = 0.6  # least share of the largest number of control points that is tried
 ALIKE: Final = (3.0, 0.01)  # parameters on curves of length L through the same cones differ by < a + b L (m)
+NEED_STEP: Final = 1.0  # distance of the points of a line's curve that say how many knots it needs (m)
+MOST_NEEDED: Final = 400  # largest number of these points, which bounds the time
 FOLDS: Final = 4  # groups of the cross-validation, dealt in turn, so that the neighbours of a cone are there
 
 
@@ -35,6 +37,10 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
         cones = cones_of_curve(state, detections, label, settings)
         points = cones.points
         if len(points) < ROW_CONES:
+            continue
+        if not dense and label in settings.lines:
+            spline = fit_line(state.spline(label), settings)
+            state.replace_boundary(label, *boundary_of(spline, settings))
             continue
         if not dense:  # the optimum's curve beside the cones, since some of them are strays
             points = feet_of_cones(state, cones, label).position
@@ -62,6 +68,18 @@ def fit_through(
         points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
     chosen = chosen_breaks(points, periodic, degree, max(smallest, int(least_share * most)), most)
     return fit_spline(points, chosen.size, periodic, degree, chosen.breaks)
+
+
+def fit_line(spline: BSpline, settings: MapperSettings) -> BSpline:
+    """Return the curve on fewest knots that follows a line's within half of `spline.sigma_shape`.
+
+    So it adds an eighth to that. A line has no number of cones that could say how many it needs.
+    """
+    own, smallest = settings.spline, settings.spline.min_size
+    step = max(NEED_STEP, spline.length() / MOST_NEEDED)
+    points = sampled(spline, step)[: -1 if spline.periodic else None]
+    chosen = fewest_breaks(points, spline.periodic, own.degree, smallest, 0.5 * own.sigma_shape)
+    return fit_spline(points, chosen.size, spline.periodic, own.degree, chosen.breaks)
 
 
 def extended(points: Array, beyond: float) -> Array:
@@ -141,16 +159,28 @@ class Scatter:
         return np.asarray(self.sigma(label, u) / np.sqrt((basis**2).sum(axis=1)))
 
 
-def scatter_of_cones(state: State, detections: DetectionTable, settings: MapperSettings) -> Scatter:
-    """Return the scatter of the detected cones about the curves of the state."""
+def scatter_about(
+    state: State, optimum: State, detections: DetectionTable, settings: MapperSettings
+) -> Scatter:
+    """Return the scatter of the detected cones about the curves of the state.
+
+    Of a line, it is that of the curve of the optimum, which follows it everywhere.
+    """
     seen, unseen, places, lengths = [], [], {}, {}
     for label, boundary in state.boundaries.items():
+        lengths[label] = boundary.length if boundary.periodic else np.inf
+        if label in settings.lines:
+            points = sampled(optimum.spline(label), NEED_STEP)
+            foot = boundary.find_anywhere(state.control_points(label), points)
+            seen.append(foot.distance)
+            unseen.append(foot.distance)
+            places[label] = foot.u
+            continue
         cones = cones_of_curve(state, detections, label, settings)
         foot, share = feet_of_cones(state, cones, label), boundary.size / max(len(cones.u), 1)
         seen.append(foot.distance)
         unseen.append(cross_validated(cones.points, boundary.periodic, settings, share))
         places[label] = foot.u
-        lengths[label] = boundary.length if boundary.periodic else np.inf
     return Scatter(_rms(seen), _rms(unseen), places, lengths)
 
 
@@ -205,7 +235,7 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
     detections = detections.copy()
     locate_poses(few)
     associate(few, detections, settings, settings.batch.gate, strict=True)
-    return Simplified(few, change, detections, scatter_of_cones(few, detections, settings))
+    return Simplified(few, change, detections, scatter_about(few, state, detections, settings))
 
 
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:

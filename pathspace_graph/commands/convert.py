@@ -23,6 +23,7 @@ from pathspace_graph.plausibility.diagnosis import measured_line
 from pathspace_graph.plausibility.hint import because
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.scale import scale_of
+from pathspace_graph.settings.mapper import MapperSettings
 
 from .estimate import tell
 from .simulate import describe
@@ -98,7 +99,7 @@ class Convert:
         rule = LabelRule(self.labels, self.label_field)
         with progress("converting"):
             record = windowed(self._read(source, rule), self.window, source)
-            log = with_measured_noise(to_log(record, self.frames, self.noise, source))
+            log = with_measured_noise(to_log(record, self.frames, self.noise, source, self.window.spacing))
             write_checked(log, out, source)
         report(record.notes, rule, log, out)
         tell(hints(log))
@@ -116,8 +117,8 @@ def with_measured_noise(log: Log) -> Log:
     """Return a log whose noise is measured where nobody has stated it."""
     if log.odometry_stated and log.detections_stated:
         return log
-    scale = scale_of(log)
-    measured = scaled(measure_log(scaled(log, 1.0 / scale)), scale)
+    scale, settings = scale_of(log), MapperSettings(kind=log.sensor.kind)
+    measured = scaled(measure_log(scaled(log, 1.0 / scale), settings), scale)
     if measured is None:
         return log
     sigma = log.odometry_sigma if log.odometry_stated else measured.twist_sigma

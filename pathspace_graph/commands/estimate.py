@@ -223,7 +223,7 @@ def report(result: RunResult, log: Log) -> None:
     """Print the run, the paper's table where there is truth, and as an error what was not mapped."""
     if laps := laps_of(result, log):
         output().print(laps_table(laps))
-    say(outline(result))
+    say(outline(result), *kind_lines(result))
     say(*(f"at {record.t:.1f} s: {record.notice}" for record in result.cycles if record.notice))
     if result.batches is not None and result.batches.late:
         late = f"{result.batches.late} cycle{'' if result.batches.late == 1 else 's'}"
@@ -233,6 +233,19 @@ def report(result: RunResult, log: Log) -> None:
     say(*([] if state is None else diagnose(state, result.settings, result.scale)))
     if missing := not_mapped(result.map, log):
         note("; ".join(missing))
+
+
+def kind_lines(result: RunResult) -> list[str]:
+    """Return a line on the kind of the sensor, where it isn't of cones, or not known."""
+    if "kind" not in result.settings:
+        return []
+    words = {"line": "on both sides", "line-left": "on the left", "line-right": "on the right"}
+    kind = result.settings["kind"]
+    if kind is None:
+        return ["too little was seen twice to tell cones from points of a line: cones are assumed"]
+    return (
+        [f"detections are points of a line {words[kind]}, not of things that stay"] if kind in words else []
+    )
 
 
 def outline(result: RunResult) -> str:

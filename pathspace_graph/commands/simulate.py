@@ -36,8 +36,9 @@ class Simulate:
     """Event that is driven instead of either, on the track that the rules describe."""
     seed: int = 0
     """Seed of the drive's wander and of all noise."""
-    sensor: Literal["plain", "camera"] = "plain"
-    """Preset of `--sensor.*` and `--faults.sensor.*`, each of which can still be set."""
+    sensor: Literal["plain", "camera", "line"] = "plain"
+    """Preset of `--sensor.*`, `--line.*` and `--faults.sensor.*`, each of which can still be set: cones with
+    white noise, a camera's cones, or points of a line."""
     odometry: Literal["plain", "ins"] = "plain"
     """Preset of `--odometry.*` and `--vehicle.rate`, each of which can still be set."""
     settings: Annotated[SimulationSettings, arg(name="")] = field(default_factory=SimulationSettings)

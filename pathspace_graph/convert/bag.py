@@ -23,7 +23,7 @@ INSTALL: Final = "pip install 'pathspace-graph[ros]'"  # command that installs t
 SUPPORTED: Final = {  # what a message must hold, by the option of its topic
     "--odometry": "a twist, a speed or a pose",
     "--imu": "an angular velocity",
-    "--detections": "a point cloud, an array of markers, or a list of cones with points",
+    "--detections": "a point cloud, a scan, an array of markers, or a list of cones or polylines",
     "transforms": "transforms",
 }
 METADATA: Final = "metadata.yaml"  # file that describes the others in a folder of rosbag2
@@ -53,8 +53,8 @@ class BagOptions:
     the yaw rate), or with a pose. For CSV a file in the folder, by default odometry.csv."""
     detections: str | None = None
     """Topic of the detections in a bag: a point cloud with a field for the label, an array of markers (blue
-    is left, yellow is right), or any message with lists of cones. For CSV a file in the folder, by default
-    detections.csv."""
+    is left, yellow is right), any message with lists of cones or polylines, or a LaserScan. For CSV a file in
+    the folder, by default detections.csv."""
     imu: str | None = None
     """Topic of the yaw rate, sensor_msgs/Imu, whose z axis points up."""
     wheelbase: float | None = None

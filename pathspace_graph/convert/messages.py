@@ -22,6 +22,9 @@ LIST_NAMES: Final = {  # labels of the cones in a list with such a word in its n
 CLOUD_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # by `datatype`
 POINT_MARKERS: Final = (1, 2, 3, 10)  # types of markers that are one point: cube, sphere, cylinder, mesh
 LIST_MARKERS: Final = (6, 7, 8)  # types of markers that are lists of points: cubes, spheres, points
+LINE_STRIP: Final = 4  # type of a marker that is a polyline
+ALONE: Final = -1  # in place of the number of a polyline: a point that stands alone, as a cone does
+DENSE: Final = -2  # a point of a scan, anywhere along a line or a wall
 ADDED: Final = 0  # action of a marker that is added; others are taken away
 POSITIONS: Final = ("point", "position", "location", "center", "pose", "bbox")  # of a cone without x and y
 SPEEDS: Final = ("speed", "data", "vx")  # fields of a speed alone
@@ -43,16 +46,20 @@ class Points(NamedTuple):
     points: Array  # (m, 2) points in m
     covariances: Array  # (m, 2, 2) covariances in m^2, NaN where the message does not give them
     labels: IntArray  # (m,) labels
+    lines: IntArray  # (m,) number of the polyline of each, in the order of its vertices; or ALONE, or DENSE
 
     @classmethod
-    def of(cls, points: Any, labels: Any, covariances: Any = None) -> "Points":
+    def of(cls, points: Any, labels: Any, covariances: Any = None, lines: Any = ALONE) -> "Points":
         """Return the points of arrays or lists, which may be empty."""
         placed = np.array(points, dtype=float).reshape(-1, 2)
         covariances = np.full((len(placed), 2, 2), np.nan) if covariances is None else covariances
-        return cls(placed, np.array(covariances, float).reshape(-1, 2, 2), np.array(labels, dtype=int))
+        covariances = np.array(covariances, float).reshape(-1, 2, 2)
+        lines = np.array(np.broadcast_to(lines, len(placed)), dtype=int)
+        return cls(placed, covariances, np.array(labels, dtype=int), lines)
 
-    def where(self, chosen: BoolArray | slice) -> "Points":
-        return Points(self.points[chosen], self.covariances[chosen], self.labels[chosen])
+    def where(self, chosen: BoolArray | IntArray | slice) -> "Points":
+        points, covariances, labels, lines = self
+        return Points(points[chosen], covariances[chosen], labels[chosen], lines[chosen])
 
     def equals(self, other: "Points") -> bool:
         return np.array_equal(self.points, other.points) and np.array_equal(self.labels, other.labels)
@@ -125,7 +132,9 @@ def yaw_of(quaternion: Any) -> float:
 
 
 def points_of(message: Any, rule: LabelRule) -> Points:
-    """Return the points of a cloud, an array of markers, or a message with lists of cones or numbers."""
+    """Return the points of a scan, a cloud, an array of markers, or lists of cones, polylines or numbers."""
+    if hasattr(message, "angle_increment"):
+        return scan_points(message)
     if hasattr(message, "point_step"):
         return cloud_points(message, rule)
     if hasattr(message, "x") and hasattr(message, "y"):
@@ -133,6 +142,18 @@ def points_of(message: Any, rule: LabelRule) -> Points:
     if hasattr(message, "markers"):
         return marker_points(message, rule)
     return cone_points(message, rule)
+
+
+def scan_points(scan: Any) -> Points:
+    """Return the points that the beams of a `LaserScan` have hit, without labels.
+
+    The range is NaN, infinite, or out of its limits where a beam has hit nothing.
+    """
+    ranges = np.asarray(scan.ranges, dtype=float)
+    angles = scan.angle_min + scan.angle_increment * np.arange(len(ranges))
+    hit = np.isfinite(ranges) & (ranges >= scan.range_min) & (ranges <= scan.range_max)
+    points = ranges[hit, None] * np.column_stack([np.cos(angles[hit]), np.sin(angles[hit])])
+    return Points.of(points, np.full(len(points), UNKNOWN), lines=DENSE)
 
 
 def cloud_points(cloud: Any, rule: LabelRule) -> Points:
@@ -187,13 +208,20 @@ def array_points(message: Any, rule: LabelRule) -> Points:
 
 
 def marker_points(array: Any, rule: LabelRule) -> Points:
-    """Return the points of a `MarkerArray` that are added: blue ones are left, yellow ones right."""
-    rows = [row for marker in _added(array.markers) for row in _of_marker(marker, rule)]
-    return Points.of([row[:2] for row in rows], [row[2] for row in rows])
+    """Return the points of a `MarkerArray` that are added: blue ones are left, yellow ones right.
+
+    A strip of lines is a polyline.
+    """
+    rows = [
+        (*row, number if marker.type == LINE_STRIP else ALONE)
+        for number, marker in enumerate(_added(array.markers))
+        for row in _of_marker(marker, rule)
+    ]
+    return Points.of([row[:2] for row in rows], [row[2] for row in rows], lines=[row[3] for row in rows])
 
 
 def _added(markers: Iterable[Any]) -> Iterator[Any]:
-    known = POINT_MARKERS + LIST_MARKERS
+    known = (*POINT_MARKERS, *LIST_MARKERS, LINE_STRIP)
     return (marker for marker in markers if marker.action == ADDED and marker.type in known)
 
 
@@ -214,15 +242,23 @@ def cone_points(message: Any, rule: LabelRule) -> Points:
     """Return the cones in all lists of a message, as in `ConeArrayWithCovariance` and `Detection3DArray`.
 
     A list whose name has a word of `LIST_NAMES` in it gives all its cones that label. In other lists a cone
-    has its own. Its covariance has 4 (x, y), 9 (x, y, z) or 36 entries (a pose), row by row.
+    has its own. Its covariance has 4 (x, y), 9 (x, y, z) or 36 entries (a pose), row by row. What has a list
+    of points in place of a position is a polyline.
     """
     lists = {name: getattr(message, name) for name in _names(message)}
     lists = {name: listed for name, listed in lists.items() if _is_list(listed)}
     if not lists:
         raise MessageError(f"expected a message with a list of cones, found the fields {_names(message)}")
-    cones = [cone for listed in lists.values() for cone in listed]
-    labels = [_cone_label(name, cone, rule) for name, listed in lists.items() for cone in listed]
-    return Points.of([*map(_position, cones)], labels, [*map(_covariance, cones)])
+    points, covariances = list[tuple[float, float]](), list[Array]()
+    labels, numbers = list[int](), list[int]()
+    for number, (name, one) in enumerate((name, one) for name, listed in lists.items() for one in listed):
+        vertices = _vertices(one)
+        points += [_position(one)] if vertices is None else vertices
+        added = len(points) - len(labels)
+        labels += [_cone_label(name, one, rule)] * added
+        covariances += [_covariance(one)] * added
+        numbers += [ALONE if vertices is None else number] * added
+    return Points.of(points, labels, covariances, numbers)
 
 
 def _is_list(value: Any) -> bool:
@@ -235,6 +271,17 @@ def _path(cone: Any) -> Iterator[Any]:
     while at is not None:
         yield at
         at = first_of(at, POSITIONS)
+
+
+def _vertices(line: Any) -> list[tuple[float, float]] | None:
+    """Return the vertices (m) of a polyline: arrays x and y, or a list of points. None of a single point."""
+    if np.ndim(getattr(line, "x", 0.0)) and np.ndim(getattr(line, "y", 0.0)):
+        return [(float(x), float(y)) for x, y in zip(line.x, line.y, strict=True)]
+    if any(hasattr(at, "x") and hasattr(at, "y") for at in _path(line)):
+        return None
+    lists = [getattr(line, name) for name in _names(line)]
+    points = next((listed for listed in lists if _is_list(listed)), None)
+    return None if points is None else [*map(_position, points)]
 
 
 def _position(cone: Any) -> tuple[float, float]:

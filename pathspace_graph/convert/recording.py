@@ -15,10 +15,11 @@ from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
-from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
-from .messages import Points, points_of, stamp_of, twist_of
+from .lines import along_lines, are_lines, count, default_spacing, in_vehicle, lines_of
+from .messages import ALONE, DENSE, Points, points_of, stamp_of, twist_of
 from .settings import Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
@@ -127,19 +128,40 @@ def _near(record: Recording, most: float | None, notes: Counter[str]) -> Recordi
     return replace(record, scans=[scan.where(one) for scan, one in zip(record.scans, near, strict=True)])
 
 
-def to_log(record: Recording, frames: Frames, noise: NoiseSettings, file: Path) -> Log:
-    """Return a record in order of time, in the vehicle frame; InputError of `file` if nothing is usable."""
+def to_log(
+    record: Recording, frames: Frames, noise: NoiseSettings, file: Path, spacing: float | None = None
+) -> Log:
+    """Return a record in order of time, in the vehicle frame; InputError of `file` if nothing is usable.
+
+    Points of lines are a spacing (m) apart, by default one that they tell themselves.
+    """
     frames = replace(frames, mounting=frames.mounting or record.mounting)
     odometry = _odometry(record, frames, file)
+    is_line = are_lines(record.scans, spacing)
+    record = _with_lines(record, odometry, frames, spacing) if is_line else _without_lines(record)
     stated = noise.sigma_odometry
     return Log(
         odometry,
         _cycles(record, odometry, frames, noise, file),
         np.array(logs.SIGMA_ODOMETRY if stated is None else stated, dtype=float),
+        sensor=SensorInfo(kind="line" if is_line else None),
         source=record.source,
         odometry_stated=stated is not None,
         detections_stated=noise.states_detections or not record.notes[ASSUMED],
     )
+
+
+def _with_lines(record: Recording, odometry: Odometry, frames: Frames, spacing: float | None) -> Recording:
+    scans = [usable(scan, record.notes) for scan in record.scans]
+    return replace(record, scans=lines_of(record.scan_t, scans, odometry, frames, spacing, record.notes))
+
+
+def _without_lines(record: Recording) -> Recording:
+    """Return a record of points that stand alone, without polylines beside them."""
+    scans = [scan.where(scan.lines == ALONE) for scan in record.scans]
+    notes, left_out = record.notes, count(record.scans) - count(scans)
+    notes["points of polylines beside cones were left out (--spacing takes both as lines)"] += left_out
+    return replace(record, scans=scans)
 
 
 def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
@@ -240,17 +262,15 @@ def in_vehicle_frame(
     A point `q` with covariance `K` is at `R(yaw) q + (x, y)` with `R K R^T`. Where a covariance is missing or
     not positive definite, it is made from range and bearing at the sensor.
     """
-    side = np.array([1.0, 1.0 if frames.y == "left" else -1.0])
-    points, covariances = found.points * side, found.covariances * np.outer(side, side)
+    covariances = found.covariances * np.outer(frames.sides, frames.sides)
     known = positive_definite(covariances) & (not noise.replace_covariances)
     notes[ASSUMED] += int((~known).sum())
-    assumed = logs.ray_covariances(points, noise.sigmas)
+    assumed = logs.ray_covariances(found.points * frames.sides, noise.sigmas)
     covariances = np.where(known[:, None, None], covariances, assumed)
-    mounting = frames.mounting or (0.0, 0.0, 0.0)
-    turn = rotation(mounting[2])
+    turn = rotation((frames.mounting or (0.0, 0.0, 0.0))[2])
     turned = turn @ covariances @ turn.T
     symmetric = 0.5 * (turned + turned.transpose(0, 2, 1))
-    return Detections(t, points @ turn.T + np.array(mounting[:2]), symmetric, found.labels)
+    return Detections(t, in_vehicle(found.points, frames), symmetric, found.labels)
 
 
 def positive_definite(covariances: Array) -> BoolArray:
@@ -302,6 +322,9 @@ class MessageStream:
         """Yield the cycles that have waited for long enough, with the twists since the last in `use`."""
         try:
             points = usable(points_of(message, self.rule), self.refused)
+            points = points.where(points.lines < 0)  # polylines beside cones are decoration
+            if (points.lines == DENSE).any():
+                points = along_lines(points, default_spacing([points]))
             t = stamp_of(message) or received
             if not self._first <= t < np.inf:
                 raise ValueError("detections: expected a stamp not before that of the first odometry")

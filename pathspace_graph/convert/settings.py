@@ -19,6 +19,7 @@ Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 # fields of a message that may hold the label of a detection, the first one that is there
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
 NO_LABEL: Final = "none"  # name of a label field that says there are no labels
+LEAST_SPACING: Final = 1e-3  # of points along a line (m)
 DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
@@ -92,6 +93,11 @@ class Frames:
             raise SettingsError(f"{expected}, found {' '.join(f'{value:g}' for value in mounting)}")
 
     @property
+    def sides(self) -> NDArray[np.float64]:
+        """Return by what a point [x, y] (2,) of the sensor is multiplied, so that y points to the left."""
+        return np.array([1.0, 1.0 if self.y == "left" else -1.0])
+
+    @property
     def flip(self) -> NDArray[np.float64]:
         """Return by what a twist [vx, vy, wz] (3,) is multiplied, so that its y axis points to the left."""
         return np.array([1.0, 1.0, 1.0] if (self.y_odometry or self.y) == "left" else [1.0, -1.0, -1.0])
@@ -109,6 +115,10 @@ class Window:
     """Time after the first odometry at which the log begins (s)."""
     end: float = inf
     """Time after the first odometry at which the log ends (s)."""
+    spacing: float | None = None
+    """Distance of points along a line, a kerb or a wall (m), to which dense ones are thinned and polylines
+    interpolated. It says that all detections are of lines. Without it those of a LaserScan and of polylines
+    are, at 0.15 of their median range."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.start < self.end:
@@ -116,6 +126,9 @@ class Window:
             raise SettingsError(f"--start, --end: expected times of at least 0 in this order, {found}")
         if self.range_max is not None and not 0.0 < self.range_max < inf:
             raise SettingsError(f"--range-max: expected a positive number, found {self.range_max:g}")
+        if self.spacing is not None and not LEAST_SPACING <= self.spacing < inf:
+            expected = f"--spacing: expected at least {LEAST_SPACING:g} m"
+            raise SettingsError(f"{expected}, found {self.spacing:g}")
         if not isfinite(self.time_offset):
             raise SettingsError(f"--time-offset: expected a number, found {self.time_offset:g}")
 

@@ -2,12 +2,13 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
 from math import pi
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -26,7 +27,7 @@ from pathspace_graph.io.parsing import (
 )
 from pathspace_graph.labels import UNKNOWN
 
-from .messages import Points
+from .messages import ALONE, Points, scan_points
 from .recording import Recording
 from .settings import LabelRule
 
@@ -36,7 +37,7 @@ QUANTITIES: Final = {  # columns of each file and their quantities; a covariance
     ODOMETRY: {"t": "time", "vx": "speed", "vy": "speed", "wz": "yaw_rate"},
     DETECTIONS: {
         **{"t": "time", "x": "length", "y": "length", "range": "length", "bearing": "angle", "label": ""},
-        **{"xx": "length", "xy": "length", "yy": "length"},
+        **{"xx": "length", "xy": "length", "yy": "length", "line": ""},
     },
 }
 COVARIANCE: Final = ("xx", "xy", "yy")  # columns of the covariance of a detection, if there is one
@@ -212,8 +213,11 @@ def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
         covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
     if file.has("label"):
         labels = rule.of_all(np.array(file.table.columns[file.column("label")]))
+    lines: Any = ALONE
+    if (DETECTIONS, "line") in file.named:
+        lines = np.unique(file.table.columns[file.column("line")], return_inverse=True)[1]
     starts = np.flatnonzero(np.diff(t, prepend=np.nan))
-    detections = Points.of(points, labels, covariances)
+    detections = Points.of(points, labels, covariances, lines)
     spans = [slice(*span) for span in pairwise([*starts.tolist(), len(t)])]
     return t[starts], [detections.where(span) for span in spans]
 
@@ -248,7 +252,9 @@ def read_json_lines(file: Path, rule: LabelRule) -> Recording:
 
     A line is `{"t": s, "twist": [vx, vy, wz]}` or `{"t": s, "detections": [{"x": m, "y": m, "label": "blue",
     "covariance": [[xx, xy], [xy, yy]]}, ...]}`, with `range` and `bearing` in place of `x` and `y` where one
-    likes; label and covariance are optional. A line may have both.
+    likes; label and covariance are optional. A line may have both. In place of detections it may have
+    `"polylines": [{"points": [[x, y], ...], "label": "left"}, ...]` or a scan as of a `LaserScan`:
+    `"scan": {"angle_min": rad, "angle_increment": rad, "range_min": m, "range_max": m, "ranges": [m, ...]}`.
     """
     t, twists, scan_t, scans = [], [], [], []
     for row, line in enumerate(read_text(file).splitlines(), start=1):
@@ -260,11 +266,11 @@ def read_json_lines(file: Path, rule: LabelRule) -> Recording:
             if "twist" in entry:
                 t.append(stamp)
                 twists.append(np.array(entry["twist"], dtype=float).reshape(3))
-            if "detections" in entry:
-                scan_t.append(stamp)
-                scans.append(_points_of_objects(entry["detections"], rule))
+            points = [read(entry[key], rule) for key, read in _READERS.items() if key in entry]
+            scan_t += [stamp] * len(points)
+            scans += points
         except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
-            expected = "expected a line with t, and with twist [vx, vy, wz] or a list of detections"
+            expected = "expected a line with t, and with twist [vx, vy, wz], detections, polylines or a scan"
             found = f"found {shown(line)} ({type(error).__name__}: {error})"
             raise InputError(file, f"{expected}, {found}", row) from None
     measured = np.array(t), np.array(twists).reshape(-1, 3)
@@ -282,3 +288,32 @@ def _points_of_objects(objects: list[dict[str, Any]], rule: LabelRule) -> Points
         covariances.append(np.array(one.get("covariance", UNSTATED), dtype=float).reshape(2, 2))
         labels.append(rule.of(one["label"]) if "label" in one else UNKNOWN)
     return Points.of(points, labels, covariances)
+
+
+def _points_of_polylines(polylines: list[dict[str, Any]], rule: LabelRule) -> Points:
+    points, labels, lines = [], [], []
+    for number, one in enumerate(polylines):
+        vertices = np.array(one["points"], dtype=float).reshape(-1, 2)
+        points.append(vertices)
+        labels += [rule.of(one["label"]) if "label" in one else UNKNOWN] * len(vertices)
+        lines += [number] * len(vertices)
+    return Points.of(np.concatenate([np.zeros((0, 2)), *points]), labels, lines=lines)
+
+
+def _points_of_scan(scan: dict[str, Any], rule: LabelRule) -> Points:
+    ranges = [np.nan if value is None else float(value) for value in scan["ranges"]]
+    fields = {key: float(scan[key]) for key in ("angle_min", "angle_increment")}
+    fields |= {
+        "range_min": float(scan.get("range_min", 0.0)),
+        "range_max": float(scan.get("range_max", np.inf)),
+    }
+    return scan_points(SimpleNamespace(ranges=ranges, **fields))
+
+
+_READERS: Final[
+    dict[str, Callable[[Any, LabelRule], Points]]
+] = {  # of what a line may have beside its stamp and a twist
+    "detections": _points_of_objects,
+    "polylines": _points_of_polylines,
+    "scan": _points_of_scan,
+}

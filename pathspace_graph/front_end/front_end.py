@@ -18,6 +18,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
+from .lines import merged, of_line
 from .log_odometry import LogOdometry, chained
 from .measurement import measure
 from .motion import MotionCheck
@@ -80,8 +81,10 @@ class FrontEnd:
         noise, check, sides = self.noise, self._motion, self._sides
         of_orange = is_orange(detections)
         cones, orange = detections.where(~of_orange), detections.where(of_orange)
+        cones = merged(cones, of_line(cones.labels, self._settings))
         checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
-        motion = check.update(odometry, checked, may_doubt=noise.is_settled)
+        is_line = of_line(cones.labels, self._settings)
+        motion = check.update(odometry, checked, noise.is_settled, is_line)
         swapped, colourless = sides.swapped, sides.colourless
         in_lane = is_in_orange_lane(detections, of_orange)
         labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane).labels
@@ -96,7 +99,7 @@ class FrontEnd:
         if may_doubt and check.errors.contradict(calibration):
             self._sensor_doubted = True
             settings = replace(settings, calibration=check.errors.found(calibration))
-        fresh = noise.observe(odometry, cones, motion, check.pose)
+        fresh = noise.observe(odometry, cones.where(~of_line(labels, settings)), motion, check.pose)
         if fresh:
             check.set_noise(noise.twist_sigma)
         if fresh or not self._begun:
@@ -130,7 +133,7 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
     """Return a log of scale 1 as the front end gives it to a batch; unknown noise is measured on it first."""
     front_end = FrontEnd(settings, noise)
     if front_end.noise.is_learning:
-        front_end = FrontEnd(settings, replace(noise, measured=measure_log(log)))
+        front_end = FrontEnd(settings, replace(noise, measured=measure_log(log, settings)))
     admitted = (front_end.admit(odometry, cycle) for odometry, cycle in split_odometry(log))
     readings = [front_end.update(cycle.odometry, cycle.detections) for cycle in admitted]
     settings = readings[0].measured or settings
@@ -153,17 +156,21 @@ def is_orange(detections: Detections) -> BoolArray:
     return np.asarray(detections.labels >= min(POINTS))
 
 
-def measure_log(log: Log) -> MeasuredNoise | None:
-    """Return the noise of a whole log and the constant errors of its sensor, by its readings alone."""
-    return measure(*seen_cycles(log), None)
+def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoise | None:
+    """Return the noise of a whole log and the constant errors of its sensor, by its readings alone.
+
+    Points of lines, of which the settings say, tell neither.
+    """
+    return measure(*seen_cycles(log, settings), None)
 
 
-def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
-    """Return the cycles of a log where odometry alone, which is not doubted, places them, and the twists."""
+def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
+    """Return the cones of a log where odometry alone, which is not doubted, places them, and the twists."""
+    settings = settings or MapperSettings()
     readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
     for odometry, _ in readings:
         twists.add(odometry)
-    white, settings = measure([], twists, None), MapperSettings()
+    white = measure([], twists, None)
     sigma = log.odometry_sigma if white is None else white.twist_sigma
     check, sides = MotionCheck(sigma, settings.motion), SideJudge(settings.sides)
     for odometry, detections in readings:
@@ -171,5 +178,6 @@ def seen_cycles(log: Log) -> tuple[list[SeenCycle], TwistRecord]:
         cones, in_lane = detections.where(~of_orange), is_in_orange_lane(detections, of_orange)
         motion = check.update(odometry, cones, may_doubt=None)
         labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
+        labelled = labelled.where(~of_line(labelled.labels, settings))
         cycles.append(SeenCycle(labelled, check.pose, motion.odometry.twist))
     return cycles, twists

@@ -8,7 +8,7 @@ import numpy as np
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import integrate_twists, integrated_odometry
-from pathspace_graph.factors.se2 import compose, relative, rotation, to_map
+from pathspace_graph.factors.se2 import compose, relative, rotation
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, integrate_odometry
 from pathspace_graph.settings.online import MotionSettings
@@ -68,18 +68,25 @@ class MotionCheck:
         self._standstill = Standstill()
 
     def update(
-        self, odometry: Odometry, detections: Detections, may_doubt: bool | None = True
+        self,
+        odometry: Odometry,
+        detections: Detections,
+        may_doubt: bool | None = True,
+        is_line: BoolArray | None = None,
     ) -> MeasuredMotion:
         """Return the motion since the last cycle, whose odometry may be doubted if the noise is known.
 
-        If `may_doubt` is None, the detections are only asked where the odometry is missing or stuck.
+        If `may_doubt` is None, the detections are only asked where the odometry is missing or stuck. Points
+        of a line (m,) tell the motion across it, and nothing of a standstill.
         """
+        is_line = np.zeros(len(detections.labels), bool) if is_line is None else is_line
         t, matcher = detections.t, self._matcher
         motion = self._twists.integrate(odometry, t, self._t, self.sigma)
         twist, delta = motion.odometry.twist, motion.odometry.delta
-        seen = matcher.corrected(detections, twist)
+        seen = matcher.corrected(detections, twist, is_line)
         limit = DOUBT_AGAIN if t - self._doubted_at < DISTRUST else self._settings.doubt
-        self._standstill.add(t, seen[0], matcher.excess * detections.covariances, delta)
+        cones = matcher.excess * detections.covariances[~is_line]
+        self._standstill.add(t, seen.points[~is_line], cones, delta)
         standing, agrees = self._standing(motion) if may_doubt else None, None
         if standing is None:
             motion, agrees = self._checked(motion, t, seen, may_doubt, limit)
@@ -90,11 +97,12 @@ class MotionCheck:
         if not motion.fault and self._rest.update(odometry, t, self.sigma):
             motion = self._at_rest(motion, t, seen, limit)
         self.pose = compose(self.pose, motion.odometry.delta)
-        if agrees is not None:
+        if agrees is not None and not agrees.by_lines:
             self.seen_again = agrees.is_matched
         elif may_doubt is not None:
-            self.seen_again = matcher.recent.has(to_map(seen[0], self.pose[None]))
-        matcher.remember(detections, motion.odometry.twist if motion.fault else twist, self.pose)
+            self.seen_again = matcher.has(seen, self.pose)
+        moving = motion.odometry.twist if motion.fault else twist
+        matcher.remember(detections, moving, self.pose, is_line)
         self._standstill.believe(self.pose)
         if self._t is not None and t > self._t:
             self._velocity = motion.odometry.delta / (t - self._t)

@@ -9,9 +9,10 @@ by -psi. Detections that are late by tau lie too far ahead by `tau v`, which cha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
@@ -21,6 +22,8 @@ from pathspace_graph.factors.se2 import left_of, rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
+
+from .line_matching import HEADING_TOLD, Limits, match_lines, squares_at
 
 LEARNED_ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
 SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
@@ -50,8 +53,19 @@ MISFIT_GAIN: Final = 0.02  # smoothing gain of the mean-square misfit
 MAX_MISFIT: Final = 3.0  # largest misfit of a motion: 1 where the vehicle moved, 4 where it was put down
 MISFIT_ODOMETRY: Final = 2.0  # least misfit at the odometry's own pose in a contradiction
 MISFIT_RATIO: Final = 1.3  # least ratio of that misfit to the one of the match
-Seen = tuple[Array, Array]
-"""Corrected detections (m, 2), vehicle frame, and variances (m,) of a coordinate."""
+
+
+class Seen(NamedTuple):
+    """Detections of a cycle as they are matched."""
+
+    points: Array  # (m, 2) corrected, vehicle frame (m)
+    variances: Array  # (m,) of one coordinate (m^2)
+    is_line: BoolArray  # (m,) whether they are points of a line
+
+    def where(self, chosen: BoolArray) -> "Seen":
+        return Seen(self.points[chosen], self.variances[chosen], self.is_line[chosen])
+
+
 _TINY: Final = float(np.finfo(float).tiny)
 
 
@@ -103,6 +117,7 @@ class Match:
     information: Array  # (3, 3) information about the pose from the matched detections, same frame
     is_matched: BoolArray  # (m,) whether each detection lies on earlier ones
     misfit: float  # mean square of the matched detections' whitened distances
+    by_lines: bool = False  # whether lines are among them, which tell nothing along themselves
 
     @property
     def matched(self) -> int:
@@ -111,6 +126,8 @@ class Match:
     @property
     def is_certain(self) -> bool:
         """Whether the detections hold the pose in every direction."""
+        if self.by_lines:
+            return bool(np.linalg.inv(self.information)[2, 2] < HEADING_TOLD**2)
         (w, _, a), (_, _, b), (_, _, turning) = self.information.tolist()  # of x and y: w times the identity
         return bool(w * (w * turning - a * a - b * b) / max(w * w * turning, _TINY) > LEAST_SHARE)
 
@@ -138,6 +155,25 @@ def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array,
     matched = weights > MIN_WEIGHT
     variance = variances * (1.0 + 1.0 / np.where(matched, weights, 1.0)) + SIGMA_CONE**2
     square = np.where(matched, ((points - means) ** 2).sum(axis=1) / variance, MOST_MISFIT)
+    return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
+
+
+LIMITS: Final = Limits(FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED)
+
+
+def match_with_lines(
+    recent: RecentDetections, lines: RecentDetections, seen: Seen, start: Array, reaches: Sequence[float]
+) -> Match:
+    """Lay detections on recent ones, of cones and of lines, from a pose (3,)."""
+    points = recent.points, lines.points
+    pose, information, matched, square = match_lines(points, seen, start, reaches, LIMITS)
+    return Match(pose, information, matched, square / max(int(matched.sum()), 1), by_lines=True)
+
+
+def misfit_with_lines(recent: RecentDetections, lines: RecentDetections, seen: Seen, pose: Array) -> float:
+    """Return the mean square of the whitened distances as `match_with_lines` has them, at a pose (3,)."""
+    square, matched = squares_at((recent.points, lines.points), seen, pose, REACH_LAST, LIMITS)
+    square = np.where(matched, square, MOST_MISFIT)
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
 
@@ -238,40 +274,57 @@ class ScanMatcher:
     def copy(self) -> Self:
         """Return a copy that goes on independently."""
         other = shallow(self)
-        other.recent, other.errors = self.recent.copy(), self.errors.copy()
+        other.recent, other.recent_lines = self.recent.copy(), self.recent_lines.copy()
+        other.errors = self.errors.copy()
         return other
 
     def forget(self) -> None:
         """Forget the newest cycles, and what was learned of the sensor."""
         self.recent, self.errors = RecentDetections(), SensorErrors(self._settings)
+        self.recent_lines = RecentDetections()
 
     @property
     def excess(self) -> float:
         """Factor by which the variance of detections is larger than they claim; at least 1."""
         return max(self._misfit / LARGE_MISFIT, 1.0)
 
-    def corrected(self, detections: Detections, twist: Array) -> Seen:
+    def corrected(self, detections: Detections, twist: Array, is_line: BoolArray) -> Seen:
         """Return a cycle's detections by the errors of the sensor, and correct the remembered ones."""
         measured, covariances = detections.points_vehicle, detections.covariances
-        self.recent.forget(detections.t)
-        self.recent.correct(self.errors.mean)
+        for recent in (self.recent, self.recent_lines):
+            recent.forget(detections.t)
+            recent.correct(self.errors.mean)
         points = measured + by_errors(measured, twist) @ self.errors.mean
-        return points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1])
+        return Seen(points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1]), is_line)
 
-    def remember(self, detections: Detections, twist: Array, pose: Array) -> None:
+    def remember(self, detections: Detections, twist: Array, pose: Array, is_line: BoolArray) -> None:
         """Remember a cycle that was seen from a pose (3,), in motion by a twist (3,)."""
-        measured = detections.points_vehicle
-        self.recent.add(detections.t, measured, by_errors(measured, twist), pose)
+        for recent, chosen in ((self.recent, ~is_line), (self.recent_lines, is_line)):
+            measured = detections.points_vehicle[chosen]
+            recent.add(detections.t, measured, by_errors(measured, twist), pose)
+
+    def has(self, seen: Seen, pose: Array) -> BoolArray:
+        """Return whether each detection (m,), from a pose (3,), lies where an earlier one does."""
+        placed, again = to_map(seen.points, pose[None]), np.zeros(len(seen.points), bool)
+        again[~seen.is_line] = self.recent.has(placed[~seen.is_line])
+        lines = self.recent_lines.points
+        if len(lines) and seen.is_line.any():
+            again[seen.is_line] = KDTree(lines).query(placed[seen.is_line])[0] < REACH_FIRST
+        return again
 
     def match(self, seen: Seen, start: Array, reaches: Sequence[float]) -> Match | None:
         """Return the match of detections from a pose (3,), unless it leaves the pose open."""
-        matched = match(self.recent, *seen, start, reaches)
+        if seen.is_line.any():
+            matched = match_with_lines(self.recent, self.recent_lines, seen, start, reaches)
+        else:
+            matched = match(self.recent, seen.points, seen.variances, start, reaches)
         return matched if matched.matched >= MIN_MATCHED and matched.is_certain else None
 
     def difference(self, matched: Match, odometry: IntegratedOdometry, predicted: Array) -> Difference:
         """Return how far a match is from the pose (3,) that odometry predicts, in the vehicle's frame."""
         known = matched.pose, matched.information, self.excess, predicted, odometry.covariance
-        way = rotation(predicted[2]).T @ (predicted[:2] - self.recent.seen_from)
+        recent = self.recent_lines if matched.by_lines else self.recent
+        way = rotation(predicted[2]).T @ (predicted[:2] - recent.seen_from)
         return Difference(*kernels.off_prediction(*known), self.errors.shifts(way, odometry.twist))
 
     def denies(self, matched: Match, difference: Difference, limit: float) -> bool:
@@ -289,7 +342,11 @@ class ScanMatcher:
 
     def fits_better(self, matched: Match, predicted: Array, seen: Seen) -> bool:
         """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
-        points, variances = (column[matched.is_matched] for column in seen)
-        at_odometry = misfit_at(self.recent, points, variances, predicted)
-        at_match = misfit_at(self.recent, points, variances, matched.pose)
+        chosen = seen.where(matched.is_matched)
+        at_odometry, at_match = (
+            misfit_with_lines(self.recent, self.recent_lines, chosen, pose)
+            if matched.by_lines
+            else misfit_at(self.recent, chosen.points, chosen.variances, pose)
+            for pose in (predicted, matched.pose)
+        )
         return at_odometry > max(MISFIT_ODOMETRY, MISFIT_RATIO * at_match)

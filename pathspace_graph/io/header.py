@@ -61,15 +61,21 @@ class Header:
             raise InputError(self.file, f"expected {what} as [{path}] {name}, found {shown(value)}")
         return np.array(values, dtype=float)
 
+    def word(self, path: str, name: str, known: tuple[str, ...]) -> Any:
+        """Return an entry that is one of the known words, or None where there is none."""
+        value = self.section(path).get(name)
+        if value is None or value in known:
+            return value
+        quoted = [f'"{word}"' for word in known]
+        expected = f"expected {', '.join(quoted[:-1])} or {quoted[-1]} as [{path}] {name}"
+        raise InputError(self.file, f"{expected}, found {shown(value)}")
+
     def noise(self) -> dict[str, Any]:
         """Return the fields of a log about its noise; one without the section has stated it."""
         found: dict[str, Any] = {}
         for name in ("odometry", "detections"):
-            value = self.section("noise").get(name, STATED)
-            if value not in (STATED, *UNSTATED):
-                expected = f'expected "stated", "measured" or "assumed" as [noise] {name}'
-                raise InputError(self.file, f"{expected}, found {shown(value)}")
-            found[f"{name}_stated"] = value == STATED
+            word = self.word("noise", name, (STATED, *UNSTATED))
+            found[f"{name}_stated"] = word in (None, STATED)
         return found | {"measured": self._measured() if "measured" in self.section("noise") else None}
 
     def _measured(self) -> MeasuredNoise:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, get_args
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS
+from pathspace_graph.settings.mapper import Kind
 
 from . import parsing as limits
 from .brief import Brief, pictures
@@ -128,6 +129,9 @@ class Detections(Brief):
         )
 
 
+KINDS: Final = get_args(Kind)
+
+
 @dataclass(frozen=True)
 class SensorInfo:
     """What is known of the sensor; None where the log does not say."""
@@ -140,6 +144,8 @@ class SensorInfo:
     """Field of view, the whole angle, rad."""
     rate: float | None = None
     """Perception cycles per second, Hz."""
+    kind: Kind | None = None
+    """What detections are of."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -228,7 +234,6 @@ def read_log(folder: Path | str) -> Log:
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
     header = Header(folder / LOG_FILE)
     odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
-    sensor = [name for name in vars(SensorInfo()) if name in header.section("sensor")]
     truth = header.section("truth")
     true_errors = {
         name: np.array([header.numbers("truth", entry).item() for entry in entries])
@@ -239,11 +244,17 @@ def read_log(folder: Path | str) -> Log:
         odometry=odometry,
         cycles=_cycles(table, float(odometry.t[0]), float(odometry.t[-1])),
         odometry_sigma=header.numbers("odometry", "sigma", 3, POSITIVE),
-        sensor=SensorInfo(**{name: header.numbers("sensor", name, 1, POSITIVE).item() for name in sensor}),
+        sensor=_read_sensor(header),
         source={key: str(value) for key, value in header.section("source").items()},
         **header.noise(),
         truth=_read_truth(folder, len(table), true_errors),
     )
+
+
+def _read_sensor(header: Header) -> SensorInfo:
+    numbers = [name for name in ("range_max", "fov", "rate") if name in header.section("sensor")]
+    values = {name: header.numbers("sensor", name, 1, POSITIVE).item() for name in numbers}
+    return SensorInfo(**values, kind=header.word("sensor", "kind", KINDS))
 
 
 def _table(folder: Path, name: str) -> Table:
@@ -390,7 +401,11 @@ def _sections(log: Log) -> dict[str, dict[str, Any]]:
         truth |= {} if values is None else dict(zip(entries, values.tolist(), strict=True))
     return {
         "odometry": {"sigma": [float(value) for value in log.odometry_sigma]},
-        "sensor": {name: float(value) for name, value in vars(log.sensor).items() if value is not None},
+        "sensor": {
+            name: value if isinstance(value, str) else float(value)
+            for name, value in vars(log.sensor).items()
+            if value is not None
+        },
         **noise_sections(log.odometry_stated, log.detections_stated, log.measured),
         "source": {toml_text(key): value for key, value in log.source.items()},
         **({"truth": truth} if truth else {}),

@@ -141,7 +141,7 @@ class DriveRecord:
         self.replaced(np.concatenate([bent[:first], window]))
 
     def seen_in(self, sensor: Array, noise: NoiseLearner) -> SeenIn:
-        """Return the detections of some cycles, corrected by the calibration (5,) of the sensor, or (0,)."""
+        """Return the cones detected in some cycles, corrected by the sensor's calibration: (5,) or (0,)."""
 
         def seen_in(cycles: IntArray) -> DetectionColumns:
             chosen = [self._measured[k] for k in cycles.tolist()]
@@ -149,7 +149,7 @@ class DriveRecord:
             table = DetectionColumns.of([one.seen.with_others(one.orange) for one in chosen], twists=twists)
             table = replace(_for_map(table, noise), cycle=cycles[table.cycle])
             table.correct(sensor)
-            return table
+            return table.cones(self.settings.lines)
 
         return seen_in
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Final, Self
 
+from pathspace_graph.batch.association import LINE_STEP
 from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.changes import solve_loop
@@ -91,7 +92,10 @@ class Open:
 
     def _is_solvable(self, road: Road, drive: Drive) -> bool:
         """Return whether the lap can be solved as a batch; a lap of too many cones is given up."""
-        cones = sum(len(boundary.cone_parameters) for boundary in road.boundaries.values())
+        cones = sum(  # or of places that stand for those of a line
+            boundary.length / LINE_STEP if label in self.settings.lines else len(boundary.cone_parameters)
+            for label, boundary in road.boundaries.items()
+        )
         if cones > self.settings.open_lap.max_cones:
             drive.record.give_up("the lap has too many cones for a batch")
         return drive.record.unsolvable is None

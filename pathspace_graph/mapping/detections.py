@@ -95,6 +95,10 @@ class DetectionColumns:
         """Set the calibration of the sensor by which `point` is corrected."""
         self.sensor = sensor.copy()
 
+    def cones(self, lines: Sequence[int]) -> Self:
+        """Return the detections that are of no boundary of these labels, which are lines."""
+        return self.where(np.flatnonzero(~np.isin(self.label, lines))) if lines else self
+
     @property
     def point(self) -> Array:
         """Return all positions (m, 2), vehicle frame, corrected by the calibration that was set last."""

@@ -128,10 +128,13 @@ NOISE_SHARE: Final = 0.75  # share of the detections from which on wrong covaria
 NOISE_CYCLES: Final = 300  # most cycles on which the noise of detections is measured
 
 
-def noise_hints(log: Log) -> list[Hint]:
-    """Return hints where the readings contradict the noise that the log states by a large factor."""
+def noise_hints(log: Log, *, stay: bool = True) -> list[Hint]:
+    """Return hints where the readings contradict the noise that the log states by a large factor.
+
+    That of detections is only known if they `stay` where they are.
+    """
     found = _odometry(log) if log.odometry_stated else []
-    return found + (_detections(log) if log.detections_stated else [])
+    return found + (_detections(log) if log.detections_stated and stay else [])
 
 
 def _odometry(log: Log) -> list[Hint]:

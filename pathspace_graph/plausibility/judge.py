@@ -11,12 +11,14 @@ import numpy as np
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.gate import read_usable_log
+from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.parsing import read_table, shown
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import Length, scaled
 from pathspace_graph.scale import scale_of
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
 from . import hypotheses
@@ -91,8 +93,16 @@ def _hints(log: Log) -> list[Hint]:
     pairs = hypotheses.pairs_of(log.cycles)
     if pairs is None:
         return of_ends + found + beyond_any_vehicle(log.odometry)
-    found += _by_motion(Trials(log, telling_pairs(log, pairs)))
-    return of_ends + (found or noise_hints(log))
+    trials = Trials(log, telling_pairs(log, pairs))
+    others = _of_readings(trials, found)
+    if others and with_kind(MapperSettings(), log).lines:
+        others = _of_readings(trials, found, stay=False)
+    return of_ends + others
+
+
+def _of_readings(trials: Trials, found: list[Hint], *, stay: bool = True) -> list[Hint]:
+    """Return the hints found and those by motion, or those about noise where there are none of either."""
+    return found + _by_motion(trials, stay=stay) or noise_hints(trials.log, stay=stay)
 
 
 # --- figures that tell units by themselves ---------------------------------------------------------------
@@ -192,13 +202,16 @@ def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
     return pairs.chosen(pairs.overlap(motion) >= PAIR_OVERLAP)
 
 
-def _by_motion(trials: Trials) -> list[Hint]:
+def _by_motion(trials: Trials, *, stay: bool) -> list[Hint]:
+    """Return the hints that detections tell which `stay` where they are; points of a line tell only some."""
     if len(trials.pairs) == 0:
         return beyond_any_vehicle(trials.log.odometry)
     best, found = _meant(trials)
     if best.hypothesis.content == "nothing" or (found and camera(trials.pairs)):
         return found
     late, of_clocks = _late(trials, best)
+    if not stay:
+        return found + of_clocks
     if best.share < hypotheses.LEAST_EXPLAINED and late is best:
         return found + (_unexplained(trials, best) if not found else [])
     mounting = hypotheses.mounting_of(trials, late.hypothesis)

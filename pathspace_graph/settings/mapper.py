@@ -1,9 +1,10 @@
 """Settings of the estimators; a number that nobody changes is a constant, here or beside its use."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
 
 from pathspace_graph.errors import SettingsError, check_type
+from pathspace_graph.labels import LEFT, RIGHT
 
 from .checked import Positive
 from .online import (
@@ -18,6 +19,12 @@ from .online import (
 
 Knots = Literal["cones", "curvature"]  # what the knots of a closed boundary follow
 Start = Literal["auto", "online", "odometry"]
+Kind = Literal["cones", "line", "line-left", "line-right"]  # what detections are of, on both sides or on one
+_LINES: Final[dict[Kind | None, tuple[int, ...]]] = {  # boundaries that are lines
+    "line": (LEFT, RIGHT),
+    "line-left": (LEFT,),
+    "line-right": (RIGHT,),
+}
 
 
 @dataclass(frozen=True)
@@ -227,6 +234,10 @@ class MapperSettings(Positive):
     noise: Literal["measured", "stated"] | None = None
     """Noise of odometry and detections: by default as stated, and measured where nothing is. Constant errors
     of the sensor are measured unless this is `stated`."""
+    kind: Kind | None = None
+    """What detections are of: cones, which stay where they are, or a line, whose points lie anywhere along
+    it, on both sides or on one. By default the log states it, or its first seconds tell it; an online
+    estimator that is made without one takes cones."""
     scale: float | None = None
     """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road. All
     lengths of the settings are those at scale 1. By default the first metres of the log tell it; an online
@@ -248,6 +259,11 @@ class MapperSettings(Positive):
     ckf: CkfSettings = field(default_factory=CkfSettings)
 
     sigma_step: ClassVar[float] = 0.5  # of a control point's move in a step, m: damps sliding along the curve
+
+    @property
+    def lines(self) -> tuple[int, ...]:
+        """Labels of the boundaries that are lines."""
+        return _LINES.get(self.kind, ())
 
     @property
     def calibrations(self) -> tuple[float, ...]:

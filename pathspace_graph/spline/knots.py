@@ -246,6 +246,18 @@ def chosen_breaks(points: Array, periodic: bool, degree: int, least: int, most: 
     return min(within, key=lambda curve: (1.0 if curve is within[0] else 1.0 + SIZE_MARGIN) * curve.crossed)
 
 
+def fewest_breaks(points: Array, periodic: bool, degree: int, least: int, tolerance: float) -> Thinned:
+    """Choose the smallest curve of `thin` whose points left out are within a tolerance (m), root mean square.
+
+    It has at least `least` control points. Where none is so near, the largest is chosen.
+    """
+    along = path_lengths(points)
+    high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
+    path = list(thin(points, along, high, periodic, degree, least))
+    near = [curve for curve in path if curve.crossed <= tolerance**2 * len(points)]
+    return near[-1] if near else path[0]
+
+
 def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, least: int) -> Iterator[Thinned]:
     """Yield least-squares curves with one knot less each, from a knot at each point down to `least` points.
 

@@ -5,12 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.association import cones_of_curve
-from pathspace_graph.batch.simplification import Scatter, cross_validated, new_from_old, reknot, simplified
+from pathspace_graph.batch.association import cones_of_curve, points_along
+from pathspace_graph.batch.simplification import (
+    Scatter,
+    cross_validated,
+    fit_line,
+    new_from_old,
+    reknot,
+    simplified,
+)
 from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import sampled
+from pathspace_graph.spline.knots import fit_spline
 
 from ..scenes.batch import settled, straight
 
@@ -106,3 +115,23 @@ def test_a_cone_that_is_left_out_shows_how_far_unseen_cones_lie() -> None:
     assert len(cross_validated(circle, True, SETTINGS, 0.43)) == 40
     assert np.abs(cross_validated(circle, True, SETTINGS, 0.43)).max() < 0.05
     assert np.sqrt(np.mean(cross_validated(zigzag, True, SETTINGS, 0.43) ** 2)) > 0.3
+
+
+def test_the_places_of_a_line_are_as_far_apart_as_its_length_allows() -> None:
+    """On 9 m there are three places, at 1.5, 4.5 and 7.5 m, each the mean of the points about it."""
+    u = np.array([0.1, 1.0, 2.9, 3.2, 5.8, 4.5, 6.2, 8.8, 7.5])
+    points = np.column_stack([u, np.tile([0.0, 0.3, -0.3], 3)])
+    found = points_along(points, u, np.tile(np.eye(2), (9, 1, 1)), 9.0, True, SETTINGS)
+    assert found.u.tolist() == [1.5, 4.5, 7.5]
+    assert found.count.tolist() == [3, 3, 3]
+    np.testing.assert_allclose(found.points, [[4.0 / 3.0, 0.0], [4.5, 0.0], [7.5, 0.0]], atol=1e-12)
+
+
+def test_a_line_has_as_few_control_points_as_its_shape_needs() -> None:
+    """A circle of 20 m radius on 60 control points needs far fewer within 0.05 m."""
+    phi = 2.0 * np.pi * np.arange(120) / 120.0
+    circle = fit_spline(20.0 * np.column_stack([np.cos(phi), np.sin(phi)]), 60, True)
+    few = fit_line(circle, SETTINGS)
+    assert 8 <= few.size <= 16
+    radii = np.hypot(*sampled(few, 0.5).T)
+    assert np.sqrt(np.mean((radii - 20.0) ** 2)) < 0.05

@@ -31,7 +31,7 @@ def record(points: Points, t: float = 0.5) -> Recording:
 
 
 def one(x: float, y: float, covariance: object = np.nan) -> Points:
-    return Points(np.array([[x, y]]), np.broadcast_to(covariance, (1, 2, 2)).astype(float), np.zeros(1, int))
+    return Points.of([[x, y]], [0], np.broadcast_to(covariance, (1, 2, 2)))
 
 
 def test_points_and_covariances_go_to_the_vehicle_frame() -> None:

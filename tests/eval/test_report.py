@@ -32,6 +32,7 @@ from pathspace_graph.eval.views import (
     faults_table,
     lap_columns,
     laps_table,
+    lines_table,
     metrics_table,
     skidpad_table,
     study_table,
@@ -138,6 +139,24 @@ def test_the_table_of_the_camera_has_each_estimator_and_the_landmarks_that_are_t
     assert [figures[0].value for _, figures in rows] == pytest.approx([0.3, 0.2, 0.2])
     assert rows[0][1][-1].value == pytest.approx(25.0) and rows[2][1][-1].value is None
     assert all(len(figures) == len(header) - 1 for _, figures in rows)
+
+
+def test_the_table_of_lines_has_each_estimator_at_each_spacing() -> None:
+    parts = [
+        frame(estimator, 2, rmse).assign(noise=noise, nees=1.5)
+        for noise in ("1 m", "4 m")
+        for estimator, rmse in (("fixed-lag", 0.6), ("spline", 0.4))
+    ]
+    header, rows = lines_table(pd.concat([*parts, parts[0].assign(estimator="landmark-fixed-lag")]))
+    assert header[:2] == ("points, estimator", "rmse [m]")
+    assert [label for label, _ in rows] == [
+        "1 m, `fixed-lag`",
+        "1 m, `spline`",
+        "4 m, `fixed-lag`",
+        "4 m, `spline`",
+        "1 m, `landmark-fixed-lag`",
+    ]
+    assert [figures[0].value for _, figures in rows] == pytest.approx([0.3, 0.2, 0.3, 0.2, 0.3])
 
 
 def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength() -> None:

@@ -42,7 +42,7 @@ def small_log() -> Log:
         rng.normal(size=6),
     )
     source = {"track": 'a "quoted" \\ name\n', "Umlaut": "Zürich \x7f"}
-    sensor = SensorInfo(range_max=15.0, fov=1.9)
+    sensor = SensorInfo(range_max=15.0, fov=1.9, kind="line")
     return Log(
         Odometry(t, rng.normal(size=(11, 3))), cycles, np.array([0.1, 0.2, 1e-5]), sensor, source, truth=truth
     )
@@ -264,6 +264,12 @@ BAD_ROWS = [
         'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[sensor]\nfov = "wide"\n',
         None,
         "fov",
+    ),
+    (
+        "log.toml",
+        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[sensor]\nkind = "wall"\n',
+        None,
+        'expected "cones", "line", "line-left" or "line-right" as [sensor] kind',
     ),
 ]
 

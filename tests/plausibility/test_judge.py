@@ -15,6 +15,7 @@ from pathspace_graph.plausibility.judge import positions_in_metres
 from pathspace_graph.sim.mistakes import MISTAKES, in_frame, late, with_points, with_twists
 
 from ..scenes.drives import ahead, corridor, detections, exact_log, short_drive
+from ..scenes.lines import line_drive
 
 SAID = {
     "positions in millimetres": ("in millimetres", "multiply x and y by 0.001"),
@@ -223,3 +224,14 @@ def test_detections_that_do_not_last_for_the_drive_are_told(
     drives = (log.odometry.t >= first) & (log.odometry.t <= last)
     parked = replace(log.odometry, twist=log.odometry.twist * drives[:, None])
     assert [hint for hint in hints(replace(short, odometry=parked)) if hint.cause == "gaps"] == []
+
+
+@pytest.mark.parametrize("spacing", [0.25, 4.0])
+def test_a_drive_along_lines_is_not_accused_of_moving_cones(spacing: float) -> None:
+    assert hints(line_drive(1, spacing)) == []
+
+
+def test_the_unit_of_the_positions_is_told_of_lines_as_well() -> None:
+    """Nothing about it needs cones that stay."""
+    found = hints(MISTAKES["positions in millimetres"](line_drive(1, 1.0)))
+    assert [hint.cause for hint in found] == ["positions"]

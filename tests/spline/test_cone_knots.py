@@ -8,7 +8,14 @@ import pytest
 from pathspace_graph.eval.metrics.accuracy import closest_points
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import ENERGY_WEIGHT, chosen_breaks, energy_rows, fit_spline, thin
+from pathspace_graph.spline.knots import (
+    ENERGY_WEIGHT,
+    chosen_breaks,
+    energy_rows,
+    fewest_breaks,
+    fit_spline,
+    thin,
+)
 
 DEGREE = 3
 
@@ -148,3 +155,15 @@ def test_few_cones_have_a_curve_through_them(count: int, periodic: bool) -> None
     chosen = chosen_breaks(points, periodic, DEGREE, 8, 8)
     spline = fit_spline(points, chosen.size, periodic, DEGREE, chosen.breaks)
     assert np.abs(closest_points(spline, points).distance).max() < 0.5
+
+
+@pytest.mark.parametrize("tolerance", [0.02, 0.1])
+def test_a_line_has_the_fewest_knots_that_its_points_allow(tolerance: float) -> None:
+    """On a circle of 20 m, the curve with one control point less is farther from points left out."""
+    points = circle(120, 0.0)
+    chosen = fewest_breaks(points, True, DEGREE, 6, tolerance)
+    u = along(points)
+    high = float(u[-1] + np.hypot(*(points[0] - points[-1])))
+    by_size = {curve.size: np.sqrt(curve.crossed / 120.0) for curve in thin(points, u, high, True, DEGREE, 6)}
+    assert by_size[chosen.size] <= tolerance < by_size[chosen.size - 1]
+    assert 6 < chosen.size < 20

@@ -207,6 +207,7 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
         "faults",
         "gauge",
         "hard",
+        "lines",
         "lag",
         "online",
         "open",
@@ -237,6 +238,7 @@ def test_every_shipped_study_is_sound_and_listed(name: str) -> None:
     assert len(read.tracks) * len(read.seeds) >= {
         "acceleration": 10,
         "hard": 16,
+        "lines": 6,
         "faults": 4,
         "endurance": 4,
         "sizes": 4,

@@ -1,0 +1,173 @@
+"""Points of lines, kerbs or walls: at a spacing along their row, and of the side of the way driven."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.odometry import integrate_poses
+from pathspace_graph.factors.se2 import rotation
+from pathspace_graph.io.log import Odometry
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+
+from .messages import ALONE, Points
+from .settings import LEAST_SPACING, Frames
+
+SPACING_SHARE: Final = 0.15  # spacing by the median range, which has the size of the scene
+MOST_SAMPLES: Final = 1_000_000  # of the way driven
+STRETCH: Final = 2.0  # reach along the way, before and behind, by the range of a point
+FARTHEST: Final = 3.0  # distance from the way by that of the median point, beyond which it is of no boundary
+NEXT_LINE: Final = 1.5  # distance of a polyline from the way by that of the nearest one on its side
+
+
+def are_lines(scans: list[Points], spacing: float | None) -> bool:
+    """Return whether a record has points of lines: it has a stated spacing, or no point that stands alone."""
+    lines = np.concatenate([np.zeros(0, int), *(scan.lines for scan in scans)])
+    return spacing is not None or bool(len(lines) and (lines != ALONE).all())
+
+
+def default_spacing(scans: list[Points]) -> float:
+    """Return the spacing (m) of a record that states none."""
+    points = np.concatenate([np.zeros((0, 2)), *(scan.points for scan in scans)])
+    return max(SPACING_SHARE * float(np.median(np.hypot(*points.T))), LEAST_SPACING)
+
+
+def lines_of(
+    t: Array,
+    scans: list[Points],
+    odometry: Odometry,
+    frames: Frames,
+    spacing: float | None,
+    notes: Counter[str],
+) -> list[Points]:
+    """Return scans at the stamps t (n,) in s with points at a spacing (m), each of a side of the way driven.
+
+    A point keeps the label that it has. What is farther from the way than a boundary is left out.
+    """
+    spacing = spacing or default_spacing(scans)
+    found = [along_lines(scan, spacing) for scan in scans]
+    told = f"points of lines are {spacing:.2g} m apart (--spacing), of {count(scans)} that were recorded"
+    notes[told] += count(found)
+    way = DrivenWay.of(odometry, 0.5 * spacing)
+    places = [in_vehicle(scan.points, frames) for scan in found]
+    lateral = [way.lateral(float(at), points) for at, points in zip(t, places, strict=True)]
+    kept = [nearest_lines(scan.lines, away) for scan, away in zip(found, lateral, strict=True)]
+    limit = farthest(np.concatenate(lateral))
+    result = []
+    for scan, away, near in zip(found, lateral, kept, strict=True):
+        labels = np.select(
+            [scan.labels != UNKNOWN, away > 0.0, away < 0.0], [scan.labels, LEFT, RIGHT], UNKNOWN
+        )
+        result.append(scan._replace(labels=labels).where(near & ~(np.abs(away) > limit)))
+    notes["points of lines were too far from the way driven, and were left out"] += count(found) - count(
+        result
+    )
+    return result
+
+
+def count(scans: Iterable[Points]) -> int:
+    return sum(len(scan.labels) for scan in scans)
+
+
+def in_vehicle(points: Array, frames: Frames) -> Array:
+    """Return points (m, 2) of the sensor in the vehicle frame."""
+    x, y, yaw = frames.mounting or (0.0, 0.0, 0.0)
+    return np.asarray((points * frames.sides) @ rotation(yaw).T + np.array([x, y]))
+
+
+def farthest(lateral: Array) -> float:
+    """Return the largest distance (m) of a boundary from the way, by all lateral distances (m,)."""
+    known = np.abs(lateral[np.isfinite(lateral)])
+    return FARTHEST * float(np.median(known)) if len(known) else np.inf
+
+
+def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
+    """Return which points (m,) are of the polylines nearest to the way on their side, or of none."""
+    kept = np.ones(len(lines), bool)
+    numbers = np.unique(lines[lines >= 0])
+    middles = np.array([np.nanmedian(lateral[lines == line]) for line in numbers])
+    for side in (1.0, -1.0):
+        away = np.where(side * middles > 0.0, side * middles, np.inf)
+        far = numbers[(away > NEXT_LINE * away.min(initial=np.inf)) & np.isfinite(away)]
+        kept &= ~np.isin(lines, far)
+    return kept
+
+
+def along_lines(points: Points, spacing: float) -> Points:
+    """Return points at a spacing (m): polylines are interpolated, what is dense is thinned."""
+    parts = [points.where(thinned(points.points, spacing, points.lines < 0))]
+    for line in np.unique(points.lines[points.lines >= 0]):
+        own = points.where(points.lines == line)
+        placed = resampled(own.points, spacing)
+        labels = np.full(len(placed), own.labels[0])
+        parts.append(Points.of(placed, labels, lines=np.full(len(placed), line)))
+    return Points(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def resampled(vertices: Array, spacing: float) -> Array:
+    """Return the points (m, 2) of a polyline (n, 2) at each multiple of the spacing (m) along it."""
+    s = np.append(0.0, np.cumsum(np.hypot(*np.diff(vertices, axis=0).T)))
+    at = np.arange(0.0, s[-1] + 1e-9 * spacing, spacing)
+    return np.column_stack([np.interp(at, s, vertices[:, 0]), np.interp(at, s, vertices[:, 1])])
+
+
+def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
+    """Return the indices of chosen points (m, 2) no two of which are nearer than the spacing (m).
+
+    They are taken by bearing: by range, the noise of the ranges would decide which of some points is kept.
+    """
+    left = np.flatnonzero(chosen)
+    left = left[np.argsort(np.arctan2(points[left, 1], points[left, 0]), kind="stable")]
+    kept = []
+    while len(left):
+        kept.append(left[0])
+        left = left[np.hypot(*(points[left] - points[left[0]]).T) >= spacing]
+    return np.array(kept, dtype=int)
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenWay:
+    """The way driven by dead reckoning from the pose at the first twist."""
+
+    t: Array  # (N,) stamps (s)
+    poses: Array  # (N, 3) poses in m, m and rad
+    s: Array  # (N,) path length (m)
+    points: Array  # (k, 2) points of the way, at even distances
+    at: Array  # (k,) their path lengths (m)
+
+    @classmethod
+    def of(cls, odometry: Odometry, step: float) -> "DrivenWay":
+        moves = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
+        poses = np.vstack([np.zeros(3), moves])
+        s = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+        at = np.linspace(0.0, s[-1], int(min(np.ceil(s[-1] / step), MOST_SAMPLES)) + 1)
+        moved = np.diff(s, prepend=-1.0) > 0.0
+        points = np.column_stack([np.interp(at, s[moved], poses[moved, k]) for k in range(2)])
+        return cls(odometry.t, poses, s, points, at)
+
+    def lateral(self, t: float, points: Array) -> Array:
+        """Return the distances (m,) of points (m, 2) to the left of the way, seen in the vehicle frame at t.
+
+        Each is measured on the stretch around the vehicle that is within its range, as the way may come near
+        again later. It is NaN of a point before the begin of the way or beyond its end.
+        """
+        x, y, heading, here = (np.interp(t, self.t, of) for of in (*self.poses.T, self.s))
+        placed = points @ rotation(float(heading)).T + np.array([x, y])
+        reach = STRETCH * np.hypot(*points.T)
+        near = np.abs(self.at - here) <= reach.max(initial=0.0)
+        way, at = self.points[near], self.at[near]
+        if len(way) < 2:
+            return np.full(len(points), np.nan)
+        offset = placed[:, None] - way
+        distances = np.hypot(offset[..., 0], offset[..., 1])
+        distances[np.abs(at - here) > reach[:, None]] = np.inf
+        foot = distances.argmin(axis=1)
+        along, away = np.gradient(way, axis=0)[foot], offset[np.arange(len(foot)), foot]
+        side = np.sign(along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0])
+        forward = (along * away).sum(axis=1)
+        first, last = at[foot] == self.at[0], at[foot] == self.at[-1]
+        outside = (first & (forward < 0.0)) | (last & (forward > 0.0))
+        return np.where(outside, np.nan, side * distances.min(axis=1))

@@ -1,0 +1,167 @@
+"""Scan matching for points of a line: a detection is drawn to the line beside it, not to a point of it.
+
+The line is that of the recent points about a detection: their weighted mean, and the direction in which they
+are spread most. Only the distance across it counts, so what a line cannot tell, the way along it, stays open.
+"""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from pathspace_graph.factors import _kernels as kernels
+from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.noise import huber_weights
+from pathspace_graph.factors.se2 import left_of, rotation, to_map
+
+LINE_REACH: Final = 1.5  # reach of a line by that of a cone: its points are spread over the gap of points
+LEAST_POINTS: Final = 2.0  # least sum of weights of the points that tell a line
+LEAST_SPREAD: Final = 0.3  # least standard deviation of these along the line, by the reach
+LEAST_SHAPE: Final = 4.0  # least ratio of their variances along and across it: others are no line
+LEAST_INSIDE: Final = 0.5  # most distance along the line from the mean of its points, by the reach
+HELD: Final = np.array([0.1, 10.0, 1.0]) ** 2
+"""Variances (m^2, m^2, rad^2) about the start, vehicle frame: the way along the lines is not searched for."""
+ALIKE: Final = np.array([1.0, 0.03, 0.003]) ** 2
+"""Variances (m^2, m^2, rad^2) of errors that all points of a match share, vehicle frame: nothing is known
+along the lines, and they are taken for straight."""
+HEADING_TOLD: Final = 0.05  # standard deviation of the heading (rad) up to which lines hold the pose
+
+
+class Limits(NamedTuple):
+    """Limits of a match, as `scan_matching` has them for cones."""
+
+    farthest: float  # distance in reaches from which on a remembered detection has no weight
+    weight: float  # least sum of weights of a matched detection that is a cone
+    huber: float  # whitened distance beyond which a weight is reduced
+    sigma: float  # added to a detection's (m)
+    fewest: int  # least number of matched detections that tell a motion
+
+
+class Targets(NamedTuple):
+    """What placed detections are drawn to."""
+
+    off: Array  # (m, 2) from the mean of the recent points to each detection (m)
+    weights: Array  # (m,) sums of the weights of these points
+    normals: Array  # (m, 2) unit vectors across the line; zero for cones
+    matched: BoolArray  # (m,) whether there is a line, or a cone
+
+
+def targets_on_lines(placed: Array, recent: Array, reach: float, farthest: float) -> Targets:
+    """Return the lines beside placed points (m, 2), by recent points (n, 2) within a reach (m)."""
+    centre = placed.mean(axis=0)  # about which the moments are summed, or their differences would vanish
+    near, points = placed - centre, recent - centre
+    x, y = points.T
+    square = (near**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * near @ points.T
+    weight = np.where(square < (farthest * reach) ** 2, np.exp(-0.5 * square / reach**2), 0.0)
+    total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)
+    means = weight @ np.column_stack([x, y, x * x, x * y, y * y]) / total[:, None]
+    mean, (xx, xy, yy) = means[:, :2], means[:, 2:].T
+    xx, xy, yy = xx - mean[:, 0] ** 2, xy - mean[:, 0] * mean[:, 1], yy - mean[:, 1] ** 2
+    off = near - mean
+    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    direction = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    tangents = np.column_stack([np.cos(direction), np.sin(direction)])
+    along, across = middle + half, np.maximum(middle - half, 0.0)
+    matched = (total > LEAST_POINTS) & (along > (LEAST_SPREAD * reach) ** 2) & (along > LEAST_SHAPE * across)
+    matched &= np.abs((off * tangents).sum(axis=1)) < LEAST_INSIDE * reach
+    return Targets(off, total, left_of(tangents), matched)
+
+
+def targets_on_cones(placed: Array, recent: Array, reach: float, limits: Limits) -> Targets:
+    """Return the means of the recent points (n, 2) of cones beside placed points (m, 2)."""
+    means, weights = kernels.weighted_means(placed, recent, reach, limits.farthest)
+    return Targets(placed - means, weights, np.zeros(placed.shape), np.asarray(weights > limits.weight))
+
+
+def match_lines(
+    recent: tuple[Array, Array],
+    seen: tuple[Array, Array, BoolArray],
+    start: Array,
+    reaches: Sequence[float],
+    limits: Limits,
+) -> tuple[Array, Array, BoolArray, float]:
+    """Lay detections on recent points of cones (n, 2) and of lines (k, 2), by Gauss-Newton steps.
+
+    Detections are points (m, 2), vehicle frame, with variances (m,) of one coordinate (m^2), and whether each
+    is of a line. The result is the pose (3,), its information (3, 3), which detections were matched, and the
+    sum of their whitened squares.
+    """
+    pose, turn = start.copy(), np.eye(3)  # from the vehicle's frame at the start
+    turn[:2, :2] = rotation(start[2])
+    held = turn @ np.diag(1.0 / HELD) @ turn.T
+    for reach in reaches:
+        hessian, gradient, *_ = _system(recent, seen, pose, reach, limits)
+        pose = pose - np.linalg.solve(hessian + held, gradient + held @ (pose - start))
+    hessian, _, matched, square = _system(recent, seen, pose, reaches[-1], limits)
+    if matched.sum() < limits.fewest:
+        return pose, np.zeros((3, 3)), matched, square
+    covariance = np.linalg.inv(hessian + held) + turn @ np.diag(ALIKE) @ turn.T
+    return pose, np.asarray(np.linalg.inv(covariance)), matched, square
+
+
+def squares_at(
+    recent: tuple[Array, Array],
+    seen: tuple[Array, Array, BoolArray],
+    pose: Array,
+    reach: float,
+    limits: Limits,
+) -> tuple[Array, BoolArray]:
+    """Return the whitened squares (m,) of detections at a pose (3,), and which of them are matched."""
+    targets = _targets(recent, seen, pose, reach, limits)
+    return _squares(targets, _variances(targets, seen, limits)), targets.matched
+
+
+def _targets(
+    recent: tuple[Array, Array],
+    seen: tuple[Array, Array, BoolArray],
+    pose: Array,
+    reach: float,
+    limits: Limits,
+) -> Targets:
+    points, _, is_line = seen
+    placed = to_map(points, pose[None])
+    found = Targets(
+        np.zeros(placed.shape), np.ones(len(placed)), np.zeros(placed.shape), np.zeros(len(placed), bool)
+    )
+    if len(recent[0]):
+        own = targets_on_cones(placed[~is_line], recent[0], reach, limits)
+        for column, values in zip(found, own, strict=True):
+            column[~is_line] = values
+    if len(recent[1]):
+        own = targets_on_lines(placed[is_line], recent[1], LINE_REACH * reach, limits.farthest)
+        for column, values in zip(found, own, strict=True):
+            column[is_line] = values
+    return found
+
+
+def _variances(targets: Targets, seen: tuple[Array, Array, BoolArray], limits: Limits) -> Array:
+    return np.asarray(seen[1] * (1.0 + 1.0 / targets.weights) + limits.sigma**2)
+
+
+def _squares(targets: Targets, variances: Array) -> Array:
+    is_line = targets.normals.any(axis=1)
+    across = (targets.off * targets.normals).sum(axis=1) ** 2
+    return np.asarray(np.where(is_line, across, (targets.off**2).sum(axis=1)) / variances)
+
+
+def _system(
+    recent: tuple[Array, Array],
+    seen: tuple[Array, Array, BoolArray],
+    pose: Array,
+    reach: float,
+    limits: Limits,
+) -> tuple[Array, Array, BoolArray, float]:
+    """Return Hessian (3, 3) and gradient (3,) of half the sum of squares, which are matched, and the sum."""
+    targets = _targets(recent, seen, pose, reach, limits)
+    variances = _variances(targets, seen, limits)
+    square = _squares(targets, variances)
+    weights = huber_weights(np.sqrt(square), limits.huber) * targets.matched / variances
+    n, is_line = targets.normals, targets.normals.any(axis=1)
+    axes = np.where(np.asarray(is_line)[:, None, None], n[:, :, None] * n[:, None, :], np.eye(2))
+    information = axes * weights[:, None, None]
+    arm = left_of(to_map(seen[0], pose[None]) - pose[:2])
+    jacobian = np.concatenate([np.tile(np.eye(2), (len(arm), 1, 1)), arm[:, :, None]], axis=2)
+    weighted = information @ jacobian
+    hessian = np.einsum("mij,mik->jk", jacobian, weighted)
+    gradient = np.einsum("mij,mi->j", weighted, targets.off)
+    return hessian, gradient, targets.matched, float(np.where(targets.matched, square, 0.0).sum())
