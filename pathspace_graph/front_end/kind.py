@@ -156,5 +156,5 @@ def kind_of(log: Log) -> Kind | None:
 
 def with_kind(settings: MapperSettings, log: Log) -> MapperSettings:
     """Return settings with the kind of a log's sensor where they leave it open; lines have no stations."""
-    kind = settings.kind or log.sensor.kind or kind_of(log)
-    return replace(settings, kind=kind, stations=settings.stations and kind != "line")
+    settings = replace(settings, kind=settings.kind or log.sensor.kind or kind_of(log))
+    return replace(settings, stations=settings.stations and not settings.lines)

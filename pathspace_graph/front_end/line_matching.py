@@ -135,7 +135,8 @@ def _targets(
 
 
 def _variances(targets: Targets, seen: tuple[Array, Array, BoolArray], limits: Limits) -> Array:
-    return np.asarray(seen[1] * (1.0 + 1.0 / targets.weights) + limits.sigma**2)
+    weights = np.where(targets.matched, targets.weights, 1.0)
+    return np.asarray(seen[1] * (1.0 + 1.0 / weights) + limits.sigma**2)
 
 
 def _squares(targets: Targets, variances: Array) -> Array:
