@@ -47,20 +47,20 @@ def match_stations(
 ) -> StationMatches | None:
     """Return the cones of the first lap as stations of closed curves, with the detections of all laps.
 
-    None where a curve has too few cones, or all are lines. A lap ends beside its beginning by some
+    None where a curve has too few cones, or one is a line. A lap ends beside its beginning by some
     decimetres: cones of both ends would be smeared, and those of a later lap matched with their neighbours.
     So the first lap places them, and each stretch of a later one is shifted along the curves to where its
     cones are. Where two shifts are about as likely, its detections are of no cone.
     """
     places = {}
-    for label in (label for label in state.boundaries if label not in settings.lines):
+    if settings.lines:
+        return None
+    for label in state.boundaries:
         first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0))
         cones = cones_of_curve(state, first, label, settings)
         if len(cones.u) < ROW_CONES:
             return None
         places[label] = feet_of_cones(state, cones, label).u
-    if not places:
-        return None
     sigmas = {label: np.full(len(u), SIGMA_STATION) for label, u in places.items()}
     stations = Stations.of(state, places, sigmas)
     seen = [SeenAgain.of(state, detections, curve) for curve in stations.curves]

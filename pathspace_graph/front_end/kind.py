@@ -23,19 +23,14 @@ COMPARED: Final = 2  # nearest detections of a side that are compared: noise and
 PARTNERS: Final = 10  # nearest detections of an earlier cycle among which each of them has its partner
 MOVED: Final = 0.25  # least way between both cycles, over the gap: at rest a line is seen at the same places
 LONGEST: Final = 1.5  # longest time between them (s), over which odometry hardly drifts
+PATIENCE: Final = 120.0  # time (s) after which the kind is what it is by then
 MOST_AWAY: Final = 1.5  # largest distance that counts, over half the gap
-FEWEST: Final = (
-    80  # comparisons from which cones are clear; a line has 0.5 as the median, with a sigma of 0.08
-)
-CLEAR_CONES: Final = 0.2
-ENOUGH: Final = (
-    300  # comparisons that tell cones from a line: 0.1 to 0.26 were met for cones, 0.46 to 0.7 for lines
-)
+FEWEST: Final = 80  # comparisons from which clear ones are enough; the median of a line has a sigma of 0.08
+CLEAR: Final = 0.2, 0.5  # median distances over half the gap, below and above which they are clear
+ENOUGH: Final = 300  # comparisons that tell: 0.1 to 0.27 was met for cones, 0.46 to 1.2 for lines
 CONES: Final = 0.32  # median distance over half the gap up to which they are cones
 LINE: Final = 0.4  # from which on they are points of a line; between, it cannot be told
-ON_LINE: Final = (
-    3.0  # median distance across the line (sigmas) up to which they are on it: nothing is garbled
-)
+ON_LINE: Final = 2.2  # median distance (sigmas) across the line up to which points are on it, not garbled
 LEAST_SIGMA: Final = 1e-3  # least standard deviation of that distance (m)
 _OF_LINES: Final[dict[tuple[int, ...], Kind]] = {
     (): "cones",
@@ -82,7 +77,9 @@ class SideKind:
     @property
     def is_final(self) -> bool:
         count = len(self._away)
-        return count >= ENOUGH or (count >= FEWEST and float(np.median(self._away)) < CLEAR_CONES)
+        if count < FEWEST or count >= ENOUGH:
+            return count >= ENOUGH
+        return not CLEAR[0] < float(np.median(self._away)) < CLEAR[1]
 
     @property
     def is_line(self) -> bool | None:
@@ -150,14 +147,14 @@ class KindJudge:
 def kind_of(log: Log) -> Kind | None:
     """Return the kind of a log's sensor, which its first seconds tell; None where they don't."""
     judge = KindJudge()
-    for cycle in split_odometry(log):
-        judge.see(*cycle)
-        if judge.is_final:
+    for odometry, detections in split_odometry(log):
+        judge.see(odometry, detections)
+        if judge.is_final or detections.t > log.cycles[0].t + PATIENCE:
             break
     return judge.kind
 
 
 def with_kind(settings: MapperSettings, log: Log) -> MapperSettings:
     """Return settings with the kind of a log's sensor where they leave it open; lines have no stations."""
-    kind = settings.kind or log.sensor.kind or kind_of(log)
-    return replace(settings, kind=kind, stations=settings.stations and kind != "line")
+    settings = replace(settings, kind=settings.kind or log.sensor.kind or kind_of(log))
+    return replace(settings, stations=settings.stations and not settings.lines)

@@ -123,11 +123,11 @@ def _targets(
     found = Targets(
         np.zeros(placed.shape), np.ones(len(placed)), np.zeros(placed.shape), np.zeros(len(placed), bool)
     )
-    if len(recent[0]):
+    if len(recent[0]) and not is_line.all():
         own = targets_on_cones(placed[~is_line], recent[0], reach, limits)
         for column, values in zip(found, own, strict=True):
             column[~is_line] = values
-    if len(recent[1]):
+    if len(recent[1]) and is_line.any():
         own = targets_on_lines(placed[is_line], recent[1], LINE_REACH * reach, limits.farthest)
         for column, values in zip(found, own, strict=True):
             column[is_line] = values
@@ -135,7 +135,8 @@ def _targets(
 
 
 def _variances(targets: Targets, seen: tuple[Array, Array, BoolArray], limits: Limits) -> Array:
-    return np.asarray(seen[1] * (1.0 + 1.0 / targets.weights) + limits.sigma**2)
+    weights = np.where(targets.matched, targets.weights, 1.0)
+    return np.asarray(seen[1] * (1.0 + 1.0 / weights) + limits.sigma**2)
 
 
 def _squares(targets: Targets, variances: Array) -> Array:

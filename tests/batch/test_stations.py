@@ -22,6 +22,7 @@ from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.stations import CurveStations
 from pathspace_graph.settings.mapper import MapperSettings
 
+from ..scenes.batch import straight
 from ..scenes.drives import bean_track, lap_log, noisy, true_poses
 from .test_lap import open_lap
 from .test_nonlinear_graph import rotations
@@ -181,3 +182,10 @@ def test_stations_hold_the_vehicle_along_the_curves() -> None:
     )
     error = [np.hypot(*(result.trajectory - true_poses(log()))[:, :2].T).mean() for result in (without, held)]
     assert error[1] < error[0]
+
+
+def test_a_road_with_a_line_has_no_stations() -> None:
+    """Points of a line are at no station, and cones of one side alone are not matched."""
+    system, state = straight()
+    settings = replace(system.settings, kind="line-right")
+    assert match_stations(state, system.detections, settings) is None

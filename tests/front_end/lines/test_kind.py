@@ -90,5 +90,5 @@ def test_a_setting_comes_before_the_log_and_the_log_before_its_readings() -> Non
     assert kinds == {
         "by readings": ("line", (LEFT, RIGHT), False),
         "by the log": ("cones", (), True),
-        "by a setting": ("line-left", (LEFT,), True),
+        "by a setting": ("line-left", (LEFT,), False),
     }

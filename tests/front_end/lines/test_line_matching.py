@@ -53,16 +53,21 @@ def test_walls_tell_the_way_across_and_the_turn_and_nothing_along() -> None:
 
 
 def test_cones_beside_a_wall_are_matched_with_it() -> None:
-    """The wall is on the right, three cones on the left, and the vehicle is 0.1 m to the left."""
+    """The wall is on the right, three cones on the left, and the vehicle is 0.1 m to the left.
+
+    A fourth cone, last in the list, was not there before.
+    """
     cones, wall = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0]]), CORRIDOR[CORRIDOR[:, 1] < 0.0]
     true, every = np.array([0.3, 0.1, 0.0]), np.concatenate([cones, wall])
+    every = np.concatenate([every, [[14.0, 5.0]]])
     points = to_vehicle(every, np.tile(true, (len(every), 1)))
-    is_line = np.arange(len(every)) >= len(cones)
+    is_line = np.isin(np.arange(len(every)), np.arange(len(wall)) + len(cones))
     seen = points, np.full(len(points), 0.01), is_line
     start = np.array([0.3, 0.0, 0.0])
     pose, _, matched, _ = match_lines((cones, wall), seen, start, REACHES_CHECK, LIMITS)
     np.testing.assert_allclose(pose, true, atol=0.02)
     assert matched[:3].all()
+    assert not matched[-1]
 
 
 def test_points_of_a_line_in_one_cell_become_their_mean() -> None:
