@@ -1,12 +1,15 @@
-"""Boundary labels: the side of the track that a detected cone marks."""
+"""Boundary labels: the side of the track that a detection marks; and what detections are of."""
 
-from typing import Final
+from typing import Final, Literal, get_args
 
 LEFT, RIGHT, UNKNOWN, ORANGE, BIG_ORANGE = range(5)
 NAMES: Final = ("left", "right", "unknown", "orange", "big_orange")  # of the file format, by label
 LABELS: Final = {name: label for label, name in enumerate(NAMES)}
 BOUNDARIES: Final = (LEFT, RIGHT)
 POINTS: Final = (ORANGE, BIG_ORANGE)  # they bound no road: they stand at gates, and along lanes to a track
+
+Kind = Literal["cones", "line", "line-left", "line-right"]  # what detections are of, on both sides or on one
+KINDS: Final = get_args(Kind)
 
 _CODES: Final = LABELS | {
     **{"blue": LEFT, "yellow": RIGHT, "small_orange": ORANGE},

@@ -14,10 +14,10 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose, move_points, relative
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, Kind
 from pathspace_graph.run import split_odometry
 from pathspace_graph.scale import nearest_cones, side_of
-from pathspace_graph.settings.mapper import Kind, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 COMPARED: Final = 2  # nearest detections of a side that are compared: noise and drift grow with the range
 PARTNERS: Final = 10  # nearest detections of an earlier cycle among which each of them has its partner

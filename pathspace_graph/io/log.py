@@ -6,16 +6,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
-from pathspace_graph.labels import NAMES, label_from_name
+from pathspace_graph.labels import KINDS, NAMES, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS
-from pathspace_graph.settings.mapper import Kind
 
 from . import parsing as limits
 from .brief import Brief, pictures
@@ -127,9 +126,6 @@ class Detections(Brief):
         return Detections(
             self.t, *(np.concatenate([getattr(of, name) for of in (self, other)]) for name in names)
         )
-
-
-KINDS: Final = get_args(Kind)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Final, Literal
 
 from pathspace_graph.errors import SettingsError, check_type
-from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.labels import LEFT, RIGHT, Kind
 
 from .checked import Positive
 from .online import (
@@ -19,7 +19,6 @@ from .online import (
 
 Knots = Literal["cones", "curvature"]  # what the knots of a closed boundary follow
 Start = Literal["auto", "online", "odometry"]
-Kind = Literal["cones", "line", "line-left", "line-right"]  # what detections are of, on both sides or on one
 _LINES: Final[dict[Kind | None, tuple[int, ...]]] = {  # boundaries that are lines
     "line": (LEFT, RIGHT),
     "line-left": (LEFT,),
