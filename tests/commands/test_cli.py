@@ -15,10 +15,10 @@ from scipy.interpolate import BSpline as ScipyBSpline
 
 from pathspace_graph import __main__ as program
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
-from pathspace_graph.batch.system import BatchSystem
 from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import estimate as commands_estimate
 from pathspace_graph.commands.options import one_line
+from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.io.log import Detections, Log, Odometry, read_log, write_log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import LapBatches, RunResult
@@ -225,7 +225,7 @@ def test_an_estimate_that_cannot_be_computed_is_one_line_and_exit_code_3(
         raise np.linalg.LinAlgError("SVD did not\nconverge")
 
     monkeypatch.setattr(LandmarkFixedLag, "update", fails)
-    monkeypatch.setattr(BatchSystem, "eliminated", fails)
+    monkeypatch.setattr(Elimination, "step", fails)
     command = "batch" if estimator == "spline" else "online"
     options = (
         ["--estimator", estimator, "--start", "odometry"]
