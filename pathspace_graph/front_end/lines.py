@@ -16,7 +16,7 @@ def of_line(labels: IntArray, settings: MapperSettings) -> BoolArray:
     """Return which detections (m,) are points of a line: all where both sides are, whatever the label."""
     if settings.kind == "line":
         return np.ones(len(labels), bool)
-    return np.isin(labels, settings.lines)
+    return np.isin(labels, settings.lines) if settings.lines else np.zeros(len(labels), bool)
 
 
 def merged(detections: Detections, is_line: BoolArray) -> Detections:

@@ -292,16 +292,19 @@ class ScanMatcher:
         """Return a cycle's detections by the errors of the sensor, and correct the remembered ones."""
         measured, covariances = detections.points_vehicle, detections.covariances
         for recent in (self.recent, self.recent_lines):
-            recent.forget(detections.t)
-            recent.correct(self.errors.mean)
+            if len(recent.points):
+                recent.forget(detections.t)
+                recent.correct(self.errors.mean)
         points = measured + by_errors(measured, twist) @ self.errors.mean
         return Seen(points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1]), is_line)
 
     def remember(self, detections: Detections, twist: Array, pose: Array, is_line: BoolArray) -> None:
         """Remember a cycle that was seen from a pose (3,), in motion by a twist (3,)."""
+        measured = detections.points_vehicle
+        columns = by_errors(measured, twist)
         for recent, chosen in ((self.recent, ~is_line), (self.recent_lines, is_line)):
-            measured = detections.points_vehicle[chosen]
-            recent.add(detections.t, measured, by_errors(measured, twist), pose)
+            if chosen.any():
+                recent.add(detections.t, measured[chosen], columns[chosen], pose)
 
     def has(self, seen: Seen, pose: Array) -> BoolArray:
         """Return whether each detection (m,), from a pose (3,), lies where an earlier one does."""
