@@ -21,7 +21,7 @@ from .simplification import reknot
 from .system import LOOSE_GATE, BatchSystem, Biweight, Evaluation, moved
 
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
-SETTLED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
+CHANGED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
 POSE_STEPS: Final = 1  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
 TOLERANCE_DECREASE: Final = 0.05  # most decrease of the cost that the last step predicts; one sigma has 1/2
 ROUGH_TOLERANCE: Final = 100.0  # its factor before the last optimization, on knots or stations that change
@@ -114,7 +114,7 @@ class Optimizer:
                 if not strict and done > 1:
                     locate_poses(state)
                 at, changed = self._refreshed(state, gate, strict)
-                settled = changed <= SETTLED_SHARE * len(system.detections) or done > rounds // 2
+                settled = changed <= CHANGED_SHARE * len(system.detections) or done > rounds // 2
                 searching = not (strict and settled)
             at, decrease = self._step(at, tolerance)
             state = at.state

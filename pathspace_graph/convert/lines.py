@@ -17,9 +17,9 @@ from .messages import ALONE, Points
 from .settings import LEAST_SPACING, Frames
 
 SPACING_SHARE: Final = 0.15  # spacing by the median range, which has the size of the scene
-MOST_SAMPLES: Final = 1_000_000  # of the way driven
-STRETCH: Final = 2.0  # reach along the way, before and behind, by the range of a point
-FARTHEST: Final = 3.0  # distance from the way by that of the median point, beyond which it is of no boundary
+WALL_SAMPLES: Final = 1_000_000  # of the way driven
+WALL_STRETCH: Final = 2.0  # reach along the way, before and behind, by the range of a point
+WALL_FARTHEST: Final = 3.0  # of a point of a boundary from the way, by the distance of the median point
 NEXT_LINE: Final = 1.5  # distance of a polyline from the way by that of the nearest one on its side
 
 
@@ -81,7 +81,7 @@ def in_vehicle(points: Array, frames: Frames) -> Array:
 def farthest(lateral: Array) -> float:
     """Return the largest distance (m) of a boundary from the way, by all lateral distances (m,)."""
     known = np.abs(lateral[np.isfinite(lateral)])
-    return FARTHEST * float(np.median(known)) if len(known) else np.inf
+    return WALL_FARTHEST * float(np.median(known)) if len(known) else np.inf
 
 
 def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
@@ -143,7 +143,7 @@ class DrivenWay:
         moves = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
         poses = np.vstack([np.zeros(3), moves])
         s = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-        at = np.linspace(0.0, s[-1], int(min(np.ceil(s[-1] / step), MOST_SAMPLES)) + 1)
+        at = np.linspace(0.0, s[-1], int(min(np.ceil(s[-1] / step), WALL_SAMPLES)) + 1)
         moved = np.diff(s, prepend=-1.0) > 0.0
         points = np.column_stack([np.interp(at, s[moved], poses[moved, k]) for k in range(2)])
         return cls(odometry.t, poses, s, points, at)
@@ -156,7 +156,7 @@ class DrivenWay:
         """
         x, y, heading, here = (np.interp(t, self.t, of) for of in (*self.poses.T, self.s))
         placed = points @ rotation(float(heading)).T + np.array([x, y])
-        reach = STRETCH * np.hypot(*points.T)
+        reach = WALL_STRETCH * np.hypot(*points.T)
         near = np.abs(self.at - here) <= reach.max(initial=0.0)
         way, at = self.points[near], self.at[near]
         if len(way) < 2:

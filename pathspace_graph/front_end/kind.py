@@ -19,19 +19,22 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.scale import nearest_cones, side_of
 from pathspace_graph.settings.mapper import MapperSettings
 
-COMPARED: Final = 2  # nearest detections of a side that are compared: noise and drift grow with the range
+KIND_COMPARED: Final = 2  # nearest detections of a side that are compared: noise grows with the range
 PARTNERS: Final = 10  # nearest detections of an earlier cycle among which each of them has its partner
 MOVED: Final = 0.25  # least way between both cycles, over the gap: at rest a line is seen at the same places
-LONGEST: Final = 1.5  # longest time between them (s), over which odometry hardly drifts
+KIND_LONGEST: Final = 1.5  # longest time between them (s), over which odometry hardly drifts
 PATIENCE: Final = 120.0  # time (s) after which the kind is what it is by then
 MOST_AWAY: Final = 1.5  # largest distance that counts, over half the gap
 FEWEST: Final = 80  # comparisons from which clear ones are enough; the median of a line has a sigma of 0.08
-CLEAR: Final = 0.2, 0.5  # median distances over half the gap, below and above which they are clear
+KIND_CLEAR: Final = 0.2, 0.5  # median distances over half the gap, below and above which they are clear
 ENOUGH: Final = 300  # comparisons that tell: 0.1 to 0.27 was met for cones, 0.46 to 1.2 for lines
-CONES: Final = 0.32  # median distance over half the gap up to which they are cones
+KIND_CONES: Final = 0.32  # median distance over half the gap up to which they are cones
 LINE: Final = 0.4  # from which on they are points of a line; between, it cannot be told
 ON_LINE: Final = 2.2  # median distance (sigmas) across the line up to which points are on it, not garbled
 LEAST_SIGMA: Final = 1e-3  # least standard deviation of that distance (m)
+SIGMA_RANGES: Final = 0.05  # of the scale of ranges that nothing measures: cameras' are off by as much
+STATED_CYCLES: Final = 200  # first cycles whose stated noise is looked at
+FAR: Final = 0.75  # quantile of the ranges from which on a detection is far
 _OF_LINES: Final[dict[tuple[int, ...], Kind]] = {
     (): "cones",
     (LEFT,): "line-left",
@@ -54,11 +57,11 @@ class SideKind:
 
         They are in the vehicle frame, the nearest first, with standard deviations (k,) of a coordinate (m).
         """
-        self._past = [one for one in self._past if one[0] >= t - LONGEST]
+        self._past = [one for one in self._past if one[0] >= t - KIND_LONGEST]
         if len(points) > 1:
-            self._gaps.append(float(np.median(_from_nearest(points[:COMPARED], points))))
+            self._gaps.append(float(np.median(_from_nearest(points[:KIND_COMPARED], points))))
             gap = float(np.median(self._gaps))
-            self._compare(pose, points[:COMPARED], sigmas[:COMPARED], gap)
+            self._compare(pose, points[:KIND_COMPARED], sigmas[:KIND_COMPARED], gap)
             self._past.append((t, pose, points))
 
     def _compare(self, pose: Array, points: Array, sigmas: Array, gap: float) -> None:
@@ -79,7 +82,7 @@ class SideKind:
         count = len(self._away)
         if count < FEWEST or count >= ENOUGH:
             return count >= ENOUGH
-        return not CLEAR[0] < float(np.median(self._away)) < CLEAR[1]
+        return not KIND_CLEAR[0] < float(np.median(self._away)) < KIND_CLEAR[1]
 
     @property
     def is_line(self) -> bool | None:
@@ -87,7 +90,7 @@ class SideKind:
         if not self.is_final:
             return None
         away, across = float(np.median(self._away)), float(np.median(self._across))
-        if away < CONES:
+        if away < KIND_CONES:
             return False
         return True if away > LINE and across < ON_LINE else None
 
@@ -155,6 +158,31 @@ def kind_of(log: Log) -> Kind | None:
 
 
 def with_kind(settings: MapperSettings, log: Log) -> MapperSettings:
-    """Return settings with the kind of a log's sensor where they leave it open; lines have no stations."""
+    """Return settings with the kind of a log's sensor where they leave it open.
+
+    Lines have no stations. Nothing measures their ranges, so where the odometry sets the size of the map, it
+    holds it from the beginning, and the scale of the ranges is free.
+    """
     settings = replace(settings, kind=settings.kind or log.sensor.kind or kind_of(log))
-    return replace(settings, stations=settings.stations and not settings.lines)
+    if not settings.lines:
+        return settings
+    sensor, odometry = settings.calibration, settings.odometry
+    if sensor.sensor and trusts_odometry(settings, log):
+        free = max(sensor.sigma_range_scale, SIGMA_RANGES)
+        sensor, odometry = replace(sensor, sigma_range_scale=free), replace(odometry, hold_scale=True)
+    return replace(settings, stations=False, calibration=sensor, odometry=odometry)
+
+
+def trusts_odometry(settings: MapperSettings, log: Log) -> bool:
+    """Return whether the odometry sets the size of the map, by default where its scale is better known.
+
+    That of ranges is known as well as a range is, by what the log states of the farthest detections.
+    """
+    trust, seen = settings.calibration.trust, log.cycles[:STATED_CYCLES]
+    ranges = np.concatenate([np.zeros(0), *(np.hypot(*one.points_vehicle.T) for one in seen)])
+    if trust is not None or len(ranges) == 0 or not log.detections_stated:
+        return trust != "ranges"
+    covariances = np.concatenate([one.covariances for one in seen])
+    far = ranges >= np.quantile(ranges, FAR)
+    shares = np.sqrt(np.linalg.eigvalsh(covariances[far])[:, 0]) / ranges[far]
+    return bool(np.median(shares) > settings.odometry.sigma_scale)

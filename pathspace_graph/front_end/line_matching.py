@@ -19,9 +19,9 @@ LEAST_POINTS: Final = 2.0  # least sum of weights of the points that tell a line
 LEAST_SPREAD: Final = 0.3  # least standard deviation of these along the line, by the reach
 LEAST_SHAPE: Final = 4.0  # least ratio of their variances along and across it: others are no line
 LEAST_INSIDE: Final = 0.5  # most distance along the line from the mean of its points, by the reach
-HELD: Final = np.array([0.1, 10.0, 1.0]) ** 2
+LINE_HELD: Final = np.array([0.1, 10.0, 1.0]) ** 2
 """Variances (m^2, m^2, rad^2) about the start, vehicle frame: the way along the lines is not searched for."""
-ALIKE: Final = np.array([1.0, 0.03, 0.003]) ** 2
+LINES_ALIKE: Final = np.array([1.0, 0.03, 0.003]) ** 2
 """Variances (m^2, m^2, rad^2) of errors that all points of a match share, vehicle frame: nothing is known
 along the lines, and they are taken for straight."""
 HEADING_TOLD: Final = 0.05  # standard deviation of the heading (rad) up to which lines hold the pose
@@ -88,14 +88,14 @@ def match_lines(
     """
     pose, turn = start.copy(), np.eye(3)  # from the vehicle's frame at the start
     turn[:2, :2] = rotation(start[2])
-    held = turn @ np.diag(1.0 / HELD) @ turn.T
+    held = turn @ np.diag(1.0 / LINE_HELD) @ turn.T
     for reach in reaches:
         hessian, gradient, *_ = _system(recent, seen, pose, reach, limits)
         pose = pose - np.linalg.solve(hessian + held, gradient + held @ (pose - start))
     hessian, _, matched, square = _system(recent, seen, pose, reaches[-1], limits)
     if matched.sum() < limits.fewest:
         return pose, np.zeros((3, 3)), matched, square
-    covariance = np.linalg.inv(hessian + held) + turn @ np.diag(ALIKE) @ turn.T
+    covariance = np.linalg.inv(hessian + held) + turn @ np.diag(LINES_ALIKE) @ turn.T
     return pose, np.asarray(np.linalg.inv(covariance)), matched, square
 
 

@@ -9,7 +9,7 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.mapper import MapperSettings
 
 MOST_CELLS: Final = 1 << 20  # in a row of cells, which is more than any sensor sees
-CELL: Final = 1.0  # side of the cells (m) in which points are merged: an arc of 9 m is 5 mm off their means
+MERGE_CELL: Final = 1.0  # side of the cells (m) in which points are merged: 5 mm beside an arc of 9 m
 
 
 def of_line(labels: IntArray, settings: MapperSettings) -> BoolArray:
@@ -24,7 +24,7 @@ def merged(detections: Detections, is_line: BoolArray) -> Detections:
     if not is_line.any():
         return detections
     line = detections.where(is_line)
-    column, row = np.floor(line.points_vehicle / CELL).astype(np.intp).T
+    column, row = np.floor(line.points_vehicle / MERGE_CELL).astype(np.intp).T
     keys = (line.labels * MOST_CELLS + column) * MOST_CELLS + row
     _, first, cell, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
     points = _means(line.points_vehicle, cell, counts)

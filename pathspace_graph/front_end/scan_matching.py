@@ -158,7 +158,7 @@ def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array,
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
 
-LIMITS: Final = Limits(FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED)
+MATCH_LIMITS: Final = Limits(FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED)
 
 
 def match_with_lines(
@@ -166,13 +166,13 @@ def match_with_lines(
 ) -> Match:
     """Lay detections on recent ones, of cones and of lines, from a pose (3,)."""
     points = recent.points, lines.points
-    pose, information, matched, square = match_lines(points, seen, start, reaches, LIMITS)
+    pose, information, matched, square = match_lines(points, seen, start, reaches, MATCH_LIMITS)
     return Match(pose, information, matched, square / max(int(matched.sum()), 1), by_lines=True)
 
 
 def misfit_with_lines(recent: RecentDetections, lines: RecentDetections, seen: Seen, pose: Array) -> float:
     """Return the mean square of the whitened distances as `match_with_lines` has them, at a pose (3,)."""
-    square, matched = squares_at((recent.points, lines.points), seen, pose, REACH_LAST, LIMITS)
+    square, matched = squares_at((recent.points, lines.points), seen, pose, REACH_LAST, MATCH_LIMITS)
     square = np.where(matched, square, MOST_MISFIT)
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
