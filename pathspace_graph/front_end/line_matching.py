@@ -107,8 +107,8 @@ def squares_at(
     limits: Limits,
 ) -> tuple[Array, BoolArray]:
     """Return the whitened squares (m,) of detections at a pose (3,), and which of them are matched."""
-    targets = _targets(recent, seen, pose, reach, limits)
-    return _squares(targets, _variances(targets, seen, limits)), targets.matched
+    targets, _, squares = _misfit(recent, seen, pose, reach, limits)
+    return squares, targets.matched
 
 
 def _targets(
@@ -134,15 +134,21 @@ def _targets(
     return found
 
 
-def _variances(targets: Targets, seen: tuple[Array, Array, BoolArray], limits: Limits) -> Array:
+def _misfit(
+    recent: tuple[Array, Array],
+    seen: tuple[Array, Array, BoolArray],
+    pose: Array,
+    reach: float,
+    limits: Limits,
+) -> tuple[Targets, Array, Array]:
+    """Return what detections are drawn to at a pose (3,), and variances and whitened squares (m,)."""
+    targets = _targets(recent, seen, pose, reach, limits)
     weights = np.where(targets.matched, targets.weights, 1.0)
-    return np.asarray(seen[1] * (1.0 + 1.0 / weights) + limits.sigma**2)
-
-
-def _squares(targets: Targets, variances: Array) -> Array:
+    variances = seen[1] * (1.0 + 1.0 / weights) + limits.sigma**2
     is_line = targets.normals.any(axis=1)
     across = (targets.off * targets.normals).sum(axis=1) ** 2
-    return np.asarray(np.where(is_line, across, (targets.off**2).sum(axis=1)) / variances)
+    squares = np.where(is_line, across, (targets.off**2).sum(axis=1)) / variances
+    return targets, np.asarray(variances), np.asarray(squares)
 
 
 def _system(
@@ -153,9 +159,7 @@ def _system(
     limits: Limits,
 ) -> tuple[Array, Array, BoolArray, float]:
     """Return Hessian (3, 3) and gradient (3,) of half the sum of squares, which are matched, and the sum."""
-    targets = _targets(recent, seen, pose, reach, limits)
-    variances = _variances(targets, seen, limits)
-    square = _squares(targets, variances)
+    targets, variances, square = _misfit(recent, seen, pose, reach, limits)
     weights = huber_weights(np.sqrt(square), limits.huber) * targets.matched / variances
     n, is_line = targets.normals, targets.normals.any(axis=1)
     axes = np.where(np.asarray(is_line)[:, None, None], n[:, :, None] * n[:, None, :], np.eye(2))

@@ -11,7 +11,7 @@ import numpy as np
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.gate import read_usable_log
-from pathspace_graph.front_end.kind import with_kind
+from pathspace_graph.front_end.kind import kind_of
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.parsing import read_table, shown
@@ -95,7 +95,7 @@ def _hints(log: Log) -> list[Hint]:
         return of_ends + found + beyond_any_vehicle(log.odometry)
     trials = Trials(log, telling_pairs(log, pairs))
     others = _of_readings(trials, found)
-    if others and with_kind(MapperSettings(), log).lines:
+    if others and MapperSettings(kind=log.sensor.kind or kind_of(log)).lines:
         others = _of_readings(trials, found, stay=False)
     return of_ends + others
 
