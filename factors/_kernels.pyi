@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Final, Protocol
 
 from .arrays import Array, BoolArray, IntArray
-from .bspline import Spans
+from .bspline import SpanPolynomials
 
 COMPILER: Final[str]
 """Name and version of the compiler that built them."""
@@ -68,35 +68,43 @@ _Cones = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
 
 # --- foot points -----------------------------------------------------------------------------------------
-def searched(
-    spans: Spans,
-    control_points: Array,
-    points: Array,
-    curve: IntArray,
-    u_low: Array,
-    u_high: Array,
-    coarse_step: float,
-    iterations: int,
-    tolerances: tuple[float, ...],
-) -> _FootPoints:
-    """Return `footpoint:joint_foot_points`; the tolerances are `TOLERANCES`."""
+class Curves:
+    """Curves of one degree, all periodic or none: points on any of them are searched for in one call.
 
-def refined(
-    spans: Spans,
-    control_points: Array,
-    points: Array,
-    curve: IntArray,
-    u_start: Array,
-    u_low: Array,
-    u_high: Array,
-    iterations: int,
-    safeguarded: int,
-    tolerances: tuple[float, ...],
-) -> _FootPoints:
-    """Return `footpoint:refine_joint_foot_points`; a row that a step leads farther away is searched for.
-
-    Such a search takes `safeguarded` steps at most. The tolerances are `TOLERANCES`.
+    Parameters are those of each curve. A step from there may lead across the seam of a periodic one.
     """
+
+    def __init__(
+        self, bases: Sequence[SpanPolynomials], offsets: Sequence[int] = (0,), distinct: Sequence[int] = ()
+    ) -> None:
+        """Lay out curves whose control points begin at `offsets` of a common array.
+
+        It holds unwrapped ones, or as many distinct ones of each periodic curve as is told.
+        """
+
+    def search(
+        self,
+        control_points: Array,
+        points: Array,
+        curve: IntArray,
+        u_low: Array,
+        u_high: Array,
+        coarse_step: float,
+        iterations: int,
+    ) -> _FootPoints:
+        """Return `footpoint:joint_foot_points`."""
+
+    def refine(
+        self,
+        control_points: Array,
+        points: Array,
+        curve: IntArray,
+        u_start: Array,
+        u_low: Array,
+        u_high: Array,
+        iterations: int,
+    ) -> _FootPoints:
+        """Return `footpoint:refine_joint_foot_points`; a row that a step leads farther away is searched."""
 
 # --- detections and odometry -----------------------------------------------------------------------------
 def to_map(points_vehicle: Array, poses: Array) -> Array:
@@ -377,7 +385,7 @@ def open_rows(
     """Return `DetectionTable.open_to` for a table with these columns."""
 
 def in_view(
-    spans: Spans,
+    curves: Curves,
     control_points: Array,
     trusted: Array,
     points: Array,
@@ -388,7 +396,6 @@ def in_view(
     rooms: tuple[float, float, float, float],
     step: float,
     iterations: int,
-    tolerances: tuple[float, ...],
 ) -> tuple[_FootPoints, list[tuple[float, float, float]]]:
     """Return the foot points of detections at points (m, 2), each on its curve (m,) beside its pose (m,).
 
@@ -414,16 +421,15 @@ def gated(
     """
 
 def curve_rows(
-    spans: Spans,
-    curves: tuple[Array, IntArray, IntArray, Array, Array],
+    curves: Curves,
+    on_curves: tuple[Array, IntArray, IntArray, Array, Array],
     table: tuple[Any, ...],
     cycles: IntArray,
     poses: Array,
     first_cycle: int,
     sensor: Array,
-    limits: tuple[float, int, int, float, float],
+    limits: tuple[float, int, float, float],
     names: tuple[int, int],
-    tolerances: tuple[float, ...],
 ) -> tuple[IntArray, Array, bool, _Parts]:
     """Return detections by row, their refined parameters (m,), and the parts of `CurveMap.rows`.
 

@@ -7,20 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from . import _kernels as kernels
+from ._kernels import Curves
 from .arrays import Array, BoolArray, IntArray
-from .bspline import SpanPolynomials, Spans
+from .bspline import SpanPolynomials
 
-_STEP_TOLERANCE: Final = (
-    1e-9  # a row's last step is |step| <= this * length of the domain; the error is its square
-)
-_FLAT: Final = 1e-12  # f' counts as zero where |f'| <= this * |S'|^2
-_EQUAL_SQUARE: Final = 1e-12  # squared distances d, e (m^2) differ where e > d + this * (1 + d)
-_END_TOLERANCE: Final = 1e-9  # a foot point this near (by the length of the domain) to an end is at the end
-_NO_TANGENT: Final = 1e-12  # S' vanishes where |S'| <= this * largest coordinate / length of the domain
-_TINY: Final = 1e-300  # smallest divisor of a step; the numerator vanishes before it does
-TOLERANCES: Final = (_STEP_TOLERANCE, _FLAT, _EQUAL_SQUARE, _END_TOLERANCE, _NO_TANGENT, _TINY)
-"""These, as they are handed to the compiled versions."""
 SEARCH_ITERATIONS: Final = 50  # most steps of a search in a bracket, which ends once all rows have converged
 REFINE_ITERATIONS: Final = 2  # Newton steps of a refinement from a known parameter
 
@@ -63,13 +53,12 @@ def foot_points(
     vanishes, at centres of curvature and at kinks.
     """
     curve = np.zeros(len(points), np.intp)
-    return joint_foot_points(
-        tables.alone, control_points, points, curve, u_low, u_high, coarse_step, iterations
-    )
+    alone = Curves([tables])
+    return joint_foot_points(alone, control_points, points, curve, u_low, u_high, coarse_step, iterations)
 
 
 def joint_foot_points(
-    spans: Spans,
+    curves: Curves,
     control_points: Array,
     points: Array,
     curve: IntArray,
@@ -79,12 +68,12 @@ def joint_foot_points(
     iterations: int = SEARCH_ITERATIONS,
 ) -> FootPoints:
     """Return `foot_points` on several curves; `curve` (m,) is the number of each row's own."""
-    search = coarse_step, iterations, TOLERANCES
-    return FootPoints(*kernels.searched(spans, control_points, points, curve, u_low, u_high, *search))
+    search = u_low, u_high, coarse_step, iterations
+    return FootPoints(*curves.search(control_points, points, curve, *search))
 
 
 def refine_joint_foot_points(
-    spans: Spans,
+    curves: Curves,
     control_points: Array,
     points: Array,
     curve: IntArray,
@@ -98,5 +87,5 @@ def refine_joint_foot_points(
     The arguments are those of `joint_foot_points`. A start (m,) outside its stretch is moved into it first. A
     step is never longer than one mean knot interval, and no row ends farther from the curve than it began.
     """
-    search = iterations, SEARCH_ITERATIONS, TOLERANCES
-    return FootPoints(*kernels.refined(spans, control_points, points, curve, u_start, u_low, u_high, *search))
+    search = u_start, u_low, u_high, iterations
+    return FootPoints(*curves.refine(control_points, points, curve, *search))

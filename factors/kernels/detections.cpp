@@ -175,17 +175,17 @@ Array covariances_of(const Ints& rows, const Array& covariances) {
   return out;
 }
 
-py::tuple curve_rows(const py::object& spans, const py::tuple& curves, const py::tuple& table,
+py::tuple curve_rows(const Curves& curves, const py::tuple& on_curves, const py::tuple& table,
                      const Ints& cycles, const Array& poses, Index first_cycle, const Array& sensor,
-                     const py::tuple& limits, const py::tuple& names, const py::tuple& tolerances) {
-  const Array control_points = curves[0].cast<Array>(), trusted = curves[3].cast<Array>();
-  const Ints labels = curves[1].cast<Ints>(), control_keys = curves[2].cast<Ints>();
-  const Array active_from = curves[4].cast<Array>();
+                     const py::tuple& limits, const py::tuple& names) {
+  const Array control_points = on_curves[0].cast<Array>(), trusted = on_curves[3].cast<Array>();
+  const Ints labels = on_curves[1].cast<Ints>(), control_keys = on_curves[2].cast<Ints>();
+  const Array active_from = on_curves[4].cast<Array>();
   const Ints cycle = table[0].cast<Ints>(), boundary = table[1].cast<Ints>();
   const py::array_t<bool> used = table[2].cast<py::array_t<bool>>();
   const Array all_u = table[3].cast<Array>();
-  const double room = limits[0].cast<double>(), sigma_model = limits[3].cast<double>();
-  const double huber = limits[4].cast<double>();
+  const double room = limits[0].cast<double>(), sigma_model = limits[2].cast<double>();
+  const double huber = limits[3].cast<double>();
   const Index first_pose = names[0].cast<Index>(), sensor_key = names[1].cast<Index>();
   expect(boundary.size() == cycle.size() && used.size() == cycle.size() && all_u.size() == cycle.size());
   std::vector<Index> chosen;
@@ -208,8 +208,8 @@ py::tuple curve_rows(const py::object& spans, const py::tuple& curves, const py:
     low.mutable_data()[i] = at - room;
     high.mutable_data()[i] = std::min(at + room, trusted.data()[k]);
   }
-  const py::tuple foot = refined(spans, control_points, seen.points, curve, u, low, high,
-                                 limits[1].cast<int>(), limits[2].cast<int>(), tolerances);
+  const py::tuple foot =
+      curves.refine(control_points, seen.points, curve, u, low, high, limits[1].cast<int>());
   const Array found = foot[0].cast<Array>(), basis = foot[6].cast<Array>();
   const py::array_t<bool> interior = foot[5].cast<py::array_t<bool>>();
   const Ints columns = foot[8].cast<Ints>();
@@ -221,7 +221,6 @@ py::tuple curve_rows(const py::object& spans, const py::tuple& curves, const py:
   const Index p = basis.shape(1), width = jacobian.shape(1), head = sensor.size() ? 2 : 1;
   Ints keys(Shape{m, head + p});
   bool reached = false;
-  const bool periodic = spans.attr("periodic").cast<bool>();
   for (Index i = 0; i < m; ++i) {
     const double r = residual.data()[i], s = sigma.data()[i];
     double weight = std::sqrt(1.0 / std::max(std::abs(r / s) / huber, 1.0));
@@ -232,7 +231,7 @@ py::tuple curve_rows(const py::object& spans, const py::tuple& curves, const py:
     own[0] = first_pose + seen.cycle.data()[i];
     if (head == 2) own[1] = sensor_key;
     for (Index j = 0; j < p; ++j) own[head + j] = control_keys.data()[columns.data()[i * p + j]];
-    reached |= !periodic && found.data()[i] <= active_from.data()[curve.data()[i]];
+    reached |= !curves.periodic && found.data()[i] <= active_from.data()[curve.data()[i]];
   }
   return py::make_tuple(rows, found, reached, py::make_tuple(keys, jacobian, residual, seen.cycle));
 }
@@ -254,10 +253,9 @@ py::tuple open_rows(const Ints& labels, const Ints& since, const Ints& label, co
   return py::make_tuple(Ints(shape, rows.data()), Ints(shape, curve.data()));
 }
 
-py::tuple in_view(const py::object& spans, const Array& control_points, const Array& trusted,
-                  const Array& points, const Ints& curve, const Ints& slot, const py::list& pose_u,
-                  const Array& pose, const py::tuple& rooms, double step, int iterations,
-                  const py::tuple& tolerances) {
+py::tuple in_view(const Curves& laid, const Array& control_points, const Array& trusted, const Array& points,
+                  const Ints& curve, const Ints& slot, const py::list& pose_u, const Array& pose,
+                  const py::tuple& rooms, double step, int iterations) {
   const Index m = points.shape(0), curves = static_cast<Index>(pose_u.size());
   const double room[4] = {rooms[0].cast<double>(), rooms[1].cast<double>(), rooms[2].cast<double>(),
                           rooms[3].cast<double>()};
@@ -279,8 +277,7 @@ py::tuple in_view(const py::object& spans, const Array& control_points, const Ar
     low.mutable_data()[i] = u - room[i < m ? 0 : 2];
     high.mutable_data()[i] = std::min(u + room[i < m ? 1 : 3], trusted.data()[k]);
   }
-  const py::tuple foot =
-      searched(spans, control_points, all, number, low, high, step, iterations, tolerances);
+  const py::tuple foot = laid.search(control_points, all, number, low, high, step, iterations);
   const Array u = foot[0].cast<Array>(), tangent = foot[2].cast<Array>(), distance = foot[4].cast<Array>();
   py::tuple of_rows(9);
   for (int j = 0; j < 9; ++j) of_rows[j] = foot[j][py::slice(0, m, 1)];

@@ -2,10 +2,55 @@
 
 #include "foot_points.hpp"
 
+#include <pybind11/stl.h>
+
 namespace kernels {
+
+Curve::Curve(const py::object& basis, Index offset, Index distinct, double shift)
+    : low(basis.attr("low").cast<double>() + shift),
+      high(basis.attr("high").cast<double>() + shift),
+      shift(shift),
+      degree(basis.attr("degree").cast<Index>()),
+      spans(basis.attr("occupied").cast<Index>()),
+      offset(offset),
+      distinct(distinct),
+      coefficients(basis.attr("coefficients").cast<Array>()),
+      inverse(basis.attr("inverse_widths").cast<Array>()) {
+  const Array begins = basis.attr("starts").cast<Array>();
+  const bool periodic = basis.attr("periodic").cast<bool>();
+  const double length = basis.attr("length").cast<double>();
+  stride = begins.size();
+  interval = length / static_cast<double>(stride);
+  expect(spans > 0 && spans <= stride && inverse.size() == stride);
+  expect(coefficients.size() == (degree + 1) * (degree + 1) * stride);
+  for (int period = periodic ? -1 : 0; period <= (periodic ? 1 : 0); ++period)
+    for (Index span = 0; span < spans; ++span)
+      starts.push_back((begins.data()[span] + length * period) + shift);
+}
+
+Curves::Curves(const py::sequence& bases, const std::vector<Index>& offsets,
+               const std::vector<Index>& distinct) {
+  expect(bases.size() > 0 && offsets.size() == bases.size());
+  expect(distinct.empty() || distinct.size() == bases.size());
+  first.push_back(0);
+  double end = 0.0;
+  for (size_t k = 0; k < bases.size(); ++k) {
+    const py::object basis = bases[k];
+    const bool is_periodic = basis.attr("periodic").cast<bool>();
+    const double length = is_periodic ? basis.attr("length").cast<double>() : 0.0;
+    const double low = basis.attr("low").cast<double>(), high = basis.attr("high").cast<double>();
+    const double shift = k ? std::ceil(end - (low - length) + 1.0) : 0.0;
+    end = high + length + shift;
+    all.emplace_back(basis, offsets[k], is_periodic && !distinct.empty() ? distinct[k] : 0, shift);
+    if (k == 0) degree = all[0].degree, periodic = is_periodic;
+    expect(all[k].degree == degree && is_periodic == periodic);
+    first.push_back(first.back() + all[k].spans);
+  }
+}
+
 // The grid of each curve reaches over the stretches of all rows on it, as in Python.
 void Search::nearest_on_grid(double step) {
-  const Index curves = spans_.low.shape(0);
+  const Index curves = static_cast<Index>(curves_.all.size());
   std::vector<double> least(curves, kInfinity), most(curves, -kInfinity);
   for (Index i = 0; i < size_; ++i) {
     const Index k = curve_.data()[i];
@@ -19,8 +64,8 @@ void Search::nearest_on_grid(double step) {
     on_grid[k].resize(2 * count);
     for (Index g = 0; g < count; ++g) {
       double s;
-      const Index number = locate(least[k] + step * static_cast<double>(g), &s);
-      evaluate(number, s, 0, &on_grid[k][2 * g]);
+      const Index span = locate(k, least[k] + step * static_cast<double>(g), &s);
+      evaluate(k, span, s, 0, &on_grid[k][2 * g]);
     }
   }
   probe_.resize(size_);
@@ -40,8 +85,8 @@ void Search::nearest_on_grid(double step) {
     }
     for (double v : {stretch.low, stretch.high}) {
       double s, at[2];
-      const Index number = locate(v, &s);
-      evaluate(number, s, 0, at);
+      const Index span = locate(k, v, &s);
+      evaluate(k, span, s, 0, at);
       const double square = (at[0] - x) * (at[0] - x) + (at[1] - y) * (at[1] - y);
       if (square < best) best = square, place = v;
     }
@@ -53,8 +98,8 @@ void Search::start_at(const double* u) {
   probe_.resize(size_);
   for (Index i = 0; i < size_; ++i) {
     const Stretch& stretch = stretch_[i];
-    double v = u[i] + spans_.shift.data()[curve_.data()[i]];
-    if (!spans_.periodic) {
+    double v = u[i] + on(i).shift;
+    if (!curves_.periodic) {
       v = clipped(v, stretch.low, stretch.high);
     } else {
       const double period = stretch.length();
@@ -87,7 +132,7 @@ void Search::descend(const std::vector<Index>& rows, std::vector<double> reach, 
       const bool inside = std::abs(step[r]) < std::abs(end[r] - best.v);
       const double v = stretch.within(inside ? best.v + step[r] : 0.5 * (best.v + end[r]));
       next[r] = probe(rows[r], v);
-      moves |= std::abs(v - best.v) > eps_.step * stretch.length();
+      moves |= std::abs(v - best.v) > kStepTolerance * stretch.length();
     }
     for (Index r = 0; r < count; ++r) {
       Probe& best = probe_[rows[r]];
@@ -106,7 +151,7 @@ void Search::descend(const std::vector<Index>& rows, std::vector<double> reach, 
   }
 }
 
-void Search::refine(int iterations, int safeguarded) {
+void Search::refine(int iterations) {
   std::vector<double> intervals(size_);
   for (Index i = 0; i < size_; ++i) intervals[i] = stretch_[i].interval;
   for (int iteration = 0; iteration < iterations; ++iteration) {
@@ -120,12 +165,12 @@ void Search::refine(int iterations, int safeguarded) {
       else
         farther.push_back(i);
     }
-    if (!farther.empty()) descend(farther, intervals, safeguarded);
+    if (!farther.empty()) descend(farther, intervals, kSafeguarded);
   }
 }
 
 py::tuple Search::finish(const Array& control_points) const {
-  const Index p = spans_.degree + 1;
+  const Index p = curves_.degree + 1;
   Array u(size_), position(Shape{size_, 2}), tangent(Shape{size_, 2}), normal(Shape{size_, 2});
   Array distance(size_), basis(Shape{size_, p});
   py::array_t<bool> interior(size_);
@@ -138,14 +183,15 @@ py::tuple Search::finish(const Array& control_points) const {
     const Stretch& stretch = stretch_[i];
     const double length = stretch.length();
     double v = at.v;
-    if (spans_.periodic) v -= length * std::floor((v - stretch.begin) / length);
-    u.mutable_data()[i] = clipped(v, stretch.begin, stretch.end) - spans_.shift.data()[curve_.data()[i]];
-    const Index* own = spans_.columns.data() + at.number * p;
+    if (curves_.periodic) v -= length * std::floor((v - stretch.begin) / length);
+    u.mutable_data()[i] = clipped(v, stretch.begin, stretch.end) - on(i).shift;
+    const Curve& own = on(i);
+    for (Index j = 0; j < p; ++j) columns.mutable_data()[i * p + j] = own.column(at.span, j);
     double tx = at.first[0], ty = at.first[1], norm = std::sqrt(tx * tx + ty * ty);
-    if (!(norm * length > eps_.tangent * largest)) {
-      const double* points = control_points.data();
-      tx = points[2 * own[p - 1]] - points[2 * own[0]];
-      ty = points[2 * own[p - 1] + 1] - points[2 * own[0] + 1];
+    if (!(norm * length > kNoTangent * largest)) {
+      const double* from = control_points.data() + 2 * own.column(at.span, 0);
+      const double* to = control_points.data() + 2 * own.column(at.span, p - 1);
+      tx = to[0] - from[0], ty = to[1] - from[1];
       if (tx == 0.0 && ty == 0.0) tx = 1.0;
       norm = std::hypot(tx, ty);
     }
@@ -155,54 +201,47 @@ py::tuple Search::finish(const Array& control_points) const {
     tangent.mutable_data()[2 * i + 1] = ty;
     normal.mutable_data()[2 * i] = -ty;
     distance.mutable_data()[i] = -(-ty * at.offset[0] + tx * at.offset[1]);
-    const double tolerance = eps_.end * length;
+    const double tolerance = kEndTolerance * length;
     bool outside = (at.v - stretch.floor <= tolerance && at.slope > 0.0) ||
                    (stretch.ceiling - at.v <= tolerance && at.slope < 0.0);
-    if (!spans_.periodic) outside |= at.v <= stretch.begin + tolerance || at.v >= stretch.end - tolerance;
+    if (!curves_.periodic) outside |= at.v <= stretch.begin + tolerance || at.v >= stretch.end - tolerance;
     interior.mutable_data()[i] = !outside;
-    const Index spans = spans_.columns.shape(0);
     for (Index j = 0; j < p; ++j) {
-      const double* values = spans_.values.data() + at.number * p + j;
-      double total = values[(p - 1) * spans * p];
-      for (Index k = p - 2; k >= 0; --k) total = total * at.s + values[k * spans * p];
+      const double* values = own.coefficients.data() + at.span * p + j;
+      double total = values[(p - 1) * own.stride * p];
+      for (Index k = p - 2; k >= 0; --k) total = total * at.s + values[k * own.stride * p];
       basis.mutable_data()[i * p + j] = total;
-      columns.mutable_data()[i * p + j] = own[j];
     }
-    span.mutable_data()[i] = at.number + spans_.first + spans_.degree;
+    const Index number = curves_.first[curve_.data()[i]] + at.span;
+    span.mutable_data()[i] = number + curves_.all[0].offset + curves_.degree;
   }
   return py::make_tuple(u, position, tangent, normal, distance, interior, basis, span, columns);
 }
 
-namespace {
-
-Tolerances tolerances_of(const py::tuple& eps) {
-  return {eps[0].cast<double>(), eps[1].cast<double>(), eps[2].cast<double>(),
-          eps[3].cast<double>(), eps[4].cast<double>(), eps[5].cast<double>()};
-}
-
-}  // namespace
-
-py::tuple searched(const py::object& spans, const Array& control_points, const Array& points,
-                   const Ints& curve, const Array& u_low, const Array& u_high, double coarse_step,
-                   int iterations, const py::tuple& tolerances) {
-  Search search(spans, control_points, points, curve, u_low, u_high, tolerances_of(tolerances));
+py::tuple Curves::search(const Array& control_points, const Array& points, const Ints& curve,
+                         const Array& u_low, const Array& u_high, double coarse_step, int iterations) const {
+  Search search(*this, control_points, points, curve, u_low, u_high);
   search.nearest_on_grid(coarse_step);
   search.descend(search.all(), search.reach(coarse_step), iterations);
   return search.finish(control_points);
 }
 
-py::tuple refined(const py::object& spans, const Array& control_points, const Array& points,
-                  const Ints& curve, const Array& u_start, const Array& u_low, const Array& u_high,
-                  int iterations, int safeguarded, const py::tuple& tolerances) {
-  Search search(spans, control_points, points, curve, u_low, u_high, tolerances_of(tolerances));
+py::tuple Curves::refine(const Array& control_points, const Array& points, const Ints& curve,
+                         const Array& u_start, const Array& u_low, const Array& u_high,
+                         int iterations) const {
+  Search search(*this, control_points, points, curve, u_low, u_high);
   search.start_at(u_start.data());
-  search.refine(iterations, safeguarded);
+  search.refine(iterations);
   return search.finish(control_points);
 }
 
 void add_foot_points(py::module_& module) {
-  module.def("searched", &searched);
-  module.def("refined", &refined);
+  py::class_<Curves>(module, "Curves")
+      .def(py::init<const py::sequence&, const std::vector<Index>&, const std::vector<Index>&>(),
+           py::arg("bases"), py::arg("offsets") = std::vector<Index>{0},
+           py::arg("distinct") = std::vector<Index>{})
+      .def("search", &Curves::search)
+      .def("refine", &Curves::refine);
 }
 
 }  // namespace kernels

@@ -221,7 +221,7 @@ class BatchSystem:
         curve = curves.labels.searchsorted(detections.boundary[rows])
         stretch = u, u - s.refine_room, np.minimum(u + s.refine_room, curves.trusted[curve])
         return refine_joint_foot_points(
-            curves.spans, state.map_points, points, curve, *stretch, s.refine_iterations
+            curves.searched, state.map_points, points, curve, *stretch, s.refine_iterations
         )
 
     def settle(self, state: State) -> None:

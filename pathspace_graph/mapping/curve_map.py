@@ -7,7 +7,6 @@ import numpy as np
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, TOLERANCES
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.residuals import pair_residuals, sigma_across
 from pathspace_graph.graph.rows import Rows, stacked_rows
@@ -61,16 +60,15 @@ class CurveMap:
             return []
         curves, variables, s = state.curves, self.variables, self.settings.spline
         rows, u, self.reached_inactive, parts = kernels.curve_rows(
-            curves.spans,
+            curves.searched,
             (state.map_points, curves.labels, curves.keys, curves.trusted, curves.active_from),
             detections.associated,
             cycles,
             variables.poses,
             variables.first_cycle,
             variables.sensor,
-            (s.refine_room, s.refine_iterations, SEARCH_ITERATIONS, s.sigma_model, self.settings.gate.huber),
+            (s.refine_room, s.refine_iterations, s.sigma_model, self.settings.gate.huber),
             (FIRST_POSE, SENSOR_KEY),
-            TOLERANCES,
         )
         self._refined = rows, u
         return [Rows(*parts), *self._along(rows)]

@@ -6,7 +6,7 @@ import numpy as np
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.footpoint import TOLERANCES, FootPoints
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import pose_keys
@@ -129,7 +129,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         if float(np.hypot(*(state.poses[-1, :2] - state.poses[-2, :2]))) < gate.station_step:
             room = s.refine_room, s.refine_room
         foot, beside = kernels.in_view(
-            curves.spans,
+            curves.searched,
             state.map_points,
             curves.trusted,
             points,
@@ -140,7 +140,6 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             (gate.view_behind, gate.view_ahead, *room),
             s.search_step,
             s.search_iterations,
-            TOLERANCES,
         )
         for label, (u, along, distance) in zip(state.boundaries, beside, strict=True):
             lost = along < 0.0 or abs(distance) > gate.station_lateral

@@ -1,6 +1,6 @@
 """The state of the spline estimators: curves, and the variables of their control points and poses."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import is_
@@ -9,8 +9,9 @@ from typing import Final, Self
 import numpy as np
 
 from pathspace_graph.copies import shallow
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.bspline import SpanPolynomials, Spans, lay_out
+from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points
 from pathspace_graph.graph.variables import CONTROL_LETTERS, Variables, control_keys
 from pathspace_graph.spline.boundary import Boundary
@@ -28,7 +29,6 @@ class Curves:
     labels: IntArray  # (k,) labels of the curves, ascending
     active: tuple[IntArray, ...]  # active control points of each curve, by index
     tables: tuple[SpanPolynomials, ...]  # tables of each whole curve
-    spans: Spans  # all spans of closed curves; an open curve begins at its first active control point
     active_from: Array  # (k,) parameter before which an open curve is inactive; -inf if all is active
     keys: IntArray  # (m,) keys of all control points
 
@@ -36,20 +36,24 @@ class Curves:
     def of(cls, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> Self:
         """Lay out boundaries, at least one, with the active control points (k,) of each."""
         curves, active_of = tuple(boundaries.values()), tuple(active[label] for label in boundaries)
-        sizes = [boundary.size for boundary in curves]
-        offsets = np.cumsum([0, *sizes[:-1]]).tolist()
-        first = [0 if b.periodic else int(indices[0]) for b, indices in zip(curves, active_of, strict=True)]
-        tables = [b.tables.tail(start) if start else b.tables for b, start in zip(curves, first, strict=True)]
-        begins = [t.low if start else -np.inf for t, start in zip(tables, first, strict=True)]
+        first = _first_active(curves, active_of)
+        begins = [_tail(b, start).low if start else -np.inf for b, start in zip(curves, first, strict=True)]
         return cls(
             boundaries=curves,
             labels=np.array(list(boundaries), np.intp),
             active=active_of,
             tables=tuple(boundary.tables for boundary in curves),
-            spans=lay_out(tables, [o + f for o, f in zip(offsets, first, strict=True)], sizes),
             active_from=np.array(begins),
             keys=np.concatenate([control_keys(label, b.numbers) for label, b in boundaries.items()]),
         )
+
+    @cached_property
+    def searched(self) -> kernels.Curves:
+        """Return all of closed curves, and open ones from their first active control point on."""
+        sizes = [boundary.size for boundary in self.boundaries]
+        first = _first_active(self.boundaries, self.active)
+        bases = [_tail(boundary, start) for boundary, start in zip(self.boundaries, first, strict=True)]
+        return kernels.Curves(bases, (np.cumsum([0, *sizes[:-1]]) + first).tolist(), sizes)
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
         """Return whether these are the curves of boundaries with active control points, by default all."""
@@ -89,7 +93,16 @@ class Curves:
         """Search the foot point of each point (m, 2) on its own curve (m,) and stretch [low, high]."""
         s, high = self.boundaries[0].settings, np.minimum(high, self.trusted[curve])
         search = (s.search_step, s.search_iterations)
-        return joint_foot_points(self.spans, control_points, points, curve, low, high, *search)
+        return joint_foot_points(self.searched, control_points, points, curve, low, high, *search)
+
+
+def _first_active(boundaries: Sequence[Boundary], active: Sequence[IntArray]) -> list[int]:
+    """Return the first active control point of each boundary, by index; 0 where it is closed."""
+    return [0 if b.periodic else int(indices[0]) for b, indices in zip(boundaries, active, strict=True)]
+
+
+def _tail(boundary: Boundary, first: int) -> SpanPolynomials:
+    return boundary.tables.tail(first) if first else boundary.tables
 
 
 class State:

@@ -7,8 +7,9 @@ from typing import Final
 import numpy as np
 from scipy.spatial import KDTree
 
+from pathspace_graph.factors._kernels import Curves
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.bspline import SpanPolynomials, Spans, lay_out
+from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_joint_foot_points
 from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.factors.se2 import move_points, path_lengths
@@ -133,15 +134,15 @@ class Boundary:
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
         """Search the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
         s, alone = self.settings, np.zeros(len(points), np.intp)
-        spans, search = self._spans_from(low), (s.search_step, s.search_iterations)
-        return joint_foot_points(spans, control_points, points, alone, low, high, *search)
+        search = s.search_step, s.search_iterations
+        return joint_foot_points(self._curve_from(low), control_points, points, alone, low, high, *search)
 
-    def _spans_from(self, low: Array) -> Spans:
-        """Return the spans on the distinct control points; of an open curve, from the least limit (m,) on."""
+    def _curve_from(self, low: Array) -> Curves:
+        """Return the curve on its distinct control points; an open one from the least limit (m,) on."""
         if self.periodic:
-            return lay_out([self.tables], [0], [self.size])
+            return Curves([self.tables], [0], [self.size])
         first = int(self.tables.locate(np.min(low, initial=np.inf, keepdims=True))[0][0])
-        return lay_out([self.tables.tail(first)], [first]) if first else self.tables.alone
+        return Curves([self.tables.tail(first) if first else self.tables], [first])
 
     def find_anywhere(self, control_points: Array, points: Array) -> FootPoints:
         low, high = np.full((len(points), 2), [self.tables.low, self.tables.high]).T
@@ -152,7 +153,7 @@ class Boundary:
         s, alone = self.settings, np.zeros(len(points), np.intp)
         search = u, u - s.refine_room, self.within_trusted(u + s.refine_room), s.refine_iterations
         unwrapped = self.extended(control_points)
-        return refine_joint_foot_points(self.tables.alone, unwrapped, points, alone, *search)
+        return refine_joint_foot_points(Curves([self.tables]), unwrapped, points, alone, *search)
 
     @property
     def trusted(self) -> float:

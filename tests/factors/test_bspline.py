@@ -8,13 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline as ScipyBSpline
 
+from pathspace_graph.factors._kernels import Curves
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import (
     SpanPolynomials,
-    Spans,
     clamped_knots,
     domain,
-    lay_out,
     periodic_knots,
     scatter,
     uniform_knots,
@@ -28,6 +27,7 @@ from pathspace_graph.factors.footpoint import (
 from pathspace_graph.spline.bspline import end_change_matrix
 
 from ..oracles.footpoint import Stretch, curve_coefficients, stretch_of
+from ..oracles.spans import Spans, lay_out
 
 TOLERANCE = 1e-12
 KINDS = ("random", "repeated", "clamped", "uniform")
@@ -165,7 +165,7 @@ def test_curve_coefficients_give_the_curve() -> None:
     tables = SpanPolynomials(knots, 3)
     u = rng.uniform(tables.low, tables.high, 30)
     number, s = tables.locate(u)
-    terms = curve_coefficients(tables.alone, points)[..., number]
+    terms = curve_coefficients(lay_out([tables], [0]), points)[..., number]
     curve = np.einsum("krdm,mk->rmd", terms, s[:, None] ** np.arange(4))
     for order in range(3):
         expected = ScipyBSpline(knots, points, 3)(u, nu=order)
@@ -205,9 +205,9 @@ def two_curves(periodic: bool) -> tuple[list[SpanPolynomials], list[Array]]:
     return tables, points
 
 
-def side_by_side(tables: list[SpanPolynomials], points: list[Array]) -> tuple[Spans, Array]:
+def side_by_side(tables: list[SpanPolynomials], points: list[Array]) -> tuple[Curves, Array]:
     sizes = [len(own) for own in points]
-    return lay_out(tables, [0, sizes[0]], sizes), np.concatenate(points)
+    return Curves(tables, [0, sizes[0]], sizes), np.concatenate(points)
 
 
 def unwrapped(tables: SpanPolynomials, points: Array) -> Array:
@@ -244,7 +244,7 @@ def test_rows_of_two_curves_are_found_as_on_each_alone(periodic: bool) -> None:
         alone = foot_points(tables[k], own, points[of], low[of], high[of], STEP)
         assert_same(found, alone, of, offset, len(control[k]))
         first, stretch = np.zeros(len(of), np.intp), (low[of], high[of])
-        alone = refine_joint_foot_points(tables[k].alone, own, points[of], first, u[of], *stretch, 3)
+        alone = refine_joint_foot_points(Curves([tables[k]]), own, points[of], first, u[of], *stretch, 3)
         assert_same(refined, alone, of, offset, len(control[k]))
 
 
@@ -255,7 +255,7 @@ def test_the_tail_of_an_open_curve_is_that_curve() -> None:
     low, points = np.full(50, tables.knots[DEGREE + first]), rng.normal(0.0, 6.0, (50, 2))
     high = np.full(50, tables.high)
     whole = foot_points(tables, control, points, low, high, STEP)
-    laid = lay_out([tables.tail(first)], [first])
+    laid = Curves([tables.tail(first)], [first])
     tail = joint_foot_points(laid, control, points, np.zeros(50, np.intp), low, high, STEP)
     np.testing.assert_allclose(tail.u, whole.u, rtol=0.0, atol=1e-9)
     inside = whole.interior
@@ -277,6 +277,7 @@ OPEN = SpanPolynomials(uniform_knots(13, 3), 3)
 """An open curve with the domain [0, 10] and knots one apart."""
 CLOSED = SpanPolynomials(periodic_knots(np.linspace(0.0, 8.0, 5), 3), 3, True)
 """A closed curve with the domain [0, 8] and knots two apart."""
+OPEN_ALONE, CLOSED_ALONE = lay_out([OPEN], [0]), lay_out([CLOSED], [0])
 
 
 def stretches(spans: Spans, limits: list[tuple[float, float]], curve: IntArray | None = None) -> Stretch:
@@ -291,24 +292,24 @@ def assert_limits(stretch: Stretch, low: list[float], high: list[float]) -> None
 
 
 def test_on_an_open_curve_limits_are_clipped_to_the_domain() -> None:
-    stretch = stretches(OPEN.alone, [(2.0, 4.0), (-3.0, 1.0), (9.0, 30.0), (12.0, 15.0)])
+    stretch = stretches(OPEN_ALONE, [(2.0, 4.0), (-3.0, 1.0), (9.0, 30.0), (12.0, 15.0)])
     assert_limits(stretch, [2.0, 0.0, 9.0, 10.0], [4.0, 1.0, 10.0, 10.0])
     np.testing.assert_array_equal(stretch.length, 10.0)
     np.testing.assert_array_equal(stretch.interval, 1.0)
 
 
 def test_reversed_limits_give_a_stretch_of_no_length() -> None:
-    assert_limits(stretches(OPEN.alone, [(5.0, 3.0)]), [5.0], [5.0])
-    assert_limits(stretches(CLOSED.alone, [(5.0, 3.0)]), [5.0], [5.0])
+    assert_limits(stretches(OPEN_ALONE, [(5.0, 3.0)]), [5.0], [5.0])
+    assert_limits(stretches(CLOSED_ALONE, [(5.0, 3.0)]), [5.0], [5.0])
 
 
 def test_around_a_closed_curve_a_stretch_begins_in_the_domain_and_may_end_beyond_the_seam() -> None:
-    stretch = stretches(CLOSED.alone, [(1.0, 3.0), (7.0, 9.5), (-1.0, 1.0), (17.0, 18.0)])
+    stretch = stretches(CLOSED_ALONE, [(1.0, 3.0), (7.0, 9.5), (-1.0, 1.0), (17.0, 18.0)])
     assert_limits(stretch, [1.0, 7.0, 7.0, 1.0], [3.0, 9.5, 9.0, 2.0])
 
 
 def test_a_stretch_of_a_period_is_the_whole_curve_and_has_no_limits() -> None:
-    stretch = stretches(CLOSED.alone, [(3.0, 11.0), (3.0, 5.0), (-100.0, 100.0)])
+    stretch = stretches(CLOSED_ALONE, [(3.0, 11.0), (3.0, 5.0), (-100.0, 100.0)])
     assert_limits(stretch, [0.0, 3.0, 0.0], [8.0, 5.0, 8.0])
     np.testing.assert_array_equal(stretch.floor, [-np.inf, 3.0, -np.inf])
     np.testing.assert_array_equal(stretch.ceiling, [np.inf, 5.0, np.inf])
@@ -316,21 +317,21 @@ def test_a_stretch_of_a_period_is_the_whole_curve_and_has_no_limits() -> None:
 
 
 def test_a_start_is_moved_to_the_nearest_limit_of_an_open_curve() -> None:
-    stretch = stretches(OPEN.alone, [(2.0, 4.0)] * 3)
+    stretch = stretches(OPEN_ALONE, [(2.0, 4.0)] * 3)
     np.testing.assert_array_equal(stretch.moved_into(np.array([-7.0, 3.0, 4.5])), [2.0, 3.0, 4.0])
 
 
 def test_a_start_is_moved_by_whole_periods_or_to_the_limit_that_is_nearer_around_the_curve() -> None:
     """From 7 to 10 on a curve of length 8: 1 is inside, 3 is one past the end, 6 is one before the start."""
-    stretch = stretches(CLOSED.alone, [(7.0, 10.0)] * 5)
+    stretch = stretches(CLOSED_ALONE, [(7.0, 10.0)] * 5)
     found = stretch.moved_into(np.array([7.5, 1.0, -15.0, 3.0, 6.0]))
     np.testing.assert_allclose(found, [7.5, 9.0, 9.0, 10.0, 7.0], atol=1e-12)
 
 
 def test_places_come_back_into_the_domain() -> None:
     v = np.array([-1.0, 3.0, 19.0])
-    np.testing.assert_array_equal(stretches(OPEN.alone, [(0.0, 10.0)] * 3).in_domain(v), [0.0, 3.0, 10.0])
-    np.testing.assert_allclose(stretches(CLOSED.alone, [(0.0, 8.0)] * 3).in_domain(v), [7.0, 3.0, 3.0])
+    np.testing.assert_array_equal(stretches(OPEN_ALONE, [(0.0, 10.0)] * 3).in_domain(v), [0.0, 3.0, 10.0])
+    np.testing.assert_allclose(stretches(CLOSED_ALONE, [(0.0, 8.0)] * 3).in_domain(v), [7.0, 3.0, 3.0])
 
 
 def test_each_row_s_stretch_lies_on_the_axis_of_its_own_curve() -> None:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pathspace_graph.factors._kernels import Curves
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.bspline import (
     SpanPolynomials,
@@ -34,7 +35,7 @@ def refine_foot_points(
 ) -> FootPoints:
     """The refinement on one curve."""
     alone = np.zeros(len(points), np.intp)
-    return refine_joint_foot_points(tables.alone, control_points, points, alone, *search)
+    return refine_joint_foot_points(Curves([tables]), control_points, points, alone, *search)
 
 
 def whole(tables: SpanPolynomials, control_points: Array, points: Array, step: float = 0.0) -> FootPoints:

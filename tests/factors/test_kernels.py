@@ -6,19 +6,19 @@ import ast
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import BuiltinFunctionType, SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from pathspace_graph.factors import _kernels as kernels
-from pathspace_graph.factors.bspline import SpanPolynomials, lay_out
-from pathspace_graph.factors.footpoint import TOLERANCES, joint_foot_points, refine_joint_foot_points
+from pathspace_graph.factors.bspline import SpanPolynomials
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, ORIGIN_KEY, Layout, control_keys, pose_keys
 
-from ..oracles import cones, curves, footpoint, front_end, measuring, rows
+from ..oracles import cones, curves, footpoint, front_end, measuring, rows, spans
 
 Arguments = Callable[[np.random.Generator], tuple[Any, ...]]
 COUNT = 17
@@ -31,6 +31,14 @@ ORACLES = {
     for name, one in vars(module).items()
     if name in KERNELS and one.__module__ == module.__name__
 }
+
+
+class Laid(NamedTuple):
+    """What both kinds of curves are made of."""
+
+    bases: list[SpanPolynomials]
+    offsets: list[int]
+    distinct: list[int]
 
 
 def poses(rng: np.random.Generator, count: int | None = None) -> np.ndarray:
@@ -165,25 +173,25 @@ def at_stations(rng: np.random.Generator, sensed: int) -> tuple[Any, ...]:
 
 def seen_curves(rng: np.random.Generator, periodic: bool) -> tuple[Any, ...]:
     """Curves, and detections in use on them, of two cycles of three."""
-    spans, control_points = curves(rng, periodic, 3)
+    laid, control_points = two_curves(rng, periodic, 3)
     keys = rng.permutation(1000)[: len(control_points)]
     own = control_points, np.array([0, 1]), keys, np.array([9.0, 30.0]), np.array([3.0, -np.inf])
     cycles, boundary = 5 + np.sort(rng.integers(0, 3, COUNT)), rng.integers(0, 2, COUNT)
     measured, twists = 9.0 * rng.normal(size=(COUNT, 2)), poses(rng)
     where = rng.choice([True, True, False], COUNT), rng.uniform(0.0, 20.0, COUNT)
     seen = (cycles, boundary, *where, measured, twists, covariances(rng) + 0.01 * np.eye(2))
-    limits = (4.0, 2, 50, 0.1, 1.5)
+    limits = (4.0, 2, 0.1, 1.5)
     poses_seen = 0.1 * poses(rng, 3), 5, 0.01 * rng.normal(size=5)
-    return spans, own, seen, np.array([5, 7]), *poses_seen, limits, (100, 50), TOLERANCES
+    return laid, own, seen, np.array([5, 7]), *poses_seen, limits, (100, 50)
 
 
 def views(rng: np.random.Generator, periodic: bool) -> tuple[Any, ...]:
-    spans, control_points = curves(rng, periodic, 3)
+    laid, control_points = two_curves(rng, periodic, 3)
     beside = [rng.uniform(0.0, 20.0, 4) for _ in range(2)]
     where = 9.0 * rng.normal(size=(COUNT, 2)), rng.integers(0, 2, COUNT), rng.integers(0, 5, COUNT)
     rooms = (5.0, 15.0, 2.0, 4.0)
     known = np.array([9.0, np.inf])
-    return spans, control_points, known, *where, beside, poses(rng, 1)[0], rooms, 0.7, 50, TOLERANCES
+    return laid, control_points, known, *where, beside, poses(rng, 1)[0], rooms, 0.7, 50
 
 
 CASES: dict[str, Arguments] = {
@@ -294,11 +302,12 @@ CASES: dict[str, Arguments] = {
     ),
     "whitener": lambda rng: (information(rng, 3), 1e-3),
 }
-SEARCHES = {"searched", "refined"}
 
 
 def results(function: Callable[..., Any], arguments: tuple[Any, ...]) -> list[Any]:
     """What a function returns, where of a Hessian only the lower triangle is told."""
+    lay_out = kernels.Curves if isinstance(function, BuiltinFunctionType) else spans.lay_out
+    arguments = tuple(lay_out(*one) if isinstance(one, Laid) else one for one in arguments)
     found = function(*arguments)
     if function.__name__.endswith("summed"):
         return [np.tril(found[0]), found[1]]
@@ -336,7 +345,7 @@ def test_no_rows_are_no_rows(name: str, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_every_compiled_function_is_tested() -> None:
-    assert set(KERNELS) == set(ORACLES) == set(CASES) | SEARCHES
+    assert set(KERNELS) == set(ORACLES) == set(CASES)
 
 
 def test_every_compiled_function_has_a_signature() -> None:
@@ -371,7 +380,7 @@ def test_cases_at_the_edge(name: str, arguments: Arguments) -> None:
     assert_equal(results(KERNELS[name], chosen), results(ORACLES[name], chosen))
 
 
-def curves(rng: np.random.Generator, periodic: bool, degree: int) -> tuple[Any, np.ndarray]:
+def two_curves(rng: np.random.Generator, periodic: bool, degree: int) -> tuple[Laid, np.ndarray]:
     """Two curves laid out together, and their control points."""
     tables, points = [], []
     for k in range(2):
@@ -392,29 +401,29 @@ def curves(rng: np.random.Generator, periodic: bool, degree: int) -> tuple[Any, 
         ring = (8.0 + 3.0 * k) * np.column_stack([np.cos(angle), np.sin(angle)])
         points.append(ring + rng.normal(size=ring.shape))
     sizes = [len(own) for own in points]
-    return lay_out(tables, [0, sizes[0]], sizes if periodic else None), np.concatenate(points)
+    return Laid(tables, [0, sizes[0]], sizes), np.concatenate(points)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("periodic", [False, True])
 @pytest.mark.parametrize("seed", range(8))
-def test_foot_points(seed: int, periodic: bool, degree: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_foot_points(seed: int, periodic: bool, degree: int) -> None:
     """Stretches across the seam, whole periods, reversed and empty ones; points far off and at a centre."""
     rng = np.random.default_rng(seed)
-    spans, control_points = curves(rng, periodic, degree)
+    laid, control_points = two_curves(rng, periodic, degree)
     points, curve = rng.normal(size=(60, 2)) * 9.0, rng.integers(0, 2, 60)
     points[0] = 0.0
     low = rng.uniform(-10.0, 40.0, 60)
     high = low + rng.choice([-1.0, 0.0, 5.0, 15.0, 200.0], 60)
     start = rng.uniform(-10.0, 50.0, 60)
-    both = []
-    for versions in (KERNELS, ORACLES):
-        for name in SEARCHES:
-            monkeypatch.setattr(kernels, name, versions[name])
-        searched = joint_foot_points(spans, control_points, points, curve, low, high, 0.7)
-        refined = refine_joint_foot_points(spans, control_points, points, curve, start, low, high)
-        both.append([searched, refined])
-    for found, expected in zip(*both, strict=True):
+    compiled, known = kernels.Curves(*laid), spans.lay_out(*laid)
+    on = control_points, points, curve
+    stretch = low, high
+    pairs = (
+        (compiled.search(*on, *stretch, 0.7, 50), footpoint.searched(known, *on, *stretch, 0.7, 50)),
+        (compiled.refine(*on, start, *stretch, 2), footpoint.refined(known, *on, start, *stretch, 2)),
+    )
+    for found, expected in ((FootPoints(*one), FootPoints(*other)) for one, other in pairs):
         for name in ("u", "position", "tangent_unit", "normal_unit", "distance", "basis"):
             np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-9)
         for name in ("interior", "span", "columns"):

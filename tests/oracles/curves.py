@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.bspline import Spans
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.residuals import sigma_across
@@ -15,6 +14,7 @@ from pathspace_graph.graph.rows import Parts, among
 
 from .footpoint import refined, searched
 from .measuring import detection_rows, shifted, to_map
+from .spans import Spans
 
 
 def placed(
@@ -59,7 +59,6 @@ def in_view(
     rooms: tuple[float, float, float, float],
     step: float,
     iterations: int,
-    tolerances: tuple[float, ...],
 ) -> tuple[tuple[Any, ...], list[tuple[float, float, float]]]:
     """Return the foot points of detections at points (m, 2), each on its curve (m,) beside its pose (m,)."""
     known = np.array(pose_u)
@@ -69,8 +68,7 @@ def in_view(
     behind, ahead = (np.repeat(room, [len(points), len(known)]) for room in (rooms[::2], rooms[1::2]))
     stretch = seen_from - behind, np.minimum(seen_from + ahead, trusted[numbers])
     both = np.concatenate([points, np.tile(pose[:2], (len(known), 1))])
-    search = step, iterations, tolerances
-    foot = FootPoints(*searched(spans, control_points, both, numbers, *stretch, *search))
+    foot = FootPoints(*searched(spans, control_points, both, numbers, *stretch, step, iterations))
     beside = foot.where(slice(len(points), None))
     along = beside.tangent_unit @ np.array([np.cos(pose[2]), np.sin(pose[2])])
     newest = zip(beside.u.tolist(), along.tolist(), beside.distance.tolist(), strict=True)
@@ -105,20 +103,18 @@ def curve_rows(
     poses: Array,
     first_cycle: int,
     sensor: Array,
-    limits: tuple[float, int, int, float, float],
+    limits: tuple[float, int, float, float],
     names: tuple[int, int],
-    tolerances: tuple[float, ...],
 ) -> tuple[IntArray, Array, bool, Parts]:
     """Return detections by row, their refined parameters (m,), and the parts of `CurveMap.rows`."""
     control_points, labels, control_keys, trusted, active_from = curves
-    room, iterations, safeguarded, sigma_model, huber = limits
+    room, iterations, sigma_model, huber = limits
     rows = np.flatnonzero(table[2] & among(table[0], cycles))
     cycle, boundary, _, u, measured, twist, covariance = (column[rows] for column in table)
     curve, own = labels.searchsorted(boundary), poses[cycle - first_cycle]
     points = to_map(_corrected(measured, twist, sensor), own)
     stretch = u, u - room, np.minimum(u + room, trusted[curve])
-    search = iterations, safeguarded, tolerances
-    foot = FootPoints(*refined(spans, control_points, points, curve, *stretch, *search))
+    foot = FootPoints(*refined(spans, control_points, points, curve, *stretch, iterations))
     known = points, covariance, own, foot.normal_unit, foot.distance, foot.basis
     residual, sigma, jacobian = detection_rows(*known, measured, twist, sensor, sigma_model)
     weight = np.sqrt(huber_weights(residual / sigma, huber)) * (foot.interior / sigma)

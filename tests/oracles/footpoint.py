@@ -8,10 +8,17 @@ from typing import Any, Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.bspline import Spans, horner
-from pathspace_graph.factors.footpoint import TOLERANCES
+from pathspace_graph.factors.bspline import horner
 
-_STEP_TOLERANCE, _FLAT, _EQUAL_SQUARE, _END_TOLERANCE, _NO_TANGENT, _TINY = TOLERANCES
+from .spans import Spans
+
+_STEP_TOLERANCE: Final = 1e-9  # a row's last step, by the length of the domain; the error is its square
+_FLAT: Final = 1e-12  # f' counts as zero where |f'| <= this * |S'|^2
+_EQUAL_SQUARE: Final = 1e-12  # squared distances d, e (m^2) differ where e > d + this * (1 + d)
+_END_TOLERANCE: Final = 1e-9  # a foot point this near (by the length of the domain) to an end is at the end
+_NO_TANGENT: Final = 1e-12  # S' vanishes where |S'| <= this * largest coordinate / length of the domain
+_TINY: Final = 1e-300  # smallest divisor of a step; the numerator vanishes before it does
+_SAFEGUARDED: Final = 50  # most steps of a row that a Newton step has led farther away
 
 
 def searched(
@@ -23,9 +30,8 @@ def searched(
     u_high: Array,
     coarse_step: float,
     iterations: int,
-    tolerances: tuple[float, ...],
 ) -> tuple[Any, ...]:
-    """Return the fields of `joint_foot_points`; the tolerances are those of this module."""
+    """Return the fields of `joint_foot_points`."""
     search = _Search.of(spans, control_points, points, curve, u_low, u_high)
     start = search.nearest_on_grid(coarse_step)
     probe = search.descend(start, np.full(len(points), coarse_step), iterations)
@@ -41,13 +47,11 @@ def refined(
     u_low: Array,
     u_high: Array,
     iterations: int,
-    safeguarded: int,
-    tolerances: tuple[float, ...],
 ) -> tuple[Any, ...]:
-    """Return the fields of `refine_joint_foot_points`; the last two arguments are those of this module."""
+    """Return the fields of `refine_joint_foot_points`."""
     search = _Search.of(spans, control_points, points, curve, u_low, u_high)
     start = search.stretch.moved_into(u_start + spans.shift.take(curve))
-    return search.finish(control_points, search.newton(start, iterations, safeguarded))
+    return search.finish(control_points, search.newton(start, iterations, _SAFEGUARDED))
 
 
 @dataclass(frozen=True, eq=False)
