@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 import scipy  # which imports its modules when they are used
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -114,7 +113,7 @@ def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: Flo
 def along_path(points: FloatArray, cones: FloatArray, closed: bool) -> CentreLine:
     """Return the smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
     curve = _smooth(resample(points, STEP, closed)[0], closed)
-    return _as_spline(curve, np.asarray(KDTree(cones).query(curve)[0]), closed)
+    return _as_spline(curve, np.asarray(scipy.spatial.KDTree(cones).query(curve)[0]), closed)
 
 
 def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> IntArray:

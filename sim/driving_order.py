@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.spatial import Delaunay, QhullError
+import scipy  # which imports its modules when they are used
 
 from .curves import FloatArray, IntArray, direction, left_normals, ring
 
@@ -63,8 +63,8 @@ def _order(left: FloatArray, right: FloatArray, gate: FloatArray, start: FloatAr
 def _apexes(points: FloatArray) -> Apexes:
     apexes: dict[Rung, list[int]] = defaultdict(list)
     try:
-        triangles = Delaunay(points).simplices.tolist()
-    except QhullError:
+        triangles = scipy.spatial.Delaunay(points).simplices.tolist()
+    except scipy.spatial.QhullError:
         return apexes
     for i, j, k in map(sorted, triangles):
         apexes[i, j].append(k)

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+import scipy  # which imports its modules when they are used
 from numpy.random import Generator
-from scipy.signal import lfilter
 
 from pathspace_graph.errors import SettingsError, check_numbers
 from pathspace_graph.io.log import Detections, polar_covariances
@@ -161,7 +161,7 @@ def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatAr
     rho = np.exp(-step)
     drawn = rng.standard_normal(shape)
     drawn[1:] *= np.sqrt(1.0 - rho**2)
-    return np.asarray(lfilter([1.0], [1.0, -rho], drawn, axis=0))
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -rho], drawn, axis=0))
 
 
 def seen_from(pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import scipy  # which imports its modules when they are used
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.io import parsing as limits
@@ -280,7 +280,7 @@ def _without_duplicates(cones: FloatArray) -> FloatArray:
 def _tum(path: Path, _: Table) -> Track:
     circuit = _tum_circuit(path)
     knots = arc_lengths(circuit[:, :2])
-    spline = CubicSpline(knots, circuit[:, :2], bc_type="periodic")
+    spline = scipy.interpolate.CubicSpline(knots, circuit[:, :2], bc_type="periodic")
     s = np.linspace(0.0, knots[-1], math.ceil(knots[-1] / WIDTH_STEP), endpoint=False)
     points, tangents = np.asarray(spline(s)), unit(np.asarray(spline(s, 1)))
     edges = (

@@ -4,11 +4,9 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy  # which imports its modules when they are used
 from numpy.random import Generator
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import brentq
-from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError
 
@@ -162,7 +160,9 @@ def _curve(layout: _Layout, rng: Generator) -> FloatArray:
     s = arc_lengths(polyline)
     even = np.linspace(0.0, s[-1], int(s[-1] / curves.STEP), endpoint=False)
     curve = curves.along_polyline(even, s, polyline)
-    return np.asarray(gaussian_filter1d(curve, curves.SMOOTHING / curves.STEP, axis=0, mode="wrap"))
+    return np.asarray(
+        scipy.ndimage.gaussian_filter1d(curve, curves.SMOOTHING / curves.STEP, axis=0, mode="wrap")
+    )
 
 
 def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -> FloatArray:
@@ -242,7 +242,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 def _is_separate(curve: FloatArray, distance: float) -> bool:
     """Return whether samples nearer than `distance` are of one stretch, apart by less than half a circle."""
-    pairs = cKDTree(curve).query_pairs(distance, output_type="ndarray")
+    pairs = scipy.spatial.KDTree(curve).query_pairs(distance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
     apart = np.minimum(apart, len(curve) - apart) * curves.STEP
     return bool((apart < np.pi * distance / 2).all())
@@ -254,7 +254,7 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
     curve = np.roll(curve, -(first + run // 3), axis=0)
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     normals = left_normals(unit(along))
-    crowding = 1 + CORNER_RADIUS * gaussian_filter1d(
+    crowding = 1 + CORNER_RADIUS * scipy.ndimage.gaussian_filter1d(
         np.abs(_curvature(curve)), CORNER_BLUR / curves.STEP, mode="wrap"
     )
     rows = [curve + side * normals * width / 2 for side in (1.0, -1.0)]
@@ -273,7 +273,7 @@ def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackG
         return widest
     if excess(MIN_CONE_GAP) <= 0:
         return MIN_CONE_GAP
-    return float(brentq(excess, MIN_CONE_GAP, widest))
+    return float(scipy.optimize.brentq(excess, MIN_CONE_GAP, widest))
 
 
 def _cumulative(row: FloatArray, gap: float, crowding: FloatArray) -> FloatArray:

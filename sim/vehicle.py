@@ -1,16 +1,21 @@
 """A vehicle that follows the middle of a track: true poses and the true twist of its body."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
+import scipy  # which imports its modules when they are used
 from numpy.random import Generator
-from scipy.interpolate import CubicSpline
 
 from pathspace_graph.errors import SettingsError, check_numbers
 
 from .curves import CentreLine, FloatArray, arc_lengths, curvature, direction, left_normals
 from .track import Track
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 PATH_STEP: Final = 0.25  # distance of the samples of the driven path (m)
 WAVES: Final = 8  # number of sines whose sum is the wander
@@ -127,7 +132,9 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
     offset = _wander(s, line.clearances(at), settings, rng) + _settling(line, start, track.start, s, settings)
     points = line.points(at) + normals * offset[:, None]
     points += (track.start[:2] - points[0]) * np.exp(-s / settings.settle_distance)[:, None]
-    return CubicSpline(arc_lengths(points), points, bc_type=((1, direction(track.start[2])), "not-a-knot"))
+    return scipy.interpolate.CubicSpline(
+        arc_lengths(points), points, bc_type=((1, direction(track.start[2])), "not-a-knot")
+    )
 
 
 def _settling(
