@@ -102,10 +102,11 @@ def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) 
 def read_bytes(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> bytes:
     """Return the bytes of a file, at most `most`; an InputError says that `expected` was expected."""
     try:
-        if not stat.S_ISREG(file.stat().st_mode):  # a pipe would block where it is opened
+        found = file.stat()
+        if not stat.S_ISREG(found.st_mode):  # a pipe would block where it is opened
             raise InputError(file, f"expected {expected}, found a folder, a device or a pipe")
         with file.open("rb") as stream:
-            data = stream.read(most + 1)
+            data = stream.read(min(found.st_size, most) + 1)  # whose room is reserved before it is read
     except FileNotFoundError:
         raise InputError(file, f"expected {expected}, found none") from None
     except OSError as error:
