@@ -23,9 +23,8 @@ from . import real, views
 from .benchmark.measurement import measure_drive, metrics
 from .benchmark.roads import QUICK, ScalingSettings, make_drives
 from .benchmark.scaling import measure_scaling, scaling_figures
-from .experiment.cells import ESTIMATORS as ESTIMATOR_ROOMS
-from .experiment.cells import code_digest
 from .experiment.faults import at_strength, kinds, only, suite
+from .experiment.provenance import sources_digest
 from .experiment.run import run_study
 from .experiment.study import Baseline, Study, find_study, read_study
 from .experiment.tables import TextTable
@@ -282,10 +281,6 @@ def read_figures(file: Path) -> Tables:
         return {name: MeasuredTable.from_json(table) for name, table in content["tables"].items()}
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(file, f"expected {FORMAT}: {error}") from error
-
-
-def sources_digest() -> str:
-    return code_digest(ESTIMATOR_ROOMS)
 
 
 def render_pages(root: Path, tables: Tables) -> dict[Path, str]:

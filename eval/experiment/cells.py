@@ -6,8 +6,7 @@ import time
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache, cached_property
-from importlib.util import find_spec
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Generic, Self, TypeVar
 
@@ -18,10 +17,11 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.eval.metrics.measures import Row, measure
 from pathspace_graph.eval.metrics.metric import METRICS
-from pathspace_graph.eval.metrics.summary import has_cones, lap_times, versions
+from pathspace_graph.eval.metrics.summary import has_cones, lap_times
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
 from pathspace_graph.io.files import to_plain, write_json
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.parsing import read_json
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.plausibility.diagnosis import diagnose
@@ -33,15 +33,11 @@ from pathspace_graph.sim.track import EVENTS, Track
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import generate_track
 
+from .provenance import Code, check_code, made
+
 TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
-ESTIMATORS: Final = (  # rooms on whose sources an estimate on a simulated log depends
-    *("baselines", "batch", "factors", "front_end", "graph", "loop", "mapping", "online"),
-    *("scale", "settings", "sim", "spline"),
-)
-# rooms on whose sources the metrics of a run depend
-MEASURED: Final = (*ESTIMATORS, "health", "laps", "run", "plausibility", "eval.metrics")
 CELLS: Final = "cells"  # folder of the kept cells
-FORMAT: Final = "pathspace-cell/3"
+FORMAT: Final = "pathspace-cell/4"
 DIGEST: Final = "digest"  # key of a record's digest in its file
 RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
 ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
@@ -95,19 +91,6 @@ class Drive:
 def identity(**parts: Any) -> str:
     """Return a text that is the same for the same values, which are JSON's types only."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:20]
-
-
-@cache
-def code_digest(rooms: tuple[str, ...]) -> str:
-    """Return the digest of the sources of rooms of this package."""
-    digest = hashlib.sha256()
-    for room in rooms:
-        spec = find_spec(f"pathspace_graph.{room}")
-        origin = Path(str(spec.origin if spec else None))
-        inside = [*origin.parent.glob("*.py"), *origin.parent.glob("*.cpp")]
-        for file in sorted(inside) if origin.name == "__init__.py" else [origin]:
-            digest.update(f"{room}/{file.name}".encode() + file.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:
@@ -175,13 +158,23 @@ class Cell(Generic[D]):
     settings: MapperSettings
     variant: str | None = None  # name of the settings, where there are several
     measured: Mapping[str, Any] = field(default_factory=dict)  # keyword arguments of `measure`
+    parameters: Any = None  # the estimator's own, a frozen dataclass; None where it has none
+    code: Code = field(default_factory=dict)  # with which the study began
+    began: str = ""  # the process in which it did
+
+    @cached_property
+    def meaning(self) -> str:
+        """Identity of everything that the result depends on, except the code."""
+        known = leaves(self.settings).items()
+        settings = {name: value for name, value in known if registry.reads(self.estimator, name)}
+        own = None if self.parameters is None else to_plain(asdict(self.parameters))
+        parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": settings, "own": own}
+        return identity(**parts, reference_limits=self.measured.get("reference_limits", False))
 
     @cached_property
     def id(self) -> str:
-        """Identity of everything that the result depends on, also the code."""
-        reference_limits, code = self.measured.get("reference_limits", False), code_digest(MEASURED)
-        parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": asdict(self.settings)}
-        return identity(**parts, reference_limits=reference_limits, code=code)
+        """Identity of everything that the result depends on: cells of one id have one result."""
+        return f"{self.meaning}-{identity(**self.code)[:12]}"
 
     @property
     def names(self) -> dict[str, Any]:
@@ -212,24 +205,26 @@ def run_cell(cell: Cell[Any]) -> Outcome:
         with threadpool_limits(limits=1):
             log = cell.drive.load()
             begin = time.perf_counter()
-            result = run_estimator(cell.estimator, cell.settings, log)
+            result = run_estimator(cell.estimator, cell.settings, log, cell.parameters)
             seconds = time.perf_counter() - begin - result.observing
             return Outcome(cell.names, measure(result, log, seconds, **cell.measured), result)
     except Exception as error:  # whatever ends a run belongs into the results
         return Outcome.failed(cell, error)
 
 
-def run_estimator(name: str, settings: MapperSettings, log: Log) -> RunResult:
+def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> RunResult:
     """Run an online estimator, with its reach and its map at the end of each true lap, or a batch one."""
     if name not in registry.ONLINE:
-        return registry.make_batch(name, settings, log).solve(log)
-    estimator, truth = registry.make_online(name, settings, log), log.truth
+        return registry.make_batch(name, settings, log, parameters).solve(log)
+    estimator, truth = registry.make_online(name, settings, log, parameters), log.truth
     observers = [ReachObserver(truth)] if has_cones(truth) and len(truth.poses) else []
     result = run_online(log, estimator, name=name, snapshot_times=lap_times(log), observers=observers)
     return replace(result, reach=observers[0].rows) if observers else result
 
 
 def record_cell(cell: Cell[Drive]) -> Record:
+    """Run a cell in whatever process; a SettingsError where that has other code than the study."""
+    check_code(cell.estimator, cell.code, cell.began)
     return record_of(cell, run_cell(cell))
 
 
@@ -238,7 +233,7 @@ def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
     if run is not None:
         said += [record.notice for record in run.cycles if record.notice]
         said += [] if run.vehicle is None else diagnose(run.vehicle, run.settings, run.scale)
-    record: Record = {"format": FORMAT, "id": cell.id, "cell": cell.names, "versions": versions()}
+    record: Record = {"format": FORMAT, "id": cell.id, "cell": cell.names, "made": made(cell.estimator)}
     record |= {"failure": outcome.failure, "traceback": outcome.trace}
     record |= {"notices": "; ".join(dict.fromkeys(said)), "laps": lap_rows(outcome.rows)}
     return dict(to_plain(record))
@@ -270,6 +265,13 @@ def read_record(folder: Path, cell: Cell[Drive]) -> Record | None:
 def write_record(folder: Path, cell: Cell[Drive], record: Record) -> None:
     """Write the record as a file of its own, whole or not at all."""
     write_json(_file(folder, cell), {**record, DIGEST: identity(record=record)}, indent=1)
+
+
+def of_other_code(folder: Path, cells: Iterable[Cell[Any]]) -> int:
+    """Return the number of kept cells that mean the same as one of these and are of other code."""
+    kept = {tuple(file.stem.split("-")) for file in (folder / CELLS).glob("[!.]*-*.json")}
+    known = {cell.meaning: tuple(cell.id.split("-")) for cell in cells}
+    return sum(known.get(one[0], one) != one for one in kept)
 
 
 def _file(folder: Path, cell: Cell[Drive]) -> Path:

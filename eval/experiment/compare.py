@@ -28,7 +28,6 @@ from .cells import Cell, NamedLog, Outcome, run_cell
 from .frame import add_batch, difference, write_csv
 from .plots import blind_spot_figure, plot_maps
 from .run import OnCell, run_cells
-from .study import known_estimators
 from .tables import TextTable, group_starts
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
@@ -101,7 +100,7 @@ def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedL
 
 def choose(names: Sequence[str]) -> tuple[str, ...]:
     """Return estimators by name, or all that are known if none is named; SettingsError if one is unknown."""
-    known = known_estimators()
+    known = registry.known_estimators()
     for name in names:
         check_name(name, known, "--estimators: expected a known estimator")
     return tuple(dict.fromkeys(names or known))

@@ -25,6 +25,7 @@ COMBINATION: Final = ("noise", "estimator", "variant")  # columns of a combinati
 RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on the same drive and noise
 RUN_OF: Final = (*RUN, *COMBINATION)
 TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)  # wall times
+MADE: Final = ("commit", "host", "processor", "blas", "date", "command")  # where and when a run was made
 LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
 
 
@@ -34,11 +35,12 @@ def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -
     for cell, record in cells:
         assert record is not None, "every cell has been run by now"
         shared = {"study": study.name} | cell.names | _settings_row(study, cell)
-        about = {"failure": record["failure"], "notices": record["notices"], **record["versions"]}
+        about = {"failure": record["failure"], "notices": record["notices"], **record["made"]}
+        about["cell"] = cell.id
         rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
     add_batch(rows, (*RUN, "noise", "variant"))
     settings = _settings_row(study, cells[0][0])
-    order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions()]
+    order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions(), "cell"]
     known = dict.fromkeys([*order, *(name for row in rows for name in row)])
     frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
     return frame.astype({"lap": "Int64"})
@@ -58,21 +60,25 @@ def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
 
 
 def _settings_row(study: Study, cell: Cell[Drive]) -> dict[str, Any]:
+    """Return the varied settings of a cell; one that its estimator does not have is None."""
     settings, simulation = leaves(cell.settings), leaves(cell.drive.simulation)
+    if cell.parameters is not None:
+        settings |= {f"{cell.estimator}.{name}": value for name, value in leaves(cell.parameters).items()}
     row = {f"simulation.{name}": simulation[name] for name in study.varied_noise}
     own = {"study", *RUN_OF}
-    row |= {f"settings.{name}" if name in own else name: settings[name] for name in study.varied}
+    row |= {f"settings.{name}" if name in own else name: settings.get(name) for name in study.varied}
     return {name: " ".join(map(str, v)) if isinstance(v, tuple) else v for name, v in row.items()}
 
 
 def without_times(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the columns that are the same whenever the study is run."""
-    return frame.drop(columns=[*TIMES], errors="ignore")
+    return frame.drop(columns=[*TIMES, *MADE], errors="ignore")
 
 
 def write_results(frame: pd.DataFrame, out: Path) -> None:
+    """Write the results, and apart from them how long they took, and where and when they were made."""
     write_csv(out / "results.csv", without_times(frame))
-    times = [name for name in TIMES if name in frame]
+    times = [name for name in (*TIMES, *MADE) if name in frame]
     write_csv(out / "times.csv", frame[["study", *RUN_OF, "lap", *times]])
 
 

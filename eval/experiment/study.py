@@ -22,9 +22,12 @@ ALL: Final = "all"  # name that stands for all known estimators
 _LISTS: Final = ("tracks", "seeds", "estimators", "metrics", "columns")
 
 
-def known_estimators() -> list[str]:
-    """Return the name of every estimator, online ones first."""
-    return [*registry.ONLINE, *registry.BATCH]
+@dataclass(frozen=True)
+class Variant:
+    """What one variant runs: the settings, and the own parameters of the estimators that have any."""
+
+    settings: MapperSettings
+    parameters: tuple[tuple[str, Any], ...] = ()  # pairs of an estimator and its frozen dataclass
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,8 @@ class Study:
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
     """Overrides of the simulation by the name of a noise."""
     variants: Mapping[str, Overrides] = field(default_factory=dict)
-    """Overrides of the settings by the name of a variant; `default` is always there."""
+    """Overrides of the settings by the name of a variant; `default` is always there. `NAME.field` is of the
+    own parameters of an estimator."""
     grids: tuple[Mapping[str, Sequence[Any]], ...] = ()
     """Values by dotted field; every combination is a variant with a name such as `lag=1, steps=2`."""
     baseline: Baseline = field(default_factory=Baseline)
@@ -72,7 +76,7 @@ class Study:
         tracks = tuple(Path(track) if isinstance(track, str) else track for track in self.tracks)
         object.__setattr__(self, "tracks", tracks)
         if self.estimators == (ALL,):
-            object.__setattr__(self, "estimators", tuple(known_estimators()))
+            object.__setattr__(self, "estimators", tuple(registry.known_estimators()))
         self._check_lists()
         if not isinstance(self.reference_limits, bool):
             raise SettingsError(
@@ -103,7 +107,7 @@ class Study:
                 if type(value) is not int or value < 0:
                     raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
         for name in self.estimators:
-            check_name(name, known_estimators(), "estimators: expected a known estimator")
+            check_name(name, registry.known_estimators(), "estimators: expected a known estimator")
         for name in self.metrics:
             check_name(name, METRICS, "metrics: expected a known metric")
         for column in self.columns:
@@ -117,17 +121,17 @@ class Study:
         return replace(override(preset(chosen), overrides, f"noise.{noise}"), laps=self.laps)
 
     @property
-    def points(self) -> dict[str, MapperSettings]:
-        """Settings to run by name; of variants with equal settings the first."""
+    def points(self) -> dict[str, Variant]:
+        """Variants to run by name; of those that are equal the first."""
         named = [*self._named().items()]
-        first = {settings: name for name, settings in reversed(named)}
-        return {name: settings for name, settings in named if first[settings] == name}
+        first = {variant: name for name, variant in reversed(named)}
+        return {name: variant for name, variant in named if first[variant] == name}
 
     @property
     def baseline_variant(self) -> str:
         """Name of the baseline among `points`."""
         wanted = self._named()[self.baseline.variant]
-        return next(name for name, settings in self.points.items() if settings == wanted)
+        return next(name for name, variant in self.points.items() if variant == wanted)
 
     @property
     def varied(self) -> tuple[str, ...]:
@@ -141,14 +145,25 @@ class Study:
         names = dict.fromkeys(name for overrides in self.noise.values() for name in overrides)
         return tuple(name for name in names if not name.endswith(f".{PRESET}"))
 
-    def _named(self) -> dict[str, MapperSettings]:
-        points = {DEFAULT: MapperSettings()}
+    def _named(self) -> dict[str, Variant]:
+        points = {DEFAULT: self._variant({}, "")}
         for name, overrides in self.variants.items():
-            points[name] = override(MapperSettings(), overrides, f"variants.{name}")
+            points[name] = self._variant(overrides, f"variants.{name}")
         for grid in self.grids:
             for name, overrides in _grid(grid).items():
-                points[name] = override(MapperSettings(), overrides, "grid")
+                points[name] = self._variant(overrides, "grid")
         return points
+
+    def _variant(self, overrides: Overrides, where: str) -> Variant:
+        """Return settings and parameters with overrides; those of `NAME.field` are of an estimator's own."""
+        parameters, rest = [], dict(overrides)
+        for name in self.estimators:
+            default = registry.parameters_of(name)
+            if default is not None:
+                of = [key for key in rest if key.startswith(f"{name}.")]
+                own = {key.removeprefix(f"{name}."): rest.pop(key) for key in of}
+                parameters.append((name, override(default, own, f"{where}.{name}")))
+        return Variant(override(MapperSettings(), rest, where), tuple(parameters))
 
 
 def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:

@@ -1,7 +1,5 @@
 """`ablate`, `faults`, `scale` and `report`: studies over many logs, in parallel and resumable."""
 
-import shutil
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -17,7 +15,9 @@ from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online
 from pathspace_graph.eval.benchmark import scaling as timing
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import measure_scaling
+from pathspace_graph.eval.experiment.cells import of_other_code
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
+from pathspace_graph.eval.experiment.provenance import commit_of
 from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study
 from pathspace_graph.eval.experiment.tables import write_study
@@ -53,7 +53,7 @@ class StudyCommand:
         check_jobs(self.jobs)
         study = with_drives(study, self.tracks, self.seeds, self.laps)
         plan = make_plan(study)
-        if stale := plan.stale(self.out):
+        if stale := of_other_code(self.out, plan.cells):
             note(f"{stale} runs in {self.out} are of other code, and are not used")
         with progress("runs", lines=LINES) as advance:
             how: dict[str, Any] = {"cluster": self.cluster, "retry_failed": self.retry_failed}
@@ -193,12 +193,3 @@ class Report:
             written += [self.pages / FIGURES, *pages]
         say(*(f"{name}\n{table.markdown(table.sources)}".rstrip("\n") for name, table in tables.items()))
         say(f"\nwritten to {', '.join(map(str, written))}")
-
-
-def commit_of(root: Path | None) -> str:
-    """Return the short hash of the commit that is checked out at a root; empty where there is none."""
-    git = shutil.which("git")
-    if git is None or root is None:
-        return ""
-    command = [git, "-C", str(root), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

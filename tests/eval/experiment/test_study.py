@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.estimators import known_estimators
 from pathspace_graph.eval.experiment.cells import load_tracks
 from pathspace_graph.eval.experiment.run import make_plan
 from pathspace_graph.eval.experiment.study import (
@@ -17,7 +18,6 @@ from pathspace_graph.eval.experiment.study import (
     Baseline,
     Study,
     find_study,
-    known_estimators,
     read_study,
     shipped_studies,
     study_from,
@@ -71,9 +71,9 @@ def test_a_whole_study_is_read() -> None:
     assert read.simulation("quiet").odometry.white == (0.1, 0.1, 0.01)
     assert read.simulation("quiet").laps == 2
     assert read.simulation("loud").sensor.bearing_sigma == 1.0
-    assert read.points["soft"].gate.huber == float("inf")
-    assert read.points["lag=1, spline.degree=2"].lag == 1.0
-    assert read.points["lag=1, spline.degree=2"].spline.degree == 2
+    assert read.points["soft"].settings.gate.huber == float("inf")
+    assert read.points["lag=1, spline.degree=2"].settings.lag == 1.0
+    assert read.points["lag=1, spline.degree=2"].settings.spline.degree == 2
     assert read.varied == ("gate.huber", "gauge.sigma_spacing", "lag", "spline.degree", "steps")
     assert read.varied_noise == ("odometry.white", "sensor.bearing_sigma")
 
