@@ -5,7 +5,7 @@ The order of a cycle is that of the paper: predict, classify, expand, update, an
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import ClassVar, Self
 
 import gtsam
 
@@ -37,9 +37,11 @@ class Road:
     `copy` returns a road that goes on independently: it is what a failed cycle goes back to.
     """
 
+    SMOOTHER: ClassVar = CurveSmoother  # class of its window and prior
+
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self.smoother = CurveSmoother(settings)
+        self.smoother: CurveSmoother = self.SMOOTHER(settings)
         """Variables, factors of the window, and the prior."""
         self.path = DrivenPath()
         self.growth = Growth(settings.growth)

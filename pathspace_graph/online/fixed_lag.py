@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import gtsam
 import numpy as np
@@ -54,6 +54,9 @@ class FixedLagMapper(MapperEstimate):
     twist (m/s, m/s, rad/s).
     """
 
+    ROAD: ClassVar = Road  # class of what is estimated
+    FIRST_PHASE: ClassVar = Open  # class of the phase that a drive begins with
+
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
@@ -63,9 +66,9 @@ class FixedLagMapper(MapperEstimate):
         noise = known_noise(odometry_sigma, self.scale)
         self.failures = 0  # number of updates that have failed
         self.front_end = FrontEnd(self.settings, noise, self.scale)
-        self.road = Road(self.settings)
+        self.road: Road = self.ROAD(self.settings)
         self.drive = Drive(self.settings)
-        self.phase: Phase = Open(self.settings)
+        self.phase: Phase = self.FIRST_PHASE(self.settings)
         self.health = Health()  # how far the newest estimate can be trusted
         self._unused: Odometry | None = None  # twists of a cycle that was left out
         if self.settings.open_lap.prior == "window":
