@@ -25,9 +25,10 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
 from .cells import Cell, NamedLog, Outcome, run_cell
-from .frame import add_batch, difference, write_csv
+from .frame import add_batch, write_csv
 from .plots import blind_spot_figure, plot_maps
 from .run import OnCell, run_cells
+from .statistics import difference
 from .tables import TextTable, group_starts
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized

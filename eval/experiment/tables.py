@@ -17,7 +17,8 @@ from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, figure_c
 from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, Metric, column_of
 from pathspace_graph.io.files import write_text
 
-from .frame import COMBINATION, LEVEL, RUN, RUN_OF, Contrast, Estimate, contrasts, last_laps, write_results
+from .frame import COMBINATION, RUN, RUN_OF, Contrast, contrasts, last_laps, write_results
+from .statistics import FEWEST, LEVEL, Estimate
 from .study import Study
 
 MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
@@ -103,12 +104,15 @@ def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
             names = (getattr(contrast, name) for name in several)
             value, difference = contrast.value, contrast.difference
             by = ("baseline", "") if difference is None else _figures(metric, difference, "+")
-            p = "" if np.isnan(contrast.p) else f"{contrast.p:.3f}" if contrast.p >= 0.001 else "<0.001"
-            mark = "*" if contrast.significant else ""
-            rows.append((*names, str(value.count), *_figures(metric, value), *by, p, mark))
-        header = (*several, "runs", "mean", "95 %", "difference", "95 %", "p", "")
+            tested = (_p(contrast.p), _p(contrast.wilcoxon), "*" if contrast.significant else "")
+            rows.append((*names, str(contrast.runs), *_figures(metric, value), *by, *tested))
+        header = (*several, "runs", "mean", "95 %", "difference", "95 %", "p", "Wilcoxon", "")
         tables.append(TextTable(metric.heading, header, tuple(rows), names=len(several)))
     return tables
+
+
+def _p(p: float) -> str:
+    return "" if np.isnan(p) else f"{p:.3f}" if p >= 0.001 else "<0.001"
 
 
 def caption(study: Study, frame: pd.DataFrame) -> str:
@@ -116,12 +120,16 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
     base = study.baseline
     against = f"{base.estimator}: {study.baseline_variant}" if base.estimator else study.baseline_variant
     runs = frame.groupby(list(RUN_OF), sort=False)["failure"].first()
+    tracks = frame["track"].nunique()
+    over = f"{tracks} tracks, each the mean of its drives" if tracks > 1 else "the drives of one track"
+    interval = "bootstrap-t" if tracks >= FEWEST else "Student's t"
     return (
         f"{study.name}: {study.question} "
         f"{len(runs)} runs ({int((runs != '').sum())} failed) of {study.laps} laps, at the end of the last. "
-        f"Mean and {100 * LEVEL:g} % interval (Student's t) over track x seed; difference from {against} "
-        f"paired over track and seed; p of the paired t-test, corrected by Holm's method over all "
-        f"comparisons of the metric; * where p < {1 - LEVEL:.2f}."
+        f"Mean and {100 * LEVEL:g} % interval ({interval}) over {over}; difference from {against} in the "
+        f"same drives; p of the paired t-test over them, corrected by Holm's method over all comparisons of "
+        f"the metric that differ at all, and p of Wilcoxon's signed-rank test, not corrected; * where p < "
+        f"{1 - LEVEL:.2f}. Wall times are not tested."
     )
 
 
