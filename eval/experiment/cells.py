@@ -19,15 +19,25 @@ from pathspace_graph.eval.metrics.measures import Row, measure
 from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
-from pathspace_graph.io.files import to_plain, write_json
-from pathspace_graph.io.log import Log
+from pathspace_graph.io.files import is_temporary, to_plain, write_json
+from pathspace_graph.io.log import (
+    DETECTIONS_FILE,
+    LOG_FILE,
+    ODOMETRY_FILE,
+    TRUTH_ASSOCIATIONS_FILE,
+    TRUTH_CONES_FILE,
+    TRUTH_POSES_FILE,
+    Log,
+)
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.parsing import read_json
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import EVENTS, Track
 from pathspace_graph.sim.track_files import read_track
@@ -38,6 +48,11 @@ from .provenance import Code, check_code, made
 TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
 CELLS: Final = "cells"  # folder of the kept cells
 FORMAT: Final = "pathspace-cell/4"
+LOG_FILES: Final = (  # of a log, all that an estimate or a metric of it depends on
+    *(LOG_FILE, ODOMETRY_FILE, DETECTIONS_FILE),
+    *(TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE),
+)
+RECORDED: Final = "recorded"  # noise of a drive that was not simulated
 DIGEST: Final = "digest"  # key of a record's digest in its file
 RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
 ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
@@ -69,6 +84,11 @@ class Drive:
     def names(self) -> dict[str, Any]:
         return {"track": self.track.name, "seed": self.seed, "noise": self.noise}
 
+    @property
+    def source(self) -> str:
+        """Seed with which `simulate` makes the same log of this track and noise."""
+        return str(self.own_seed)
+
     @cached_property
     def own_seed(self) -> int:
         """Seed of the simulation: drives of one seed on several tracks are independent samples."""
@@ -86,6 +106,54 @@ class Drive:
             _latest.clear()
             _latest[self.id] = simulate(self.track, self.simulation, self.own_seed)
         return _latest[self.id]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedDrive:
+    """A log in a folder, one of those that were driven on a track."""
+
+    track: str
+    seed: int  # number of the log on its track
+    folder: Path
+
+    @property
+    def names(self) -> dict[str, Any]:
+        return {"track": self.track, "seed": self.seed, "noise": RECORDED}
+
+    @property
+    def source(self) -> str:
+        """Name of the log."""
+        return self.folder.resolve().name
+
+    @property
+    def simulation(self) -> None:
+        return None
+
+    @cached_property
+    def id(self) -> str:
+        """Identity of what is in the files of the log."""
+        digest = hashlib.sha256()
+        for name in LOG_FILES:
+            file = self.folder / name
+            digest.update(name.encode() + (file.read_bytes() if file.exists() else b""))
+        return digest.hexdigest()[:20]
+
+    def load(self) -> Log:
+        if self.id not in _latest:
+            _latest.clear()
+            _latest[self.id] = read_plausible_log(self.folder, LimitSettings())[0]
+        return _latest[self.id]
+
+
+def log_folders(folder: Path) -> dict[str, Path]:
+    """Return a log's folder by its name, or those in a folder of logs; InputError if there is none."""
+    folders = {folder.resolve().name: folder}
+    if not (folder / LOG_FILE).exists():
+        entries = sorted(folder.iterdir()) if folder.is_dir() else []
+        folders = {e.name: e for e in entries if not is_temporary(e.name) and (e / LOG_FILE).is_file()}
+    if not folders:
+        raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
+    return folders
 
 
 def identity(**parts: Any) -> str:
@@ -146,7 +214,8 @@ class NamedLog:
         return self.log
 
 
-D = TypeVar("D", Drive, NamedLog)
+AnyDrive = Drive | RecordedDrive
+D = TypeVar("D", AnyDrive, NamedLog)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,13 +291,13 @@ def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any
     return replace(result, reach=observers[0].rows) if observers else result
 
 
-def record_cell(cell: Cell[Drive]) -> Record:
+def record_cell(cell: Cell[AnyDrive]) -> Record:
     """Run a cell in whatever process; a SettingsError where that has other code than the study."""
     check_code(cell.estimator, cell.code, cell.began)
     return record_of(cell, run_cell(cell))
 
 
-def record_of(cell: Cell[Drive], outcome: Outcome) -> Record:
+def record_of(cell: Cell[AnyDrive], outcome: Outcome) -> Record:
     run, said = outcome.result, list[str]()
     if run is not None:
         said += [record.notice for record in run.cycles if record.notice]
@@ -251,7 +320,7 @@ def lap_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return [{"lap": row.lap, **row.values, **shared} for row in laps] or [{"lap": 1, **whole.values}]
 
 
-def read_record(folder: Path, cell: Cell[Drive]) -> Record | None:
+def read_record(folder: Path, cell: Cell[AnyDrive]) -> Record | None:
     """Return the cell's record in a study's folder, or None if there is none that is as it was written."""
     try:
         record = read_json(_file(folder, cell), "a cell")
@@ -262,7 +331,7 @@ def read_record(folder: Path, cell: Cell[Drive]) -> Record | None:
     return record if (record.get("format"), record.get("id")) == (FORMAT, cell.id) else None
 
 
-def write_record(folder: Path, cell: Cell[Drive], record: Record) -> None:
+def write_record(folder: Path, cell: Cell[AnyDrive], record: Record) -> None:
     """Write the record as a file of its own, whole or not at all."""
     write_json(_file(folder, cell), {**record, DIGEST: identity(record=record)}, indent=1)
 
@@ -274,5 +343,5 @@ def of_other_code(folder: Path, cells: Iterable[Cell[Any]]) -> int:
     return sum(known.get(one[0], one) != one for one in kept)
 
 
-def _file(folder: Path, cell: Cell[Drive]) -> Path:
+def _file(folder: Path, cell: Cell[AnyDrive]) -> Path:
     return folder / CELLS / f"{cell.id}.json"

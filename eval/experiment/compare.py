@@ -11,20 +11,19 @@ import numpy as np
 import pandas as pd
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.errors import InputError, check_name
+from pathspace_graph.errors import check_name
 from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
 from pathspace_graph.eval.metrics.measures import online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.summary import has_cones, summarize, versions
-from pathspace_graph.io.files import atomic_folder, is_temporary, write_json, write_text
-from pathspace_graph.io.log import LOG_FILE
+from pathspace_graph.io.files import atomic_folder, write_json, write_text
 from pathspace_graph.io.results import BatchRun, write_result
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
-from .cells import Cell, NamedLog, Outcome, run_cell
+from .cells import Cell, NamedLog, Outcome, log_folders, run_cell
 from .frame import add_batch, write_csv
 from .plots import blind_spot_figure, plot_maps
 from .run import OnCell, run_cells
@@ -89,12 +88,7 @@ class Comparison:
 
 def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedLog, ...]:
     """Return the log of a log folder, or those of a folder of log folders; InputError if it is neither."""
-    folders = {folder.resolve().name: folder}
-    if folder.is_dir() and not (folder / LOG_FILE).exists():
-        entries = sorted(entry for entry in folder.iterdir() if not is_temporary(entry.name))
-        folders = {entry.name: entry for entry in entries if (entry / LOG_FILE).is_file()}
-    if not folders:
-        raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
+    folders = log_folders(folder)
     read = {name: read_plausible_log(entry, limits or LimitSettings()) for name, entry in folders.items()}
     return tuple(NamedLog(name, log, tuple(hints)) for name, (log, hints) in read.items())
 

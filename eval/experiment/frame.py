@@ -15,7 +15,7 @@ from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import replacing
 from pathspace_graph.io.overrides import leaves
 
-from .cells import Cell, Drive, Record
+from .cells import AnyDrive, Cell, Record
 from .statistics import LEVEL, Estimate, by_track, estimate, holm, paired_p, wilcoxon_p
 from .study import Study
 
@@ -26,18 +26,18 @@ TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)  # w
 MADE: Final = ("commit", "host", "processor", "blas", "date", "command")  # where and when a run was made
 
 
-def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -> pd.DataFrame:
+def frame_of(study: Study, cells: Sequence[tuple[Cell[AnyDrive], Record | None]]) -> pd.DataFrame:
     """Return a row for each run and lap, or one for a failed run; every varied setting is a column."""
     rows = []
     for cell, record in cells:
         assert record is not None, "every cell has been run by now"
         shared = {"study": study.name} | cell.names | _settings_row(study, cell)
         about = {"failure": record["failure"], "notices": record["notices"], **record["made"]}
-        about["cell"] = cell.id
+        about |= {"drive": cell.drive.source, "cell": cell.id}
         rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
     add_batch(rows, (*RUN, "noise", "variant"))
     settings = _settings_row(study, cells[0][0])
-    order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions(), "cell"]
+    order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions(), "drive", "cell"]
     known = dict.fromkeys([*order, *(name for row in rows for name in row)])
     frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
     return frame.astype({"lap": "Int64"})
@@ -56,12 +56,13 @@ def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
             row["rmse_by_batch"] = float(row["rmse"] / batch["rmse"])
 
 
-def _settings_row(study: Study, cell: Cell[Drive]) -> dict[str, Any]:
+def _settings_row(study: Study, cell: Cell[AnyDrive]) -> dict[str, Any]:
     """Return the varied settings of a cell; one that its estimator does not have is None."""
-    settings, simulation = leaves(cell.settings), leaves(cell.drive.simulation)
+    settings, simulated = leaves(cell.settings), cell.drive.simulation
+    simulation = {} if simulated is None else leaves(simulated)
     if cell.parameters is not None:
         settings |= {f"{cell.estimator}.{name}": value for name, value in leaves(cell.parameters).items()}
-    row = {f"simulation.{name}": simulation[name] for name in study.varied_noise}
+    row = {f"simulation.{name}": simulation.get(name) for name in study.varied_noise}
     own = {"study", *RUN_OF}
     row |= {f"settings.{name}" if name in own else name: settings.get(name) for name in study.varied}
     return {name: " ".join(map(str, v)) if isinstance(v, tuple) else v for name, v in row.items()}
@@ -122,7 +123,7 @@ def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
     runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
     nothing = pd.Series(dtype=float, index=pd.MultiIndex.from_arrays([[], []], names=RUN))
     contrasted = []
-    for key in product(study.noise, study.estimators, study.points):
+    for key in product(study.noises, study.estimators, study.points):
         base = (key[0], study.baseline.estimator or key[1], study.baseline_variant)
         values, against = runs.get(key, nothing), runs.get(base, nothing)
         contrast = Contrast(*key, metric, len(values), estimate(by_track(values).to_numpy()), None)

@@ -22,7 +22,7 @@ from pathspace_graph.loop.worker import end_with
 from pathspace_graph.sim.track import Track
 
 from . import cells as store
-from .cells import Cell, Drive, Outcome, Record, load_tracks, track_digest
+from .cells import AnyDrive, Cell, Drive, Outcome, Record, RecordedDrive, load_tracks, track_digest
 from .frame import frame_of
 from .provenance import code_of, here
 from .study import Study
@@ -83,7 +83,7 @@ class Plan:
 
     study: Study
     tracks: tuple[Track, ...]
-    cells: tuple[Cell[Drive], ...]
+    cells: tuple[Cell[AnyDrive], ...]
 
     def resolved(self) -> dict[str, Any]:
         """Return the content of `study.json`: the study with every default written out."""
@@ -93,6 +93,7 @@ class Plan:
             "format": FORMAT,
             **{name: getattr(study, name) for name in same},
             "tracks": [{"name": track.name, "digest": track_digest(track)} for track in self.tracks],
+            "logs": {track: [folder.name for folder in folders] for track, folders in study.logs.items()},
             "noise": {name: asdict(study.simulation(name)) for name in study.noise},
             "variants": {name: asdict(variant.settings) for name, variant in study.points.items()},
             "parameters": {
@@ -115,7 +116,12 @@ def make_plan(study: Study) -> Plan:
         registry.check_estimator(name, variant.settings, dict(variant.parameters).get(name))
     code, began = {name: code_of(name) for name in study.estimators}, here()
     measured = {"marginals": True, "reference_limits": study.reference_limits, "whole": False}
-    drives = product(study.noise, tracks, study.seeds)
+    drives: list[AnyDrive] = [
+        Drive(track, seed, noise, study.simulation(noise))
+        for noise, track, seed in product(study.noise, tracks, study.seeds)
+    ]
+    for track, folders in study.logs.items():
+        drives += [RecordedDrive(track, number, folder) for number, folder in enumerate(folders)]
     cells = tuple(
         Cell(
             *(drive, estimator, variant.settings, name, measured),
@@ -123,7 +129,7 @@ def make_plan(study: Study) -> Plan:
             code=code[estimator],
             began=began,
         )
-        for drive in (Drive(track, seed, noise, study.simulation(noise)) for noise, track, seed in drives)
+        for drive in drives
         for estimator, (name, variant) in product(study.estimators, points.items())
     )
     return Plan(study, tracks, cells)
@@ -147,11 +153,11 @@ def run_plan(plan: Plan, out: Path, *, retry_failed: bool = False, **how: Any) -
     remove_manifest(out)  # of a study that goes on; the last step writes it again
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
-    def kept(cell: Cell[Drive]) -> Record | None:
+    def kept(cell: Cell[AnyDrive]) -> Record | None:
         record = store.read_record(out, cell)
         return None if record is not None and retry_failed and record["failure"] else record
 
-    def write(cell: Cell[Drive], record: Record) -> None:
+    def write(cell: Cell[AnyDrive], record: Record) -> None:
         record["made"]["command"] = command
         store.write_record(out, cell, record)
 

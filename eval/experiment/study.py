@@ -15,6 +15,8 @@ from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_VARIANTS, parse_tom
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
 
+from .cells import RECORDED, log_folders
+
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
 DEFAULT: Final = "default"  # variant that overrides nothing, part of every study
 PRESET: Final = "preset"  # entry of a noise that names a preset, as in `sensor.preset = "camera"`
@@ -43,8 +45,10 @@ class Baseline:
 class Study:
     """Grid of tracks x seeds x noise x estimators x settings, checked when it is made."""
 
-    tracks: tuple[Path | int, ...]
+    tracks: tuple[Path | int, ...] = ()
     """Track files, and seeds of generated tracks."""
+    logs: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
+    """Recorded logs by the name of their track, which are driven beside or instead of simulated ones."""
     seeds: tuple[int, ...] = (0,)
     laps: int = 5
     name: str = "study"
@@ -75,6 +79,8 @@ class Study:
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
         tracks = tuple(Path(track) if isinstance(track, str) else track for track in self.tracks)
         object.__setattr__(self, "tracks", tracks)
+        logs = {track: tuple(map(Path, folders)) for track, folders in self.logs.items()}
+        object.__setattr__(self, "logs", logs)
         if self.estimators == (ALL,):
             object.__setattr__(self, "estimators", tuple(registry.known_estimators()))
         self._check_lists()
@@ -96,9 +102,14 @@ class Study:
             check_name(self.baseline.estimator, self.estimators, expected)
 
     def _check_lists(self) -> None:
+        if not self.tracks and not self.logs:
+            expected = "track files, or seeds of generated tracks"
+            raise SettingsError(f"tracks: expected at least one of {expected}, or drives.logs, found none")
         for name in ("tracks", "seeds", "estimators", "noise", "metrics"):
             values = getattr(self, name)
-            if len(values) == 0 or len({repr(value) for value in values}) != len(values):
+            if (len(values) == 0 and name != "tracks") or len({repr(value) for value in values}) != len(
+                values
+            ):
                 expected = "expected at least one, and none twice"
                 raise SettingsError(f"{name}: {expected}, found {shown(list(values))}")
         generated = [track for track in self.tracks if not isinstance(track, Path)]
@@ -126,6 +137,11 @@ class Study:
         named = [*self._named().items()]
         first = {variant: name for name, variant in reversed(named)}
         return {name: variant for name, variant in named if first[variant] == name}
+
+    @property
+    def noises(self) -> list[str]:
+        """Names of the noises of all drives."""
+        return [*(self.noise if self.tracks else ()), *([RECORDED] if self.logs else [])]
 
     @property
     def baseline_variant(self) -> str:
@@ -208,17 +224,18 @@ def read_study(file: Path | str) -> Study:
 
 
 def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Study:
-    known = ["grid" if entry.name == "grids" else entry.name for entry in fields(Study)]
+    renamed = {"grids": "grid", "logs": "drives"}
+    known = [renamed.get(entry.name, entry.name) for entry in fields(Study)]
     for key in content:
         check_name(key, known, "expected a known key")
     values: dict[str, Any] = {"name": name} | dict(content)
-    if "tracks" not in values:
-        raise SettingsError("tracks: expected track files, or seeds of generated tracks, found none")
     for key in (key for key in _LISTS if key in values):
         values[key] = (ALL,) if values[key] == ALL else tuple(_typed(key, values[key], list))
     for key in ("name", "question"):
         _typed(key, values.get(key, ""), str)
-    values["tracks"] = tuple(folder / t if isinstance(t, str) else t for t in values["tracks"])
+    values["tracks"] = tuple(folder / t if isinstance(t, str) else t for t in values.get("tracks", ()))
+    if "drives" in values:
+        values["logs"] = _logs(_typed("drives", values.pop("drives"), Mapping), folder)
     for key in (key for key in ("noise", "variants") if key in values):
         tables = _typed(key, values[key], Mapping).items()
         values[key] = {k: flatten(_typed(f"{key}.{k}", v, Mapping)) for k, v in tables}
@@ -232,6 +249,21 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
             _typed(f"baseline.{key}", value, str)
         values["baseline"] = Baseline(**values["baseline"])
     return Study(**values)
+
+
+def _logs(drives: Mapping[str, Any], folder: Path) -> dict[str, tuple[Path, ...]]:
+    """Return logs by their track: from a list, each of a track of its own, or from a table of lists."""
+    for key in drives:
+        check_name(key, ("logs",), "drives: expected a known key")
+    logs = drives.get("logs", [])
+    if isinstance(logs, Mapping):
+        return {track: _paths(f"drives.logs.{track}", own, folder) for track, own in logs.items()}
+    return {path.name: (path,) for path in _paths("drives.logs", logs, folder)}
+
+
+def _paths(key: str, values: Any, folder: Path) -> tuple[Path, ...]:
+    every = [folder / _typed(key, value, str) for value in _typed(key, values, list)]
+    return tuple(path for given in every for path in log_folders(given).values())
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:

@@ -247,7 +247,7 @@ def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
 def _name(study: Study, contrast: Contrast) -> str:
     """Return the names of a combination that others have differently, `sigma_spacing=1` for
     `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
-    counts = {"noise": study.noise, "estimator": study.estimators, "variant": study.points}
+    counts = {"noise": study.noises, "estimator": study.estimators, "variant": study.points}
     several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
     name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
     last = {field: field.rpartition(".")[2] for field in study.varied}

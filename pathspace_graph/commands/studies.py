@@ -15,7 +15,7 @@ from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online
 from pathspace_graph.eval.benchmark import scaling as timing
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import measure_scaling
-from pathspace_graph.eval.experiment.cells import of_other_code
+from pathspace_graph.eval.experiment.cells import log_folders, of_other_code
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
 from pathspace_graph.eval.experiment.provenance import commit_of
 from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
@@ -43,6 +43,8 @@ class StudyCommand:
     """Run again what failed before."""
     tracks: tuple[str, ...] = ()
     """Track files, and seeds of generated tracks, in place of the study's own."""
+    logs: tuple[Path, ...] = ()
+    """Recorded logs, or folders of them, in place of the study's own drives, each of a track of its own."""
     seeds: tuple[int, ...] = ()
     """Seeds in place of the study's own."""
     laps: int | None = None
@@ -51,7 +53,7 @@ class StudyCommand:
     def execute(self, study: Study, write: Callable[[Study, pd.DataFrame, Path], str]) -> None:
         """Check and run a study, `write` it and print the text of it; exit with 3 where cells failed."""
         check_jobs(self.jobs)
-        study = with_drives(study, self.tracks, self.seeds, self.laps)
+        study = with_drives(study, self)
         plan = make_plan(study)
         if stale := of_other_code(self.out, plan.cells):
             note(f"{stale} runs in {self.out} are of other code, and are not used")
@@ -67,13 +69,16 @@ class StudyCommand:
             raise SystemExit(CELLS_FAILED)
 
 
-def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], laps: int | None) -> Study:
-    """Return the study with tracks (files, or seeds of generated ones), seeds and laps that are given."""
-    if laps is not None and laps < 1:
-        raise SettingsError(f"--laps: expected at least 1, found {laps}")
-    chosen = tuple(int(track) if track.isdecimal() else Path(track) for track in tracks)
-    given: dict[str, Any] = {"tracks": chosen, "seeds": seeds, "laps": laps}
-    return replace(study, **{name: value for name, value in given.items() if value})
+def with_drives(study: Study, given: StudyCommand) -> Study:
+    """Return the study with the tracks (files, or seeds of generated ones), logs, seeds and laps given."""
+    if given.laps is not None and given.laps < 1:
+        raise SettingsError(f"--laps: expected at least 1, found {given.laps}")
+    tracks = tuple(int(track) if track.isdecimal() else Path(track) for track in given.tracks)
+    logs = {name: (folder,) for path in given.logs for name, folder in log_folders(path).items()}
+    if tracks or logs:
+        study = replace(study, tracks=tracks, logs=logs)
+    chosen: dict[str, Any] = {"seeds": given.seeds, "laps": given.laps}
+    return replace(study, **{name: value for name, value in chosen.items() if value})
 
 
 @dataclass(frozen=True, kw_only=True)

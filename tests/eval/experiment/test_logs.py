@@ -1,0 +1,80 @@
+"""Recorded logs in a study: their tracks, metrics that need no truth, and drives that can be had again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.eval.experiment.run import make_plan, run_study
+from pathspace_graph.eval.experiment.study import Study, study_from
+from pathspace_graph.eval.experiment.tables import write_study
+from pathspace_graph.io.log import read_log, write_log
+
+from ...scenes.pretenders import Pretender, contents, register, write_round_track
+from ...scenes.rings import write_logs
+
+
+@pytest.fixture
+def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the logs a and b, one of them without truth."""
+    register(monkeypatch)
+    folder = write_logs(tmp_path / "rings")
+    write_log(replace(read_log(folder / "b"), truth=None), tmp_path / "b")
+    for file in (folder / "b").iterdir():
+        file.unlink()
+    (folder / "b").rmdir()
+    (tmp_path / "b").rename(folder / "b")
+    return folder
+
+
+def test_logs_are_of_tracks_of_their_own_or_of_those_that_are_named(logs: Path) -> None:
+    assert study_from({"drives": {"logs": ["logs"]}}, logs.parent).logs == {
+        "a": (logs / "a",),
+        "b": (logs / "b",),
+    }
+    named = study_from({"drives": {"logs": {"ring": ["logs"]}}}, logs.parent)
+    assert named.logs == {"ring": (logs / "a", logs / "b")} and named.noises == ["recorded"]
+    for wrong in ({"drives": {"log": []}}, {"drives": {"logs": [0]}}, {}):
+        with pytest.raises(SettingsError):
+            study_from(wrong)
+    with pytest.raises(InputError, match="expected a log"):
+        study_from({"drives": {"logs": ["none"]}}, logs)
+
+
+def test_a_study_of_logs_and_tracks(logs: Path, tmp_path: Path) -> None:
+    track = write_round_track(tmp_path)
+    study = Study(
+        tracks=(track,),
+        logs={"ring": (logs / "a", logs / "b")},
+        estimators=("pretender",),
+        laps=2,
+        grids=({"lag": [1.0]},),
+        metrics=("rmse", "size", "crossings"),
+    )
+    frame = run_study(study, tmp_path / "out")
+    recorded = frame[frame["noise"] == "recorded"]
+    assert [*recorded["drive"].unique()] == ["a", "b"] and set(recorded["track"]) == {"ring"}
+    assert recorded.groupby("drive")["rmse"].count().to_dict() == {"a": 4, "b": 0}
+    assert recorded[recorded["drive"] == "b"]["crossings"].notna().all()
+    assert "recorded" in write_study(study, frame, tmp_path / "out")
+    calls = Pretender.calls
+    run_study(study, tmp_path / "out")
+    assert Pretender.calls == calls
+    (logs / "b" / "odometry.csv").write_text((logs / "a" / "odometry.csv").read_text())
+    run_study(study, tmp_path / "out")
+    assert Pretender.calls == calls + 2, "another log of the same name"
+
+
+def test_simulate_makes_the_drive_of_a_study_to_the_byte(logs: Path, tmp_path: Path) -> None:
+    track = write_round_track(tmp_path)
+    study = Study(tracks=(track,), seeds=(4,), estimators=("pretender",), laps=1)
+    seed = run_study(study)["drive"].iloc[0]
+    command = ["-q", "simulate", "--track", str(track), "--laps", "1", "--seed", seed]
+    assert main([*command, "--out", str(tmp_path / "again")]) == 0
+    drive = make_plan(study).cells[0].drive
+    write_log(drive.load(), tmp_path / "drive")
+    assert contents(tmp_path / "again") == contents(tmp_path / "drive")
