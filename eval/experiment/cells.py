@@ -2,12 +2,14 @@
 
 import hashlib
 import json
+import shutil
 import time
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, Generic, Self, TypeVar
 
 import numpy as np
@@ -17,9 +19,9 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.eval.metrics.measures import Row, measure
 from pathspace_graph.eval.metrics.metric import METRICS
-from pathspace_graph.eval.metrics.summary import has_cones, lap_times
+from pathspace_graph.eval.metrics.summary import has_cones, lap_times, summarize
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
-from pathspace_graph.io.files import is_temporary, to_plain, write_json
+from pathspace_graph.io.files import atomic_folder, is_temporary, to_plain, write_json, write_text
 from pathspace_graph.io.log import (
     DETECTIONS_FILE,
     LOG_FILE,
@@ -29,9 +31,10 @@ from pathspace_graph.io.log import (
     TRUTH_POSES_FILE,
     Log,
 )
+from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.parsing import read_json
-from pathspace_graph.io.results import RunResult
+from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.judge import read_plausible_log
@@ -53,6 +56,7 @@ LOG_FILES: Final = (  # of a log, all that an estimate or a metric of it depends
     *(TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE),
 )
 RECORDED: Final = "recorded"  # noise of a drive that was not simulated
+RUN_FILES: Final = "files"  # key of the kept files of a run, on their way from its process
 DIGEST: Final = "digest"  # key of a record's digest in its file
 RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
 ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
@@ -228,6 +232,7 @@ class Cell(Generic[D]):
     variant: str | None = None  # name of the settings, where there are several
     measured: Mapping[str, Any] = field(default_factory=dict)  # keyword arguments of `measure`
     parameters: Any = None  # the estimator's own, a frozen dataclass; None where it has none
+    keep: bool = False  # whether map, trajectory, cycles and summary are kept
     code: Code = field(default_factory=dict)  # with which the study began
     began: str = ""  # the process in which it did
 
@@ -294,7 +299,18 @@ def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any
 def record_cell(cell: Cell[AnyDrive]) -> Record:
     """Run a cell in whatever process; a SettingsError where that has other code than the study."""
     check_code(cell.estimator, cell.code, cell.began)
-    return record_of(cell, run_cell(cell))
+    outcome = run_cell(cell)
+    record = record_of(cell, outcome)
+    if cell.keep and outcome.result is not None:
+        record[RUN_FILES] = files_of(outcome.result, cell.drive.load())
+    return record
+
+
+def files_of(run: RunResult, log: Log) -> dict[str, str]:
+    """Return the files of a run as texts by name: a worker may have no disk in common with the study."""
+    with TemporaryDirectory() as folder:
+        write_result(Path(folder) / "run", run, summarize(run, log))
+        return {file.name: file.read_text(encoding="utf-8") for file in (Path(folder) / "run").iterdir()}
 
 
 def record_of(cell: Cell[AnyDrive], outcome: Outcome) -> Record:
@@ -321,18 +337,30 @@ def lap_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def read_record(folder: Path, cell: Cell[AnyDrive]) -> Record | None:
-    """Return the cell's record in a study's folder, or None if there is none that is as it was written."""
+    """Return the cell's record in a study's folder, or None if there is none that is as it was written.
+
+    A run that was not kept, and is to be, is none either.
+    """
     try:
         record = read_json(_file(folder, cell), "a cell")
     except InputError:
         return None
     if not isinstance(record, dict) or record.pop(DIGEST, None) != identity(record=record):
         return None
-    return record if (record.get("format"), record.get("id")) == (FORMAT, cell.id) else None
+    if (record.get("format"), record.get("id")) != (FORMAT, cell.id):
+        return None
+    is_missing = cell.keep and not record["failure"] and not (run_folder(folder, cell) / MAP_FILE).exists()
+    return None if is_missing else record
 
 
 def write_record(folder: Path, cell: Cell[AnyDrive], record: Record) -> None:
-    """Write the record as a file of its own, whole or not at all."""
+    """Write the record as a file of its own, whole or not at all, after the files of its run."""
+    files = record.pop(RUN_FILES, None)
+    if files is not None:
+        shutil.rmtree(run_folder(folder, cell), ignore_errors=True)
+        with atomic_folder(run_folder(folder, cell), MAP_FILE) as run:
+            for name, text in files.items():
+                write_text(run / name, text)
     write_json(_file(folder, cell), {**record, DIGEST: identity(record=record)}, indent=1)
 
 
@@ -341,6 +369,11 @@ def of_other_code(folder: Path, cells: Iterable[Cell[Any]]) -> int:
     kept = {tuple(file.stem.split("-")) for file in (folder / CELLS).glob("[!.]*-*.json")}
     known = {cell.meaning: tuple(cell.id.split("-")) for cell in cells}
     return sum(known.get(one[0], one) != one for one in kept)
+
+
+def run_folder(folder: Path, cell: Cell[Any]) -> Path:
+    """Return the folder of the files of a run in that of its study."""
+    return folder / CELLS / cell.id
 
 
 def _file(folder: Path, cell: Cell[AnyDrive]) -> Path:

@@ -27,7 +27,7 @@ from .cells import Cell, NamedLog, Outcome, log_folders, run_cell
 from .frame import add_batch, write_csv
 from .plots import blind_spot_figure, plot_maps
 from .run import OnCell, run_cells
-from .statistics import difference
+from .statistics import difference, estimate
 from .tables import TextTable, group_starts
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
@@ -139,6 +139,8 @@ def tables(comparison: Comparison) -> dict[str, TextTable]:
 def paper_frame(comparison: Comparison) -> pd.DataFrame:
     """Return rmse (m), missed (share) and size of each estimator and lap, means over `logs` logs.
 
+    `rmse_half` and so on are half the widths of their 95 % intervals.
+
     An estimator that completed no lap on any log has a row without a lap, of its maps at the end of the logs.
     """
     keys = [metric.key for metric in PAPER]
@@ -148,8 +150,10 @@ def paper_frame(comparison: Comparison) -> pd.DataFrame:
         runs = frame[frame["estimator"] == estimator]
         laps = runs[runs["scope"] == "lap"]
         for lap, over_logs in laps.groupby("lap") if len(laps) else [(np.nan, runs)]:
-            means = over_logs[keys].astype(float).mean().to_dict()
-            rows.append({"estimator": estimator, "lap": lap, "logs": len(over_logs)} | means)
+            found = {key: estimate(over_logs[key].astype(float).dropna().to_numpy()) for key in keys}
+            values = {name: of.mean for name, of in found.items()}
+            values |= {f"{name}_half": of.half for name, of in found.items()}
+            rows.append({"estimator": estimator, "lap": lap, "logs": len(over_logs)} | values)
     return pd.DataFrame(rows).astype({"lap": "Int64"})
 
 
@@ -234,7 +238,10 @@ def _title(comparison: Comparison, when: str) -> str:
 
 
 def _cell(metric: Metric, row: dict[Any, Any]) -> str:
-    return metric.text(float(row.get(metric.key, np.nan)))
+    """Return a value, with its spread where there is one."""
+    half = float(row.get(f"{metric.key}_half", np.nan))
+    spread = "" if np.isnan(half) else f" ± {metric.factor * half:.{metric.digits}f}"
+    return f"{metric.text(float(row.get(metric.key, np.nan)))}{spread}"
 
 
 # --- files -----------------------------------------------------------------------------------------------

@@ -3,11 +3,11 @@
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -16,7 +16,9 @@ from joblib import Parallel, delayed, parallel_config
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, OutputError, SettingsError
+from pathspace_graph.eval.metrics.reference import aligned_distance
 from pathspace_graph.io.files import check_target, remove_manifest, write_json
+from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.parsing import read_json, shown
 from pathspace_graph.loop.worker import end_with
 from pathspace_graph.sim.track import Track
@@ -106,8 +108,10 @@ class Plan:
         }
 
 
-def make_plan(study: Study) -> Plan:
+def make_plan(study: Study, *, keep: bool = False) -> Plan:
     """Read and generate the tracks, and return the cells, grouped by the log that they share.
+
+    With `keep`, the map, trajectory, cycles and summary of each are kept.
 
     A SettingsError says what is broken in an estimator of another package.
     """
@@ -126,6 +130,7 @@ def make_plan(study: Study) -> Plan:
         Cell(
             *(drive, estimator, variant.settings, name, measured),
             parameters=dict(variant.parameters).get(estimator),
+            keep=keep,
             code=code[estimator],
             began=began,
         )
@@ -135,13 +140,14 @@ def make_plan(study: Study) -> Plan:
     return Plan(study, tracks, cells)
 
 
-def run_study(study: Study, out: Path | str | None = None, **how: Any) -> pd.DataFrame:
+def run_study(study: Study, out: Path | str | None = None, *, keep: bool = False, **how: Any) -> pd.DataFrame:
     """Run the cells of a study that are missing, and return all of its results, a row per run and lap.
 
-    Finished cells are kept in the folder `out`, if there is one. `how` is that of `run_plan`.
+    Finished cells are kept in the folder `out`, if there is one, and with `keep` what each has made. `how` is
+    that of `run_plan`.
     """
     with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
-        return run_plan(make_plan(study), Path(folder), **how)
+        return run_plan(make_plan(study, keep=keep), Path(folder), **how)
 
 
 def run_plan(plan: Plan, out: Path, *, retry_failed: bool = False, **how: Any) -> pd.DataFrame:
@@ -172,7 +178,23 @@ def run_plan(plan: Plan, out: Path, *, retry_failed: bool = False, **how: Any) -
         **how,
     )
     by_id = {cell.id: record for cell, record in zip(cells, records, strict=True)}
+    add_agreement(out, cells, by_id)
     return frame_of(plan.study, [(cell, by_id[cell.id]) for cell in plan.cells])
+
+
+def add_agreement(out: Path, cells: Sequence[Cell[AnyDrive]], records: Mapping[str, Record]) -> None:
+    """Add how far each kept map of a recorded log is from those of the other logs of its track (m)."""
+    maps = dict[tuple[Any, ...], dict[str, Map]]()
+    for cell in cells:
+        if isinstance(cell.drive, RecordedDrive) and (store.run_folder(out, cell) / MAP_FILE).exists():
+            key = (cell.drive.track, cell.estimator, cell.settings, cell.parameters)
+            maps.setdefault(key, {})[cell.id] = read_map(store.run_folder(out, cell))
+    for alike in maps.values():
+        for one, other in combinations(alike, 2):
+            apart = aligned_distance(alike[one], alike[other])
+            for cell_id in (one, other):
+                for lap in records[cell_id]["laps"]:
+                    lap["agreement"] = lap.get("agreement", 0.0) + apart / (len(alike) - 1)
 
 
 def check_folder(out: Path, plan: Plan) -> None:

@@ -12,6 +12,7 @@ from pathspace_graph.factors.arrays import Array
 
 LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
 RESAMPLES: Final = 2000
+ROUND_OFF: Final = 1e-12  # share of differences below which they are all the same
 FEWEST: Final = 8  # samples that can be resampled: fewer have too few different resamples
 
 
@@ -52,11 +53,11 @@ def estimate(values: Array) -> Estimate:
     n = len(values)
     if n < 2:
         return Estimate(float(values[0]) if n else float("nan"), float("nan"), n)
-    mean, sem = float(np.mean(values)), float(stats.sem(values))
+    mean, sem = float(np.mean(values)), float(np.std(values, ddof=1) / n**0.5)
     quantile = float(stats.t.ppf(0.5 + LEVEL / 2, n - 1))
     if n >= FEWEST and sem > 0.0:
         drawn = values[np.random.default_rng(0).integers(0, n, (RESAMPLES, n))]
-        off, spread = np.abs(drawn.mean(axis=1) - mean), stats.sem(drawn, axis=1)
+        off, spread = np.abs(drawn.mean(axis=1) - mean), drawn.std(axis=1, ddof=1) / n**0.5
         quantile = float(np.quantile(off[spread > 0.0] / spread[spread > 0.0], LEVEL))
     return Estimate(mean, quantile * sem, n)
 
@@ -75,7 +76,7 @@ def paired_p(differences: Array) -> float:
     """
     if len(differences) < 2:
         return float("nan")
-    if np.ptp(differences) == 0.0:
+    if np.ptp(differences) <= ROUND_OFF * np.abs(differences).max():
         return float(differences[0] == 0.0)
     return float(stats.ttest_1samp(differences, 0.0).pvalue)
 

@@ -147,6 +147,32 @@ _ALL: Final = (
     Metric("ms_p99", "update, 99th percentile", "ms", 2, time=True),
     Metric("seconds", "whole run", "s", 1, "run", time=True),
 )
+HIGHER: Final = ("reach_median", "reach_p10", "closed", "closed_at_end", "converged")
+"""Metrics of which more is better."""
+LOWER: Final = (  # of which less is better; others, such as a NEES, have no best
+    *(
+        "rmse",
+        "missed",
+        "missed_2m",
+        "missed_1m",
+        "rmse_capped",
+        "mapped_to_truth",
+        "truth_to_mapped",
+        "centre",
+    ),
+    *(
+        "half_width",
+        "ghost_landmarks",
+        "ghost_metres",
+        "ate",
+        "along",
+        "across",
+        "reach_short",
+        "reach_error",
+    ),
+    *("rmse_aligned", "false_closing", "error_max", "lost_at_end", "end_off", "crossings", "agreement"),
+    *("ms_mean", "ms_p99", "seconds"),
+)
 METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}  # in the order of tables
 
 

@@ -39,6 +39,8 @@ class StudyCommand:
     """Number of processes at a time, -1 for one on each core."""
     cluster: str | None = None
     """Address of a Dask scheduler (tcp://HOST:8786) on whose workers the study runs instead."""
+    keep: bool = False
+    """Keep map, trajectory, cycles and summary of each run, in a folder of its cell."""
     retry_failed: bool = False
     """Run again what failed before."""
     tracks: tuple[str, ...] = ()
@@ -54,7 +56,7 @@ class StudyCommand:
         """Check and run a study, `write` it and print the text of it; exit with 3 where cells failed."""
         check_jobs(self.jobs)
         study = with_drives(study, self)
-        plan = make_plan(study)
+        plan = make_plan(study, keep=self.keep)
         if stale := of_other_code(self.out, plan.cells):
             note(f"{stale} runs in {self.out} are of other code, and are not used")
         with progress("runs", lines=LINES) as advance:

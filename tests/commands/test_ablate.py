@@ -60,6 +60,7 @@ def test_the_command_leaves_tables_and_figures(
             "summary.txt",
             "summary.md",
             "summary.tex",
+            "table.tex",
             "manifest.json",
         ),
         "figures/differences.png",

@@ -11,8 +11,9 @@ from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.experiment.run import make_plan, run_study
 from pathspace_graph.eval.experiment.study import Study, study_from
-from pathspace_graph.eval.experiment.tables import write_study
+from pathspace_graph.eval.experiment.tables import results_table, strong, write_study
 from pathspace_graph.io.log import read_log, write_log
+from pathspace_graph.io.map import read_map
 
 from ...scenes.pretenders import Pretender, contents, register, write_round_track
 from ...scenes.rings import write_logs
@@ -78,3 +79,37 @@ def test_simulate_makes_the_drive_of_a_study_to_the_byte(logs: Path, tmp_path: P
     drive = make_plan(study).cells[0].drive
     write_log(drive.load(), tmp_path / "drive")
     assert contents(tmp_path / "again") == contents(tmp_path / "drive")
+
+
+def test_what_each_run_has_made_is_kept_where_it_is_asked_for(logs: Path, tmp_path: Path) -> None:
+    study = Study(logs={"ring": (logs / "a", logs / "b")}, estimators=("pretender", "fragile"))
+    run_study(study, tmp_path / "out")
+    calls = Pretender.calls
+    frame = run_study(study, tmp_path / "out", keep=True)
+    assert Pretender.calls == calls + 2, "they have to be made once more"
+    run_study(study, tmp_path / "out", keep=True)
+    assert Pretender.calls == calls + 2
+    for cell in frame["cell"]:
+        run = tmp_path / "out" / "cells" / cell
+        assert read_map(run).size == 4
+        assert {"trajectory.tum", "cycles.csv", "summary.json"} <= {file.name for file in run.iterdir()}
+    assert set(frame["agreement"]) == {0.0}, "both drives have the same map"
+
+
+def test_a_study_becomes_a_table_of_a_paper(logs: Path, tmp_path: Path) -> None:
+    made = tuple(write_round_track(folder(tmp_path / name)) for name in "xyz")
+    study = Study(tracks=made, seeds=(0, 1), laps=1, estimators=("pretender",), grids=({"lag": [1.0]},))
+    frame = run_study(study)
+    frame.loc[frame["variant"] == "default", "rmse"] = [0.1, 0.3, 0.1, 0.3, 0.2, 0.2]  # 0.2 on each track
+    table = results_table(study, frame, ("rmse", "nees"), label="tab:lag")
+    assert table.header == ("variant", "rmse [m]", "NEES per degree of freedom")
+    assert table.rows[0][1] == strong("0.200 ± 0.000")
+    assert "\ue000" not in table.rows[1][1] + table.rows[0][2], "a NEES has no best"
+    latex = table.latex()
+    assert r"\label{tab:lag}" in latex and r"\textbf{0.200 $\pm$ 0.000}" in latex and latex.isascii()
+    assert "**0.200 ± 0.000**" in table.markdown() and "\ue000" not in table.text()
+
+
+def folder(path: Path) -> Path:
+    path.mkdir()
+    return path
