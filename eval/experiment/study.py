@@ -213,7 +213,7 @@ def find_study(name: Path) -> Path:
     raise InputError(name, "expected a study's file")
 
 
-def read_study(file: Path | str) -> Study:
+def read_study_file(file: Path | str) -> Study:
     """Return the study of a TOML file, with track files relative to it; InputError says what is wrong."""
     file = Path(file)
     content = parse_toml(read_text(file, "a study", MAX_HEADER_BYTES), file)

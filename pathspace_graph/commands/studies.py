@@ -19,7 +19,7 @@ from pathspace_graph.eval.experiment.cells import log_folders, of_other_code
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
 from pathspace_graph.eval.experiment.provenance import commit_of
 from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
-from pathspace_graph.eval.experiment.study import Study, find_study, read_study
+from pathspace_graph.eval.experiment.study import Study, find_study, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figures, render_pages, to_json
 from pathspace_graph.io.files import check_target, write_json, write_manifest, write_text
@@ -91,7 +91,7 @@ class Ablate(StudyCommand):
     """TOML file of the study, or name of one that comes with the package."""
 
     def run(self) -> None:
-        self.execute(read_study(find_study(self.study)), write_study)
+        self.execute(read_study_file(find_study(self.study)), write_study)
 
 
 @dataclass(frozen=True, kw_only=True)

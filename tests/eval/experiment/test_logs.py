@@ -10,13 +10,15 @@ import pytest
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.experiment.run import make_plan, run_study
-from pathspace_graph.eval.experiment.study import Study, study_from
+from pathspace_graph.eval.experiment.study import Study, read_study_file, study_from
 from pathspace_graph.eval.experiment.tables import results_table, strong, write_study
 from pathspace_graph.io.log import read_log, write_log
 from pathspace_graph.io.map import read_map
 
+from ...scenes.paths import ROOT
 from ...scenes.pretenders import Pretender, contents, register, write_round_track
 from ...scenes.rings import write_logs
+from ...test_docs import file_blocks
 
 
 @pytest.fixture
@@ -113,3 +115,22 @@ def test_a_study_becomes_a_table_of_a_paper(logs: Path, tmp_path: Path) -> None:
 def folder(path: Path) -> Path:
     path.mkdir()
     return path
+
+
+def test_the_page_goes_from_a_study_to_its_table_and_figures(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    track = write_round_track(tmp_path)
+    file = tmp_path / "study.toml"
+    drives = f'tracks = ["{track}"]\nseeds = [0, 1]\nlaps = 1'
+    file.write_text(f'{drives}\nestimators = ["pretender"]\ngrid.lag = [1.0]')
+    study = read_study_file(file)
+    write_study(study, run_study(study, tmp_path / "out", keep=True), tmp_path / "out")
+    monkeypatch.chdir(tmp_path)
+    code = file_blocks(ROOT / "docs" / "ablate.md")["paper.py"]
+    assert sum(bool(line) for line in code.splitlines()) <= 20
+    exec(compile(code, "paper.py", "exec"), {})
+    assert r"\label{tab:lag}" in (tmp_path / "table.tex").read_text()
+    assert (tmp_path / "differences.pdf").stat().st_size > 1000
+    assert (tmp_path / "worst.pdf").stat().st_size > 1000
+    assert "lag=1" in capsys.readouterr().out
