@@ -32,7 +32,10 @@ from .tables import TextTable, group_starts
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
 RUN: Final = ("log", "estimator")
-_PRINTED: Final = ("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "size", "ate", "ms_mean")
+WITHOUT_TRUTH: Final = (  # metrics that say something of a log without true cones
+    *("size", "closed_at_end", "end_off", "crossings", "reported_degraded", "reported_lost", "ms_mean"),
+)
+_PAIRED: Final = ("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "ate", *WITHOUT_TRUTH)
 """Metrics whose differences are in the table; the file has all."""
 
 
@@ -131,9 +134,10 @@ def compare(
 
 
 def tables(comparison: Comparison) -> dict[str, TextTable]:
-    """Return the printed tables by the name of their files, differences only where runs can be paired."""
-    printed = {"table": paper_table(comparison), "metrics": final_table(comparison)}
-    return printed | ({"paired": paired_table(comparison)} if comparison.paired else {})
+    """Return the tables by the name of their files, differences only where runs can be paired."""
+    short = paper_table(comparison) if comparison.has_truth else final_table(comparison, WITHOUT_TRUTH)
+    found = {"table": short, "metrics": final_table(comparison)}
+    return found | ({"paired": paired_table(comparison)} if comparison.paired else {})
 
 
 def paper_frame(comparison: Comparison) -> pd.DataFrame:
@@ -158,22 +162,25 @@ def paper_frame(comparison: Comparison) -> pd.DataFrame:
 
 
 def paper_table(comparison: Comparison) -> TextTable:
-    """Return the paper's Table 1, lap by lap; without truth it has the sizes only."""
-    shown = PAPER if comparison.has_truth else (METRICS["size"],)
+    """Return the paper's Table 1, lap by lap."""
     logs = ["logs"] if len(comparison.logs) > 1 else []
     rows = []
     for row in paper_frame(comparison).to_dict("records"):
         lap = ("end" if row["logs"] else "failed") if pd.isna(row["lap"]) else str(int(row["lap"]))
-        cells = (*(str(row[key]) for key in logs), *(_cell(metric, row) for metric in shown))
+        cells = (*(str(row[key]) for key in logs), *(_cell(metric, row) for metric in PAPER))
         rows.append((row["estimator"], lap, *cells))
-    header = ("estimator", "lap", *logs, *(metric.heading for metric in shown))
+    header = ("estimator", "lap", *logs, *(metric.heading for metric in PAPER))
     return TextTable(_title(comparison, "at the end of each lap"), header, tuple(rows), group_starts(rows))
 
 
-def final_table(comparison: Comparison) -> TextTable:
-    """Return the means over the logs of every metric of whole logs, with a column for each estimator."""
+def final_table(comparison: Comparison, keys: Sequence[str] = tuple(METRICS)) -> TextTable:
+    """Return the means over the logs of metrics of whole logs, with a column for each estimator."""
     final, names = comparison.final, comparison.estimators
-    known = [m for m in METRICS.values() if m.key in final and not final[m.key].astype(float).isna().all()]
+    known = [
+        m
+        for m in map(METRICS.__getitem__, keys)
+        if m.key in final and not final[m.key].astype(float).isna().all()
+    ]
     rows = tuple(
         (m.heading, *(m.text(m.over(final.loc[final["estimator"] == name, m.key])) for name in names))
         for m in known
@@ -199,7 +206,7 @@ def paired_table(comparison: Comparison) -> TextTable:
     paired = paired_frame(comparison)
     others = [name for name in comparison.estimators if name != comparison.reference]
     rows = []
-    for metric in (METRICS[key] for key in _PRINTED):
+    for metric in (METRICS[key] for key in _PAIRED):
         by_estimator = paired[paired["metric"] == metric.key].set_index("estimator")
         if by_estimator["mean"].notna().any():
             rows.append((metric.heading, *(_interval(metric, by_estimator.loc[name]) for name in others)))
