@@ -114,7 +114,7 @@ def parameters_of(name: str) -> Any:
 
 def reads(name: str, field: str) -> bool:
     """Whether an estimator reads a setting, by its dotted name; one that does not say which reads all."""
-    known = vars(maker_of(name)).get(READS)  # a subclass may read more
+    known = getattr(maker_of(name), "__dict__", {}).get(READS)  # a subclass may read more
     return known is None or any(f"{field}.".startswith(f"{own}.") for own in (*ALWAYS_READ, *known))
 
 

@@ -176,11 +176,7 @@ def paper_table(comparison: Comparison) -> TextTable:
 def final_table(comparison: Comparison, keys: Sequence[str] = tuple(METRICS)) -> TextTable:
     """Return the means over the logs of metrics of whole logs, with a column for each estimator."""
     final, names = comparison.final, comparison.estimators
-    known = [
-        m
-        for m in map(METRICS.__getitem__, keys)
-        if m.key in final and not final[m.key].astype(float).isna().all()
-    ]
+    known = [METRICS[key] for key in keys if key in final and final[key].astype(float).notna().any()]
     rows = tuple(
         (m.heading, *(m.text(m.over(final.loc[final["estimator"] == name, m.key])) for name in names))
         for m in known

@@ -43,6 +43,9 @@ def _code(roots: tuple[str, ...]) -> Code:
     Of what is installed, the version stands for the sources, except in the packages of the roots: an editable
     package has no version that changes with it. The standard library doesn't count.
     """
+    for root in roots:
+        if _spec(root) is None:  # a class of a notebook, or of the program itself
+            raise SettingsError(f"estimators: expected one of a module with sources, found {root}")
     own, found, libraries = {root.partition(".")[0] for root in roots}, Code(), set[str]()
     remaining = [(root, HOUSE) for root in roots]
     while remaining:

@@ -122,6 +122,14 @@ def test_a_plugin_is_known_by_its_sources_and_those_of_its_unversioned_imports(p
     assert {name for name in code if code[name] != changed[name]} == {"plugin_lib.far"}
 
 
+def test_an_estimator_without_sources_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    typed = type("Typed", (), {"__module__": "__main__"})
+    monkeypatch.setitem(registry.ONLINE, "typed", typed)  # type: ignore[misc]
+    monkeypatch.setattr(provenance, "_spec", lambda name: None)
+    with pytest.raises(SettingsError, match="expected one of a module with sources, found __main__"):
+        code_of("typed")
+
+
 def test_the_cells_of_a_changed_plugin_are_run_again(plugin: Path, tmp_path: Path) -> None:
     of = study(tmp_path, estimators=("plugin", "landmark-ckf"))
     before = run_study(of, tmp_path / "out")
