@@ -23,7 +23,8 @@ from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
-from .cells import Cell, NamedLog, Outcome, log_folders, run_cell
+from .cells import Cell, Outcome, run_cell
+from .drives import NamedLog, log_folders
 from .frame import add_batch, write_csv
 from .plots import blind_spot_figure, plot_maps
 from .run import OnCell, run_cells

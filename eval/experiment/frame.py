@@ -15,7 +15,8 @@ from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import replacing
 from pathspace_graph.io.overrides import leaves
 
-from .cells import AnyDrive, Cell, Record
+from .cells import Cell, Record
+from .drives import AnyDrive
 from .statistics import LEVEL, Estimate, by_track, estimate, holm, paired_p, wilcoxon_p
 from .study import Study
 

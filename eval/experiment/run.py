@@ -24,7 +24,8 @@ from pathspace_graph.loop.worker import end_with
 from pathspace_graph.sim.track import Track
 
 from . import cells as store
-from .cells import AnyDrive, Cell, Drive, Outcome, Record, RecordedDrive, load_tracks, track_digest
+from .cells import Cell, Outcome, Record
+from .drives import AnyDrive, Drive, RecordedDrive, load_tracks, track_digest
 from .frame import frame_of
 from .provenance import code_of, here
 from .study import Study

@@ -15,7 +15,7 @@ from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_VARIANTS, parse_tom
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
 
-from .cells import RECORDED, log_folders
+from .drives import RECORDED, log_folders
 
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
 DEFAULT: Final = "default"  # variant that overrides nothing, part of every study

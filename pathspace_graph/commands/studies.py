@@ -15,7 +15,8 @@ from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online
 from pathspace_graph.eval.benchmark import scaling as timing
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import measure_scaling
-from pathspace_graph.eval.experiment.cells import log_folders, of_other_code
+from pathspace_graph.eval.experiment.cells import of_other_code
+from pathspace_graph.eval.experiment.drives import log_folders
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
 from pathspace_graph.eval.experiment.provenance import commit_of
 from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan

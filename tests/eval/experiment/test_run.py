@@ -13,9 +13,10 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.errors import OutputError, SettingsError
-from pathspace_graph.eval.experiment import cells as drives
+from pathspace_graph.eval.experiment import cells as store
+from pathspace_graph.eval.experiment import drives
 from pathspace_graph.eval.experiment import run as study_run
-from pathspace_graph.eval.experiment.cells import Drive
+from pathspace_graph.eval.experiment.drives import Drive
 from pathspace_graph.eval.experiment.frame import TIMES, without_times
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study
@@ -163,11 +164,11 @@ def test_cells_of_other_code_are_run_again_and_counted(
     study: Study, ran: tuple[Path, pd.DataFrame], finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, first = ran
-    assert drives.of_other_code(finished, study_run.make_plan(study).cells) == 0
+    assert store.of_other_code(finished, study_run.make_plan(study).cells) == 0
     code = study_run.code_of("pretender")
     monkeypatch.setattr(study_run, "code_of", lambda name: code | {"tests": "other"})
-    monkeypatch.setattr(drives, "check_code", lambda *_: None)
-    assert drives.of_other_code(finished, study_run.make_plan(study).cells) == len(first)
+    monkeypatch.setattr(store, "check_code", lambda *_: None)
+    assert store.of_other_code(finished, study_run.make_plan(study).cells) == len(first)
     again = run_study(study, finished)
     assert not set(again["cell"]) & set(first["cell"])
     pd.testing.assert_frame_equal(*(without_times(of).drop(columns="cell") for of in (again, first)))

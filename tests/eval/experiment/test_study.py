@@ -11,7 +11,7 @@ import pytest
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.estimators import known_estimators
-from pathspace_graph.eval.experiment.cells import load_tracks
+from pathspace_graph.eval.experiment.drives import load_tracks
 from pathspace_graph.eval.experiment.run import make_plan
 from pathspace_graph.eval.experiment.study import (
     SHIPPED,
