@@ -31,7 +31,8 @@ ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add
 BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
 PARAMETERS: Final = "Parameters"  # attribute of a maker: a frozen dataclass of its own parameters
 READS: Final = "READS"  # attribute of a maker: the settings that it reads, by field or group; all without it
-ALWAYS_READ: Final = ("scale", "kind", "limits")  # settings that are read before an estimator is made
+ALWAYS_READ: Final = ("scale", "kind", "limits", "calibration", "odometry")
+"""Settings that are read before an estimator is made, and by what judges its calibration."""
 
 _ENTRY_POINTS: Final = entry_points()  # looked up once, since that reads the metadata of every package
 

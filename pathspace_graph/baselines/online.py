@@ -14,9 +14,8 @@ from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
-FRONT_END: Final = (  # settings that the front end and the growth of landmarks read
-    *("calibration", "closing", "gate", "growth", "motion", "noise", "odometry", "sides", "spline"),
-)
+FRONT_END: Final = ("closing", "gate", "growth", "motion", "noise", "sides", "spline")
+"""Settings that the front end and the growth of landmarks read."""
 
 
 class OnlineBaseline:
