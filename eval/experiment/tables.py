@@ -155,7 +155,7 @@ def results_table(
         cells = [_mean(metric, columns[metric.key], row) for metric in shown]
         rows.append((*(getattr(first, name) for name in several), *cells))
     header, names = (*several, *(metric.heading for metric in shown)), len(several)
-    title = f"{study.name}: {study.question} Mean and {_interval(frame)}{_laps(study)}."
+    title = f"{_about(study)} Mean and {_interval(frame)}{_laps(study)}."
     return TextTable(title, header, tuple(rows), group_starts(rows), names, label)
 
 
@@ -166,6 +166,10 @@ def _mean(metric: Metric, column: Sequence[Contrast], row: int) -> str:
     means = [sign * of.value.mean for of in column if of.noise == column[row].noise and of.value.count]
     is_best = bool(sign and len(means) > 1) and sign * column[row].value.mean <= min(means)
     return strong(text) if is_best else text
+
+
+def _about(study: Study) -> str:
+    return f"{study.name}: {study.question}".strip()
 
 
 def _laps(study: Study) -> str:
@@ -191,7 +195,7 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
     against = f"{base.estimator}: {study.baseline_variant}" if base.estimator else study.baseline_variant
     runs = frame.groupby(list(RUN_OF), sort=False)["failure"].first()
     return (
-        f"{study.name}: {study.question} "
+        f"{_about(study)} "
         f"{len(runs)} runs ({int((runs != '').sum())} failed){_laps(study)}. "
         f"Mean and {_interval(frame)}; difference from {against} in the "
         f"same drives; p of the paired t-test over them, corrected by Holm's method over all comparisons of "
