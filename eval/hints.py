@@ -21,7 +21,7 @@ from tyro.conf import arg
 from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import PathspaceError, SolveError, check_name
 from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
-from pathspace_graph.eval.experiment.cells import load_tracks
+from pathspace_graph.eval.experiment.drives import load_tracks
 from pathspace_graph.eval.experiment.frame import write_csv
 from pathspace_graph.eval.experiment.run import OnCell, WorkerDiedError, run_cells
 from pathspace_graph.eval.experiment.tables import TextTable

@@ -23,11 +23,10 @@ from . import real, views
 from .benchmark.measurement import measure_drive, metrics
 from .benchmark.roads import QUICK, ScalingSettings, make_drives
 from .benchmark.scaling import measure_scaling, scaling_figures
-from .experiment.cells import ESTIMATORS as ESTIMATOR_ROOMS
-from .experiment.cells import code_digest
 from .experiment.faults import at_strength, kinds, only, suite
+from .experiment.provenance import sources_digest
 from .experiment.run import run_study
-from .experiment.study import Baseline, Study, find_study, read_study
+from .experiment.study import Baseline, Study, find_study, read_study_file
 from .experiment.tables import TextTable
 from .hints import HintStudy
 from .views import ESTIMATORS, LANDMARKS, ONLINE, Figure, Rows, View
@@ -170,7 +169,7 @@ class Plan:
     def ablation(self, folder: Path) -> Views:
         """Drive the study of the folder's name for two laps, under the first and the last of its noises."""
         name = folder.name
-        noises = list(read_study(find_study(Path(name))).noise.items())
+        noises = list(read_study_file(find_study(Path(name))).noise.items())
         small: dict[str, Any] = {"tracks": GENERATED, "laps": 2, "noise": dict([noises[0], noises[-1]])}
         small["seeds"] = (0,) if name in ONE_SEED else (0, 1)
         study, frame = self._shipped(name, folder, **small)
@@ -221,7 +220,7 @@ class Plan:
 
     def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:
         """Drive a shipped study, made smaller: with `quick` the first variant for one lap."""
-        study = replace(read_study(find_study(Path(name))), **small)
+        study = replace(read_study_file(find_study(Path(name))), **small)
         if self.quick:
             grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
             variants = dict([*study.variants.items()][:1])
@@ -282,10 +281,6 @@ def read_figures(file: Path) -> Tables:
         return {name: MeasuredTable.from_json(table) for name, table in content["tables"].items()}
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(file, f"expected {FORMAT}: {error}") from error
-
-
-def sources_digest() -> str:
-    return code_digest(ESTIMATOR_ROOMS)
 
 
 def render_pages(root: Path, tables: Tables) -> dict[Path, str]:

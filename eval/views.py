@@ -11,7 +11,8 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from .experiment.faults import outcomes
-from .experiment.frame import COMBINATION, RUN, RUN_OF, TIMES, contrasts, estimate, last_laps
+from .experiment.frame import COMBINATION, RUN, RUN_OF, TIMES, contrasts, last_laps
+from .experiment.statistics import by_track, estimate
 from .experiment.study import Study
 from .metrics.metric import METRICS
 
@@ -228,6 +229,8 @@ def _figure(key: str, part: pd.DataFrame) -> Figure:
     metric, values = METRICS[key], part[key] if key in part else pd.Series(dtype=float)
     if metric.average == "rms":
         return Figure.known(metric.factor * metric.over(values.astype(float)), metric.digits)
+    if len(values):
+        values = by_track(part.set_index("track")[key].astype(float).dropna())
     return Figure.of(values, metric.digits, metric.factor)
 
 

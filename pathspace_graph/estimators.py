@@ -5,9 +5,8 @@ A package adds one by an entry point of its name, in the group `pathspace_graph.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
-from importlib import import_module
+from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final
 
@@ -15,53 +14,124 @@ from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.io.log import Log
+from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.scale import chosen_scale
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
-from .errors import check_name, check_type
+from .errors import SettingsError, check_name, check_type
 from .run import BatchEstimator, OnlineEstimator
 
-MakeOnline = Callable[[MapperSettings, KnownNoise], OnlineEstimator]
-MakeBatch = Callable[[MapperSettings, KnownNoise], BatchEstimator]
+MakeOnline = Callable[..., OnlineEstimator]  # of settings, known noise and, where it has any, its parameters
+MakeBatch = Callable[..., BatchEstimator]
 
 DEFAULT_ONLINE: Final = "fixed-lag"  # online estimator where none is named
 DEFAULT_BATCH: Final = "spline"  # batch estimator where none is named
 ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add online estimators
 BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
-
+PARAMETERS: Final = "Parameters"  # attribute of a maker: a frozen dataclass of its own parameters
+READS: Final = "READS"  # attribute of a maker: the settings that it reads, by field or group; all without it
+ALWAYS_READ: Final = ("scale", "kind", "limits", "calibration", "odometry")
+"""Settings that are read before an estimator is made, and by what judges its calibration."""
 
 _ENTRY_POINTS: Final = entry_points()  # looked up once, since that reads the metadata of every package
 
 
-def _installed(group: str) -> dict[str, Callable[[MapperSettings, KnownNoise], Any]]:
-    return {point.name: partial(_load, point) for point in _ENTRY_POINTS.select(group=group)}
+@dataclass(frozen=True)
+class Elsewhere:
+    """What makes an estimator, by its module, which is imported when it is first asked for."""
+
+    point: EntryPoint
+
+    @cached_property
+    def maker(self) -> Any:
+        """Return the class or function; a SettingsError says what is broken in another package."""
+        try:
+            return self.point.load()
+        except Exception as error:  # a package of somebody else may raise anything
+            raise self.broken(error) from error
+
+    def broken(self, error: Exception) -> SettingsError:
+        home = self.point.dist
+        of = f" of {home.name} {home.version}" if home else ""
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        return SettingsError(
+            f"{self.point.name}: expected an estimator at {self.point.value}{of}, found {why}"
+        )
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.maker(*arguments)
 
 
-def _load(point: EntryPoint, settings: MapperSettings, noise: KnownNoise) -> Any:
-    """Return the estimator of an entry point, made with the sigmas (3,) of a twist (m/s, m/s, rad/s)."""
-    return point.load()(settings, noise.odometry)
+def _installed(group: str) -> dict[str, Elsewhere]:
+    return {point.name: Elsewhere(point) for point in _ENTRY_POINTS.select(group=group)}
 
 
-def _baseline(home: str, settings: MapperSettings, noise: KnownNoise) -> Any:
-    """Return the estimator of a class `module:name` of the baselines, which is imported by then."""
-    module, name = home.split(":")
-    return getattr(import_module(f".baselines.{module}", __package__), name)(settings, noise)
+def _baseline(name: str, place: str) -> Elsewhere:
+    return Elsewhere(EntryPoint(name, f"{__package__}.baselines.{place}", ONLINE_GROUP))
 
 
-ONLINE: Final[dict[str, MakeOnline]] = {  # makers, from settings and known noise
+def _spline(settings: MapperSettings, noise: KnownNoise) -> BatchMapper:
+    return BatchMapper(settings, noise, FixedLagMapper)
+
+
+ONLINE: Final[dict[str, MakeOnline]] = {
     **_installed(ONLINE_GROUP),
     DEFAULT_ONLINE: FixedLagMapper,
-    "landmark-fixed-lag": partial(_baseline, "landmark_fixed_lag:LandmarkFixedLag"),
-    "ckf": partial(_baseline, "filters:CkfMapper"),
-    "landmark-ckf": partial(_baseline, "filters:LandmarkCkf"),
+    "landmark-fixed-lag": _baseline("landmark-fixed-lag", "landmark_fixed_lag:LandmarkFixedLag"),
+    "ckf": _baseline("ckf", "filters:CkfMapper"),
+    "landmark-ckf": _baseline("landmark-ckf", "filters:LandmarkCkf"),
 }
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
-    DEFAULT_BATCH: lambda settings, noise: BatchMapper(settings, noise, FixedLagMapper),
-    "landmark-batch": partial(_baseline, "landmark_batch:LandmarkBatch"),
+    DEFAULT_BATCH: _spline,
+    "landmark-batch": _baseline("landmark-batch", "landmark_batch:LandmarkBatch"),
 }
+
+
+def known_estimators() -> list[str]:
+    """Return the name of every estimator, online ones first."""
+    return [*ONLINE, *BATCH]
+
+
+def maker_of(name: str) -> Any:
+    """Return the class or function that makes an estimator; a SettingsError where its package is broken."""
+    made_by = ONLINE.get(name) or BATCH[name]
+    return made_by.maker if isinstance(made_by, Elsewhere) else made_by
+
+
+def module_of(name: str) -> str:
+    """Return the module of what makes an estimator."""
+    made_by = ONLINE.get(name) or BATCH[name]
+    return made_by.point.module if isinstance(made_by, Elsewhere) else str(made_by.__module__)
+
+
+def parameters_of(name: str) -> Any:
+    """Return the default parameters of an estimator's own, a frozen dataclass; None where it has none."""
+    made_of = getattr(maker_of(name), PARAMETERS, None)
+    return None if made_of is None else made_of()
+
+
+def reads(name: str, field: str) -> bool:
+    """Whether an estimator reads a setting, by its dotted name; one that does not say which reads all."""
+    known = getattr(maker_of(name), "__dict__", {}).get(READS)  # a subclass may read more
+    return known is None or any(f"{field}.".startswith(f"{own}.") for own in (*ALWAYS_READ, *known))
+
+
+def check_estimator(name: str, settings: MapperSettings, parameters: Any = None) -> None:
+    """Make an estimator of another package once; a SettingsError says what is broken in it."""
+    made_by = ONLINE.get(name) or BATCH[name]
+    if isinstance(made_by, Elsewhere):
+        maker = made_by.maker
+        try:
+            _make(maker, settings, known_noise(None), parameters)
+        except Exception as error:
+            raise made_by.broken(error) from error
+
+
+def _make(made_by: Any, settings: MapperSettings, noise: KnownNoise, parameters: Any) -> Any:
+    return made_by(settings, noise) if parameters is None else made_by(settings, noise, parameters)
 
 
 def check_online(name: str, option: str = "--estimator") -> None:
@@ -74,15 +144,17 @@ def check_batch(name: str) -> None:
     check_name(name, BATCH, f"--estimator: expected a known batch estimator ({', '.join(sorted(BATCH))})")
 
 
-def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
+def make_online(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> OnlineEstimator:
     """Return an online estimator for a log, which tells the scale where the settings leave it open."""
     check_online(name)
     settings = known_settings(settings)
     settings = with_kind(replace(settings, scale=chosen_scale(settings, log)), log)
-    return ONLINE[name](settings, log.noise)
+    made: OnlineEstimator = _make(ONLINE[name], settings, log.noise, parameters or parameters_of(name))
+    return made
 
 
-def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:
+def make_batch(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> BatchEstimator:
     check_batch(name)
     check_type("log", log, Log)
-    return BATCH[name](settings, log.noise)
+    made: BatchEstimator = _make(BATCH[name], settings, log.noise, parameters or parameters_of(name))
+    return made

@@ -20,7 +20,7 @@ OPTIONAL: Final = ("offered", "health", "reason", "dropped")  # columns of `cycl
 RESULTS_FILE: Final = "results.csv"  # file of a study's metrics, a row for each run and lap
 TIMES_FILE: Final = "times.csv"  # file of a study's wall times, in the same rows
 KEYS: Final = ("study", "track", "seed", "noise", "estimator", "variant", "lap")  # which tell rows apart
-TEXTS: Final = ("study", "track", "noise", "estimator", "variant", "failure", "notices")
+TEXTS: Final = ("study", "track", "noise", "estimator", "variant", "failure", "notices", "drive", "cell")
 """Columns of a study that are text, also where it looks like a number."""
 DIMENSIONS: Final = KEYS[1:]  # dimensions of a study's metrics
 

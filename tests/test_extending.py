@@ -25,8 +25,9 @@ from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.graph.window import WindowFactors
 from pathspace_graph.io.log import write_log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.loop import open as open_phase
+from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim import track_files
 
 from .scenes.drives import exact_log, noisy_lap, replay, true_poses
@@ -68,7 +69,7 @@ def page(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
 
 def test_the_three_answers_are_short_and_in_this_order() -> None:
     headings = re.findall(r"^## (.*)$", text_of(EXTENDING), flags=re.MULTILINE)
-    assert headings == ["A new sensor", "A new factor", "A new phase"]
+    assert headings == ["A new sensor", "A new factor", "A new phase", "Another part"]
     for block in blocks(EXTENDING, "python"):
         assert sum(bool(line) for line in block.splitlines()) <= MOST_LINES
 
@@ -192,8 +193,7 @@ def test_the_new_phase_freezes_the_map_in_the_pit_lane(
     drive = noisy_lap()
     beside, middle = np.array([0.0, 0.5]), true_poses(drive)[180, :2]
     monkeypatch.setattr(circuit.Circuit, "lane", (middle, 8.0))
-    monkeypatch.setattr(open_phase, "Closed", circuit.Circuit)
-    mapper, frozen, conditions = FixedLagMapper(odometry_sigma=drive.odometry_sigma), [], []
+    mapper, frozen, conditions = circuit.PitMapper(odometry_sigma=drive.odometry_sigma), [], []
     for odometry, seen in islice(split_odometry(drive), 205):
         if isinstance(mapper.phase, pit_lane.PitLane):
             result = replay(mapper, odometry, replace(seen, points_vehicle=seen.points_vehicle + beside))
@@ -206,6 +206,46 @@ def test_the_new_phase_freezes_the_map_in_the_pit_lane(
     assert set(conditions[:-1]) == {(0, "degraded")}
     assert isinstance(mapper.phase, circuit.Circuit)
     assert result.readings > 5 and result.health.condition == "good"
+
+
+# --- another part ----------------------------------------------------------------------------------------
+
+
+def mapped(mapper: FixedLagMapper, log: Log) -> FixedLagMapper:
+    for odometry, detections in split_odometry(log):
+        mapper.update(odometry, detections, strict=True)
+    return mapper
+
+
+def test_another_loss_weighs_the_rows(log: Log, page: Callable[[str], ModuleType]) -> None:
+    """The rows r w of a residual r by Cauchy's loss have the root weight w = 1 / sqrt(1 + (r / 2)^2)."""
+    cauchy = page("cauchy")
+    plain = MapperSettings(gate=replace(MapperSettings().gate, huber=np.inf))
+    mapper = mapped(cauchy.CauchyMapper(plain, log.odometry_sigma), log)
+    curves = mapper.road.smoother.map
+    assert isinstance(curves, cauchy.CauchyMap)
+    cycles = mapper.road.smoother.cycles
+    (own, *_), (unweighted, *_) = curves.rows(cycles), CurveMap.rows(curves, cycles)
+    large = np.abs(unweighted.residual).argmax()
+    assert abs(unweighted.residual[large]) > 1.0
+    weight = 1.0 / np.sqrt(1.0 + (unweighted.residual / 2.0) ** 2)
+    np.testing.assert_allclose(own.residual, weight * unweighted.residual)
+    np.testing.assert_allclose(own.jacobian[large], weight[large] * unweighted.jacobian[large])
+    usual = mapped(FixedLagMapper(odometry_sigma=log.odometry_sigma), log)
+    apart = mapper.poses[-1] - usual.poses[-1]
+    assert 1e-6 < np.hypot(*apart[:2]) < 0.2
+
+
+def test_another_association_uses_what_it_says(log: Log, page: Callable[[str], ModuleType]) -> None:
+    near = mapped(page("near").NearMapper(odometry_sigma=log.odometry_sigma), log)
+    usual = mapped(FixedLagMapper(odometry_sigma=log.odometry_sigma), log)
+
+    def farthest(mapper: FixedLagMapper) -> float:
+        detections = mapper.road.smoother.map.detections
+        return float(np.hypot(*detections.measured[detections.used].T).max())
+
+    assert farthest(near) <= 8.0 < farthest(usual)
+    assert np.hypot(*(near.poses[-1] - usual.poses[-1])[:2]) < 0.5
 
 
 # --- a new estimator -------------------------------------------------------------------------------------

@@ -11,29 +11,32 @@ import numpy as np
 import pandas as pd
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.errors import InputError, check_name
+from pathspace_graph.errors import check_name
 from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
 from pathspace_graph.eval.metrics.measures import online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.summary import has_cones, summarize, versions
-from pathspace_graph.io.files import atomic_folder, is_temporary, write_json, write_text
-from pathspace_graph.io.log import LOG_FILE
+from pathspace_graph.io.files import atomic_folder, write_json, write_text
 from pathspace_graph.io.results import BatchRun, write_result
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
-from .cells import Cell, NamedLog, Outcome, run_cell
-from .frame import add_batch, difference, write_csv
+from .cells import Cell, Outcome, run_cell
+from .drives import NamedLog, log_folders
+from .frame import add_batch, write_csv
 from .plots import blind_spot_figure, plot_maps
 from .run import OnCell, run_cells
-from .study import known_estimators
+from .statistics import difference, estimate
 from .tables import TextTable, group_starts
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
 RUN: Final = ("log", "estimator")
-_PRINTED: Final = ("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "size", "ate", "ms_mean")
+WITHOUT_TRUTH: Final = (  # metrics that say something of a log without true cones
+    *("size", "closed_at_end", "end_off", "crossings", "reported_degraded", "reported_lost", "ms_mean"),
+)
+_PAIRED: Final = ("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "ate", *WITHOUT_TRUTH)
 """Metrics whose differences are in the table; the file has all."""
 
 
@@ -89,19 +92,14 @@ class Comparison:
 
 def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedLog, ...]:
     """Return the log of a log folder, or those of a folder of log folders; InputError if it is neither."""
-    folders = {folder.resolve().name: folder}
-    if folder.is_dir() and not (folder / LOG_FILE).exists():
-        entries = sorted(entry for entry in folder.iterdir() if not is_temporary(entry.name))
-        folders = {entry.name: entry for entry in entries if (entry / LOG_FILE).is_file()}
-    if not folders:
-        raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
+    folders = log_folders(folder)
     read = {name: read_plausible_log(entry, limits or LimitSettings()) for name, entry in folders.items()}
     return tuple(NamedLog(name, log, tuple(hints)) for name, (log, hints) in read.items())
 
 
 def choose(names: Sequence[str]) -> tuple[str, ...]:
     """Return estimators by name, or all that are known if none is named; SettingsError if one is unknown."""
-    known = known_estimators()
+    known = registry.known_estimators()
     for name in names:
         check_name(name, known, "--estimators: expected a known estimator")
     return tuple(dict.fromkeys(names or known))
@@ -137,13 +135,16 @@ def compare(
 
 
 def tables(comparison: Comparison) -> dict[str, TextTable]:
-    """Return the printed tables by the name of their files, differences only where runs can be paired."""
-    printed = {"table": paper_table(comparison), "metrics": final_table(comparison)}
-    return printed | ({"paired": paired_table(comparison)} if comparison.paired else {})
+    """Return the tables by the name of their files, differences only where runs can be paired."""
+    short = paper_table(comparison) if comparison.has_truth else final_table(comparison, WITHOUT_TRUTH)
+    found = {"table": short, "metrics": final_table(comparison)}
+    return found | ({"paired": paired_table(comparison)} if comparison.paired else {})
 
 
 def paper_frame(comparison: Comparison) -> pd.DataFrame:
     """Return rmse (m), missed (share) and size of each estimator and lap, means over `logs` logs.
+
+    `rmse_half` and so on are half the widths of their 95 % intervals.
 
     An estimator that completed no lap on any log has a row without a lap, of its maps at the end of the logs.
     """
@@ -154,28 +155,29 @@ def paper_frame(comparison: Comparison) -> pd.DataFrame:
         runs = frame[frame["estimator"] == estimator]
         laps = runs[runs["scope"] == "lap"]
         for lap, over_logs in laps.groupby("lap") if len(laps) else [(np.nan, runs)]:
-            means = over_logs[keys].astype(float).mean().to_dict()
-            rows.append({"estimator": estimator, "lap": lap, "logs": len(over_logs)} | means)
+            found = {key: estimate(over_logs[key].astype(float).dropna().to_numpy()) for key in keys}
+            values = {name: of.mean for name, of in found.items()}
+            values |= {f"{name}_half": of.half for name, of in found.items()}
+            rows.append({"estimator": estimator, "lap": lap, "logs": len(over_logs)} | values)
     return pd.DataFrame(rows).astype({"lap": "Int64"})
 
 
 def paper_table(comparison: Comparison) -> TextTable:
-    """Return the paper's Table 1, lap by lap; without truth it has the sizes only."""
-    shown = PAPER if comparison.has_truth else (METRICS["size"],)
+    """Return the paper's Table 1, lap by lap."""
     logs = ["logs"] if len(comparison.logs) > 1 else []
     rows = []
     for row in paper_frame(comparison).to_dict("records"):
         lap = ("end" if row["logs"] else "failed") if pd.isna(row["lap"]) else str(int(row["lap"]))
-        cells = (*(str(row[key]) for key in logs), *(_cell(metric, row) for metric in shown))
+        cells = (*(str(row[key]) for key in logs), *(_cell(metric, row) for metric in PAPER))
         rows.append((row["estimator"], lap, *cells))
-    header = ("estimator", "lap", *logs, *(metric.heading for metric in shown))
+    header = ("estimator", "lap", *logs, *(metric.heading for metric in PAPER))
     return TextTable(_title(comparison, "at the end of each lap"), header, tuple(rows), group_starts(rows))
 
 
-def final_table(comparison: Comparison) -> TextTable:
-    """Return the means over the logs of every metric of whole logs, with a column for each estimator."""
+def final_table(comparison: Comparison, keys: Sequence[str] = tuple(METRICS)) -> TextTable:
+    """Return the means over the logs of metrics of whole logs, with a column for each estimator."""
     final, names = comparison.final, comparison.estimators
-    known = [m for m in METRICS.values() if m.key in final and not final[m.key].astype(float).isna().all()]
+    known = [METRICS[key] for key in keys if key in final and final[key].astype(float).notna().any()]
     rows = tuple(
         (m.heading, *(m.text(m.over(final.loc[final["estimator"] == name, m.key])) for name in names))
         for m in known
@@ -201,7 +203,7 @@ def paired_table(comparison: Comparison) -> TextTable:
     paired = paired_frame(comparison)
     others = [name for name in comparison.estimators if name != comparison.reference]
     rows = []
-    for metric in (METRICS[key] for key in _PRINTED):
+    for metric in (METRICS[key] for key in _PAIRED):
         by_estimator = paired[paired["metric"] == metric.key].set_index("estimator")
         if by_estimator["mean"].notna().any():
             rows.append((metric.heading, *(_interval(metric, by_estimator.loc[name]) for name in others)))
@@ -240,7 +242,10 @@ def _title(comparison: Comparison, when: str) -> str:
 
 
 def _cell(metric: Metric, row: dict[Any, Any]) -> str:
-    return metric.text(float(row.get(metric.key, np.nan)))
+    """Return a value, with its spread where there is one."""
+    half = float(row.get(f"{metric.key}_half", np.nan))
+    spread = "" if np.isnan(half) else f" ± {metric.factor * half:.{metric.digits}f}"
+    return f"{metric.text(float(row.get(metric.key, np.nan)))}{spread}"
 
 
 # --- files -----------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from pathspace_graph.io.files import write_json, write_text
 from pathspace_graph.plausibility.diagnosis import PRIOR_LIMIT
 
 from .frame import RUN, last_laps, write_csv, write_results
-from .study import Study, find_study, read_study
+from .study import Study, find_study, read_study_file
 from .tables import TextTable, group_starts
 
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
@@ -60,7 +60,7 @@ def fault_of(noise: str) -> Fault:
 
 
 def suite() -> Study:
-    return read_study(find_study(Path("faults")))
+    return read_study_file(find_study(Path("faults")))
 
 
 def by_kind(study: Study) -> list[list[str]]:

@@ -1,4 +1,4 @@
-"""The one frame: results with a row for each run and lap, its views, and paired statistics of it."""
+"""The one frame: results with a row for each run and lap, its views, and what differs in it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,37 +8,37 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
-from scipy import stats
 
 from pathspace_graph.estimators import DEFAULT_BATCH
 from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.summary import versions
-from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import replacing
 from pathspace_graph.io.overrides import leaves
 
-from .cells import Cell, Drive, Record
+from .cells import Cell, Record
+from .drives import AnyDrive
+from .statistics import LEVEL, Estimate, by_track, estimate, holm, paired_p, wilcoxon_p
 from .study import Study
 
 COMBINATION: Final = ("noise", "estimator", "variant")  # columns of a combination, which is compared
 RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on the same drive and noise
 RUN_OF: Final = (*RUN, *COMBINATION)
 TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)  # wall times
-LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
+MADE: Final = ("commit", "host", "processor", "blas", "date", "command")  # where and when a run was made
 
 
-def frame_of(study: Study, cells: Sequence[tuple[Cell[Drive], Record | None]]) -> pd.DataFrame:
+def frame_of(study: Study, cells: Sequence[tuple[Cell[AnyDrive], Record | None]]) -> pd.DataFrame:
     """Return a row for each run and lap, or one for a failed run; every varied setting is a column."""
     rows = []
     for cell, record in cells:
         assert record is not None, "every cell has been run by now"
         shared = {"study": study.name} | cell.names | _settings_row(study, cell)
-        about = {"failure": record["failure"], "notices": record["notices"], **record["versions"]}
+        about = {"failure": record["failure"], "notices": record["notices"], **record["made"]}
+        about |= {"drive": cell.drive.source, "cell": cell.id}
         rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
     add_batch(rows, (*RUN, "noise", "variant"))
     settings = _settings_row(study, cells[0][0])
-    order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions()]
+    order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions(), "drive", "cell"]
     known = dict.fromkeys([*order, *(name for row in rows for name in row)])
     frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
     return frame.astype({"lap": "Int64"})
@@ -57,22 +57,27 @@ def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
             row["rmse_by_batch"] = float(row["rmse"] / batch["rmse"])
 
 
-def _settings_row(study: Study, cell: Cell[Drive]) -> dict[str, Any]:
-    settings, simulation = leaves(cell.settings), leaves(cell.drive.simulation)
-    row = {f"simulation.{name}": simulation[name] for name in study.varied_noise}
+def _settings_row(study: Study, cell: Cell[AnyDrive]) -> dict[str, Any]:
+    """Return the varied settings of a cell; one that its estimator does not have is None."""
+    settings, simulated = leaves(cell.settings), cell.drive.simulation
+    simulation = {} if simulated is None else leaves(simulated)
+    if cell.parameters is not None:
+        settings |= {f"{cell.estimator}.{name}": value for name, value in leaves(cell.parameters).items()}
+    row = {f"simulation.{name}": simulation.get(name) for name in study.varied_noise}
     own = {"study", *RUN_OF}
-    row |= {f"settings.{name}" if name in own else name: settings[name] for name in study.varied}
+    row |= {f"settings.{name}" if name in own else name: settings.get(name) for name in study.varied}
     return {name: " ".join(map(str, v)) if isinstance(v, tuple) else v for name, v in row.items()}
 
 
 def without_times(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the columns that are the same whenever the study is run."""
-    return frame.drop(columns=[*TIMES], errors="ignore")
+    return frame.drop(columns=[*TIMES, *MADE], errors="ignore")
 
 
 def write_results(frame: pd.DataFrame, out: Path) -> None:
+    """Write the results, and apart from them how long they took, and where and when they were made."""
     write_csv(out / "results.csv", without_times(frame))
-    times = [name for name in TIMES if name in frame]
+    times = [name for name in (*TIMES, *MADE) if name in frame]
     write_csv(out / "times.csv", frame[["study", *RUN_OF, "lap", *times]])
 
 
@@ -88,77 +93,20 @@ def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
     return finished.groupby(list(RUN_OF), sort=False).tail(1)
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Mean and its 95 % interval by Student's t over runs."""
-
-    mean: float  # NaN without runs
-    half: float  # half the width of the interval; NaN for fewer than two runs
-    count: int  # number of runs, or of pairs of runs
-
-    @property
-    def low(self) -> float:
-        return self.mean - self.half
-
-    @property
-    def high(self) -> float:
-        return self.mean + self.half
-
-
-def estimate(values: Array) -> Estimate:
-    """Return the mean of the values (n,) and its interval, mean -+ t(0.975, n - 1) s / sqrt(n)."""
-    n = len(values)
-    if n < 2:
-        return Estimate(float(values[0]) if n else float("nan"), float("nan"), n)
-    half = float(stats.t.ppf(0.5 + LEVEL / 2, n - 1) * stats.sem(values))
-    return Estimate(float(np.mean(values)), half, n)
-
-
-def difference(values: ArrayLike, reference: ArrayLike) -> Estimate:
-    """Return the estimate of values - reference (n,) over the pairs of which both are finite."""
-    own, others = np.asarray(values, dtype=float), np.asarray(reference, dtype=float)
-    finite = np.isfinite(own) & np.isfinite(others)
-    return estimate(own[finite] - others[finite])
-
-
-def paired_p(differences: Array) -> float:
-    """Return the two-sided p of the paired t-test that the mean of the differences (n,) is 0.
-
-    It is NaN for fewer than two pairs. Without any spread it is 1 where all differences are 0, else 0.
-    """
-    if len(differences) < 2:
-        return float("nan")
-    if np.ptp(differences) == 0.0:
-        return float(differences[0] == 0.0)
-    return float(stats.ttest_1samp(differences, 0.0).pvalue)
-
-
-def holm(p: Array) -> Array:
-    """Return p (m,) corrected by Holm's method.
-
-    The i-th smallest becomes `max over j <= i of (m - j) p_(j)`, j from 0, at most 1. NaN isn't counted and
-    stays NaN. scipy.stats corrects the false discovery rate only, so this is written by hand.
-    """
-    corrected = np.full(len(p), np.nan)
-    known = np.flatnonzero(~np.isnan(p))
-    order = known[np.argsort(p[known], kind="stable")]
-    factors = len(order) - np.arange(len(order))
-    corrected[order] = np.minimum(np.maximum.accumulate(factors * p[order]), 1.0)
-    return corrected
-
-
 @dataclass(frozen=True)
 class Contrast:
-    """One metric of one combination, and its difference from the baseline, run by run."""
+    """One metric of one combination, and its difference from the baseline, drive by drive."""
 
     noise: str
     estimator: str
     variant: str
     metric: str  # key of the metric
-    value: Estimate  # mean over all runs, each at the end of its last lap
-    difference: Estimate | None  # mean over the pairs; None for the baseline itself
-    differences: tuple[float, ...] = ()
-    p: float = float("nan")  # p of the paired t-test, corrected for all comparisons of the metric
+    runs: int  # number of runs with a value at the end of their last lap
+    value: Estimate  # mean over the tracks
+    difference: Estimate | None  # mean over the tracks; None for the baseline itself
+    differences: tuple[float, ...] = ()  # of each track, or of each drive of a single track
+    p: float = float("nan")  # p of the paired t-test over them, corrected for all hypotheses of the metric
+    wilcoxon: float = float("nan")  # p of Wilcoxon's signed-rank test over them, not corrected
 
     @property
     def significant(self) -> bool:
@@ -167,18 +115,24 @@ class Contrast:
 
 
 def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
-    """Return every combination against the baseline of its noise, in the study's order."""
+    """Return every combination against the baseline of its noise, in the study's order.
+
+    Nothing is tested where all differences are 0, as between cells that mean the same, nor of a wall time,
+    which depends on what else the machine does.
+    """
     known = last_laps(frame).astype({metric: float}).dropna(subset=[metric])
     runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
-    nothing, contrasted = pd.Series(dtype=float), []
-    for key in product(study.noise, study.estimators, study.points):
+    nothing = pd.Series(dtype=float, index=pd.MultiIndex.from_arrays([[], []], names=RUN))
+    contrasted = []
+    for key in product(study.noises, study.estimators, study.points):
         base = (key[0], study.baseline.estimator or key[1], study.baseline_variant)
         values, against = runs.get(key, nothing), runs.get(base, nothing)
-        contrast = Contrast(*key, metric, estimate(values.to_numpy()), None)
+        contrast = Contrast(*key, metric, len(values), estimate(by_track(values).to_numpy()), None)
         if key != base:
-            shared = values.index[values.index.isin(against.index)]
-            d = values[shared].to_numpy() - against[shared].to_numpy()
-            contrast = replace(contrast, difference=estimate(d), differences=tuple(d.tolist()), p=paired_p(d))
+            d = by_track((values - against).dropna()).to_numpy()
+            contrast = replace(contrast, difference=estimate(d), differences=tuple(d.tolist()))
+            if d.any() and not METRICS[metric].time:
+                contrast = replace(contrast, p=paired_p(d), wilcoxon=wilcoxon_p(d))
         contrasted.append(contrast)
     corrected = holm(np.array([contrast.p for contrast in contrasted]))
     return [replace(contrast, p=float(p)) for contrast, p in zip(contrasted, corrected, strict=True)]

@@ -1,28 +1,33 @@
 """Cells that run in parallel, each kept at once, so that an experiment that was killed goes on."""
 
 import os
+import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import pandas as pd
 from joblib import Parallel, delayed, parallel_config
 
+from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, OutputError, SettingsError
-from pathspace_graph.io.files import check_target, remove_manifest, to_plain, write_json
-from pathspace_graph.io.overrides import flatten
-from pathspace_graph.io.parsing import read_json
+from pathspace_graph.eval.metrics.reference import aligned_distance
+from pathspace_graph.io.files import check_target, remove_manifest, write_json
+from pathspace_graph.io.map import MAP_FILE, Map, read_map
+from pathspace_graph.io.parsing import read_json, shown
 from pathspace_graph.loop.worker import end_with
 from pathspace_graph.sim.track import Track
 
 from . import cells as store
-from .cells import CELLS, Cell, Drive, Outcome, Record, load_tracks, track_digest
+from .cells import Cell, Outcome, Record
+from .drives import AnyDrive, Drive, RecordedDrive, load_tracks, track_digest
 from .frame import frame_of
+from .provenance import code_of, here
 from .study import Study
 
 C = TypeVar("C")
@@ -31,7 +36,6 @@ R = TypeVar("R")
 FORMAT: Final = "pathspace-study/1"
 STUDY_FILE: Final = "study.json"
 CONNECT_SECONDS: Final = 20.0  # time (s) within which a cluster has to answer
-_PRESENTATION: Final = ("question", "metrics", "columns")  # keys on which no cell depends
 
 OnCell = Callable[[int, int], None]  # called with the numbers of cells that are done, and of all
 
@@ -82,7 +86,7 @@ class Plan:
 
     study: Study
     tracks: tuple[Track, ...]
-    cells: tuple[Cell[Drive], ...]
+    cells: tuple[Cell[AnyDrive], ...]
 
     def resolved(self) -> dict[str, Any]:
         """Return the content of `study.json`: the study with every default written out."""
@@ -92,63 +96,113 @@ class Plan:
             "format": FORMAT,
             **{name: getattr(study, name) for name in same},
             "tracks": [{"name": track.name, "digest": track_digest(track)} for track in self.tracks],
+            "logs": {track: [folder.name for folder in folders] for track, folders in study.logs.items()},
             "noise": {name: asdict(study.simulation(name)) for name in study.noise},
-            "variants": {name: asdict(settings) for name, settings in study.points.items()},
+            "variants": {name: asdict(variant.settings) for name, variant in study.points.items()},
+            "parameters": {
+                name: {of: asdict(own) for of, own in variant.parameters}
+                for name, variant in study.points.items()
+                if variant.parameters
+            },
             "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
             "reference_limits": study.reference_limits,
         }
 
-    def stale(self, out: Path) -> int:
-        """Return the number of kept cells that are of other code, and so are not used."""
-        known = {cell.id for cell in self.cells}
-        return sum(file.stem not in known for file in (out / CELLS).glob("[!.]*.json"))
 
+def make_plan(study: Study, *, keep: bool = False) -> Plan:
+    """Read and generate the tracks, and return the cells, grouped by the log that they share.
 
-def make_plan(study: Study) -> Plan:
-    """Read and generate the tracks, and return the cells, grouped by the log that they share."""
+    With `keep`, the map, trajectory, cycles and summary of each are kept.
+
+    A SettingsError says what is broken in an estimator of another package.
+    """
     tracks, points = tuple(load_tracks(study.tracks)), study.points
+    for name, variant in product(study.estimators, points.values()):
+        registry.check_estimator(name, variant.settings, dict(variant.parameters).get(name))
+    code, began = {name: code_of(name) for name in study.estimators}, here()
     measured = {"marginals": True, "reference_limits": study.reference_limits, "whole": False}
-    drives = product(study.noise, tracks, study.seeds)
+    drives: list[AnyDrive] = [
+        Drive(track, seed, noise, study.simulation(noise))
+        for noise, track, seed in product(study.noise, tracks, study.seeds)
+    ]
+    for track, folders in study.logs.items():
+        drives += [RecordedDrive(track, number, folder) for number, folder in enumerate(folders)]
     cells = tuple(
-        Cell(drive, estimator, settings, variant, measured)
-        for drive in (Drive(track, seed, noise, study.simulation(noise)) for noise, track, seed in drives)
-        for estimator, (variant, settings) in product(study.estimators, points.items())
+        Cell(
+            *(drive, estimator, variant.settings, name, measured),
+            parameters=dict(variant.parameters).get(estimator),
+            keep=keep,
+            code=code[estimator],
+            began=began,
+        )
+        for drive in drives
+        for estimator, (name, variant) in product(study.estimators, points.items())
     )
     return Plan(study, tracks, cells)
 
 
-def run_study(study: Study, out: Path | str | None = None, **how: Any) -> pd.DataFrame:
+def run_study(study: Study, out: Path | str | None = None, *, keep: bool = False, **how: Any) -> pd.DataFrame:
     """Run the cells of a study that are missing, and return all of its results, a row per run and lap.
 
-    Finished cells are kept in the folder `out`, if there is one. `how` is that of `run_plan`.
+    Finished cells are kept in the folder `out`, if there is one, and with `keep` what each has made. `how` is
+    that of `run_plan`.
     """
     with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
-        return run_plan(make_plan(study), Path(folder), **how)
+        return run_plan(make_plan(study, keep=keep), Path(folder), **how)
 
 
 def run_plan(plan: Plan, out: Path, *, retry_failed: bool = False, **how: Any) -> pd.DataFrame:
-    """Run a study, OutputError in another's folder; `how`: `jobs`, `cluster`, `on_cell` of `run_cells`."""
+    """Run a study, OutputError in another's folder; `how`: `jobs`, `cluster`, `on_cell` of `run_cells`.
+
+    Cells that mean the same, since their estimator does not read what is varied, are run once.
+    """
     check_folder(out, plan)
     remove_manifest(out)  # of a study that goes on; the last step writes it again
+    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
-    def kept(cell: Cell[Drive]) -> Record | None:
+    def kept(cell: Cell[AnyDrive]) -> Record | None:
         record = store.read_record(out, cell)
         return None if record is not None and retry_failed and record["failure"] else record
 
+    def write(cell: Cell[AnyDrive], record: Record) -> None:
+        record["made"]["command"] = command
+        store.write_record(out, cell, record)
+
+    cells = [*{cell.id: cell for cell in reversed(plan.cells)}.values()][::-1]
     records = run_cells(
-        plan.cells,
+        cells,
         store.record_cell,
         lambda cell, error: store.record_of(cell, Outcome.failed(cell, error)),
         begin=lambda: write_json(out / STUDY_FILE, plan.resolved(), indent=1),
         read=kept,
-        write=lambda cell, record: store.write_record(out, cell, record),
+        write=write,
         **how,
     )
-    return frame_of(plan.study, list(zip(plan.cells, records, strict=True)))
+    by_id = {cell.id: record for cell, record in zip(cells, records, strict=True)}
+    add_agreement(out, cells, by_id)
+    return frame_of(plan.study, [(cell, by_id[cell.id]) for cell in plan.cells])
+
+
+def add_agreement(out: Path, cells: Sequence[Cell[AnyDrive]], records: Mapping[str, Record]) -> None:
+    """Add how far each kept map of a recorded log is from those of the other logs of its track (m)."""
+    maps = dict[tuple[Any, ...], dict[str, Map]]()
+    for cell in cells:
+        if isinstance(cell.drive, RecordedDrive) and (store.run_folder(out, cell) / MAP_FILE).exists():
+            key = (cell.drive.track, cell.estimator, cell.settings, cell.parameters)
+            maps.setdefault(key, {})[cell.id] = read_map(store.run_folder(out, cell))
+    for alike in maps.values():
+        for one, other in combinations(alike, 2):
+            apart = aligned_distance(alike[one], alike[other])
+            for cell_id in (one, other):
+                for lap in records[cell_id]["laps"]:
+                    lap["agreement"] = lap.get("agreement", 0.0) + apart / (len(alike) - 1)
 
 
 def check_folder(out: Path, plan: Plan) -> None:
-    """Raise OutputError if the folder holds another study, or something else."""
+    """Raise OutputError if the folder holds something else, or a study of another name.
+
+    One of the name may have changed: cells are used wherever they mean the same.
+    """
     check_target(out, STUDY_FILE)
     file = out / STUDY_FILE
     if not file.is_file():
@@ -157,18 +211,9 @@ def check_folder(out: Path, plan: Plan) -> None:
         found = read_json(file, "a study")
     except InputError as error:
         raise OutputError(str(error)) from error
-    if not isinstance(found, dict):
-        raise OutputError(f"{file}: expected a study, found {type(found).__name__}")
-    expected, other = (
-        flatten({key: value for key, value in content.items() if key not in _PRESENTATION})
-        for content in (to_plain(plan.resolved()), found)
-    )
-    for name in expected | other:
-        if expected.get(name) != other.get(name):
-            raise OutputError(
-                f"{file}: expected the study that is to be run, with {name} = {expected.get(name)}, "
-                f"found another, with {other.get(name)}"
-            )
+    name = found.get("name") if isinstance(found, dict) else None
+    if name != plan.study.name:
+        raise OutputError(f"{file}: expected the study {plan.study.name}, found {shown(name)}")
 
 
 # --- workers ---------------------------------------------------------------------------------------------

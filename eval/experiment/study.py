@@ -15,6 +15,8 @@ from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_VARIANTS, parse_tom
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
 
+from .drives import RECORDED, log_folders
+
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
 DEFAULT: Final = "default"  # variant that overrides nothing, part of every study
 PRESET: Final = "preset"  # entry of a noise that names a preset, as in `sensor.preset = "camera"`
@@ -22,9 +24,12 @@ ALL: Final = "all"  # name that stands for all known estimators
 _LISTS: Final = ("tracks", "seeds", "estimators", "metrics", "columns")
 
 
-def known_estimators() -> list[str]:
-    """Return the name of every estimator, online ones first."""
-    return [*registry.ONLINE, *registry.BATCH]
+@dataclass(frozen=True)
+class Variant:
+    """What one variant runs: the settings, and the own parameters of the estimators that have any."""
+
+    settings: MapperSettings
+    parameters: tuple[tuple[str, Any], ...] = ()  # pairs of an estimator and its frozen dataclass
 
 
 @dataclass(frozen=True)
@@ -40,8 +45,10 @@ class Baseline:
 class Study:
     """Grid of tracks x seeds x noise x estimators x settings, checked when it is made."""
 
-    tracks: tuple[Path | int, ...]
+    tracks: tuple[Path | int, ...] = ()
     """Track files, and seeds of generated tracks."""
+    logs: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
+    """Recorded logs by the name of their track, which are driven beside or instead of simulated ones."""
     seeds: tuple[int, ...] = (0,)
     laps: int = 5
     name: str = "study"
@@ -51,7 +58,8 @@ class Study:
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
     """Overrides of the simulation by the name of a noise."""
     variants: Mapping[str, Overrides] = field(default_factory=dict)
-    """Overrides of the settings by the name of a variant; `default` is always there."""
+    """Overrides of the settings by the name of a variant; `default` is always there. `NAME.field` is of the
+    own parameters of an estimator."""
     grids: tuple[Mapping[str, Sequence[Any]], ...] = ()
     """Values by dotted field; every combination is a variant with a name such as `lag=1, steps=2`."""
     baseline: Baseline = field(default_factory=Baseline)
@@ -71,8 +79,10 @@ class Study:
             object.__setattr__(self, name, (value,) if isinstance(value, str) else tuple(value))
         tracks = tuple(Path(track) if isinstance(track, str) else track for track in self.tracks)
         object.__setattr__(self, "tracks", tracks)
+        logs = {track: tuple(map(Path, folders)) for track, folders in self.logs.items()}
+        object.__setattr__(self, "logs", logs)
         if self.estimators == (ALL,):
-            object.__setattr__(self, "estimators", tuple(known_estimators()))
+            object.__setattr__(self, "estimators", tuple(registry.known_estimators()))
         self._check_lists()
         if not isinstance(self.reference_limits, bool):
             raise SettingsError(
@@ -92,9 +102,14 @@ class Study:
             check_name(self.baseline.estimator, self.estimators, expected)
 
     def _check_lists(self) -> None:
+        if not self.tracks and not self.logs:
+            expected = "track files, or seeds of generated tracks"
+            raise SettingsError(f"tracks: expected at least one of {expected}, or drives.logs, found none")
         for name in ("tracks", "seeds", "estimators", "noise", "metrics"):
             values = getattr(self, name)
-            if len(values) == 0 or len({repr(value) for value in values}) != len(values):
+            if (len(values) == 0 and name != "tracks") or len({repr(value) for value in values}) != len(
+                values
+            ):
                 expected = "expected at least one, and none twice"
                 raise SettingsError(f"{name}: {expected}, found {shown(list(values))}")
         generated = [track for track in self.tracks if not isinstance(track, Path)]
@@ -103,7 +118,7 @@ class Study:
                 if type(value) is not int or value < 0:
                     raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
         for name in self.estimators:
-            check_name(name, known_estimators(), "estimators: expected a known estimator")
+            check_name(name, registry.known_estimators(), "estimators: expected a known estimator")
         for name in self.metrics:
             check_name(name, METRICS, "metrics: expected a known metric")
         for column in self.columns:
@@ -117,17 +132,22 @@ class Study:
         return replace(override(preset(chosen), overrides, f"noise.{noise}"), laps=self.laps)
 
     @property
-    def points(self) -> dict[str, MapperSettings]:
-        """Settings to run by name; of variants with equal settings the first."""
+    def points(self) -> dict[str, Variant]:
+        """Variants to run by name; of those that are equal the first."""
         named = [*self._named().items()]
-        first = {settings: name for name, settings in reversed(named)}
-        return {name: settings for name, settings in named if first[settings] == name}
+        first = {variant: name for name, variant in reversed(named)}
+        return {name: variant for name, variant in named if first[variant] == name}
+
+    @property
+    def noises(self) -> list[str]:
+        """Names of the noises of all drives."""
+        return [*(self.noise if self.tracks else ()), *([RECORDED] if self.logs else [])]
 
     @property
     def baseline_variant(self) -> str:
         """Name of the baseline among `points`."""
         wanted = self._named()[self.baseline.variant]
-        return next(name for name, settings in self.points.items() if settings == wanted)
+        return next(name for name, variant in self.points.items() if variant == wanted)
 
     @property
     def varied(self) -> tuple[str, ...]:
@@ -141,14 +161,25 @@ class Study:
         names = dict.fromkeys(name for overrides in self.noise.values() for name in overrides)
         return tuple(name for name in names if not name.endswith(f".{PRESET}"))
 
-    def _named(self) -> dict[str, MapperSettings]:
-        points = {DEFAULT: MapperSettings()}
+    def _named(self) -> dict[str, Variant]:
+        points = {DEFAULT: self._variant({}, "")}
         for name, overrides in self.variants.items():
-            points[name] = override(MapperSettings(), overrides, f"variants.{name}")
+            points[name] = self._variant(overrides, f"variants.{name}")
         for grid in self.grids:
             for name, overrides in _grid(grid).items():
-                points[name] = override(MapperSettings(), overrides, "grid")
+                points[name] = self._variant(overrides, "grid")
         return points
+
+    def _variant(self, overrides: Overrides, where: str) -> Variant:
+        """Return settings and parameters with overrides; those of `NAME.field` are of an estimator's own."""
+        parameters, rest = [], dict(overrides)
+        for name in self.estimators:
+            default = registry.parameters_of(name)
+            if default is not None:
+                of = [key for key in rest if key.startswith(f"{name}.")]
+                own = {key.removeprefix(f"{name}."): rest.pop(key) for key in of}
+                parameters.append((name, override(default, own, f"{where}.{name}")))
+        return Variant(override(MapperSettings(), rest, where), tuple(parameters))
 
 
 def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:
@@ -182,7 +213,7 @@ def find_study(name: Path) -> Path:
     raise InputError(name, "expected a study's file")
 
 
-def read_study(file: Path | str) -> Study:
+def read_study_file(file: Path | str) -> Study:
     """Return the study of a TOML file, with track files relative to it; InputError says what is wrong."""
     file = Path(file)
     content = parse_toml(read_text(file, "a study", MAX_HEADER_BYTES), file)
@@ -193,17 +224,18 @@ def read_study(file: Path | str) -> Study:
 
 
 def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Study:
-    known = ["grid" if entry.name == "grids" else entry.name for entry in fields(Study)]
+    renamed = {"grids": "grid", "logs": "drives"}
+    known = [renamed.get(entry.name, entry.name) for entry in fields(Study)]
     for key in content:
         check_name(key, known, "expected a known key")
     values: dict[str, Any] = {"name": name} | dict(content)
-    if "tracks" not in values:
-        raise SettingsError("tracks: expected track files, or seeds of generated tracks, found none")
     for key in (key for key in _LISTS if key in values):
         values[key] = (ALL,) if values[key] == ALL else tuple(_typed(key, values[key], list))
     for key in ("name", "question"):
         _typed(key, values.get(key, ""), str)
-    values["tracks"] = tuple(folder / t if isinstance(t, str) else t for t in values["tracks"])
+    values["tracks"] = tuple(folder / t if isinstance(t, str) else t for t in values.get("tracks", ()))
+    if "drives" in values:
+        values["logs"] = _logs(_typed("drives", values.pop("drives"), Mapping), folder)
     for key in (key for key in ("noise", "variants") if key in values):
         tables = _typed(key, values[key], Mapping).items()
         values[key] = {k: flatten(_typed(f"{key}.{k}", v, Mapping)) for k, v in tables}
@@ -217,6 +249,21 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
             _typed(f"baseline.{key}", value, str)
         values["baseline"] = Baseline(**values["baseline"])
     return Study(**values)
+
+
+def _logs(drives: Mapping[str, Any], folder: Path) -> dict[str, tuple[Path, ...]]:
+    """Return logs by their track: from a list, each of a track of its own, or from a table of lists."""
+    for key in drives:
+        check_name(key, ("logs",), "drives: expected a known key")
+    logs = drives.get("logs", [])
+    if isinstance(logs, Mapping):
+        return {track: _paths(f"drives.logs.{track}", own, folder) for track, own in logs.items()}
+    return {path.name: (path,) for path in _paths("drives.logs", logs, folder)}
+
+
+def _paths(key: str, values: Any, folder: Path) -> tuple[Path, ...]:
+    every = [folder / _typed(key, value, str) for value in _typed(key, values, list)]
+    return tuple(path for given in every for path in log_folders(given).values())
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:

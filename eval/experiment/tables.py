@@ -14,10 +14,21 @@ from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
 
 from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, figure_context, save_figures
-from pathspace_graph.eval.metrics.metric import LATER_LAPS, MEAN_DIGITS, METRICS, Column, Metric, column_of
+from pathspace_graph.eval.metrics.metric import (
+    HIGHER,
+    LATER_LAPS,
+    LOWER,
+    MEAN_DIGITS,
+    METRICS,
+    UNKNOWN,
+    Column,
+    Metric,
+    column_of,
+)
 from pathspace_graph.io.files import write_text
 
-from .frame import COMBINATION, LEVEL, RUN, RUN_OF, Contrast, Estimate, contrasts, last_laps, write_results
+from .frame import COMBINATION, RUN, RUN_OF, Contrast, contrasts, last_laps, write_results
+from .statistics import FEWEST, LEVEL, Estimate
 from .study import Study
 
 MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
@@ -25,6 +36,14 @@ MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
 _UNICODE: Final = str.maketrans(  # LaTeX for characters that not every font has
     {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
 )
+
+
+_STRONG: Final = ("\ue000", "\ue001")  # around what is bold, in the rows of a table
+
+
+def strong(text: str) -> str:
+    """Return a cell's text that is bold where the form of the table has that."""
+    return text.join(_STRONG)
 
 
 @dataclass(frozen=True)
@@ -36,6 +55,7 @@ class TextTable:
     rows: tuple[tuple[str, ...], ...]
     groups: tuple[int, ...] = ()  # row numbers at which a new group of rows begins
     names: int = 1  # number of first columns that are names
+    label: str = ""  # of the table in LaTeX
 
     def parts(self, width: int) -> list[Self]:
         """Return tables of at most `width` characters, each with the names and some of the other columns."""
@@ -59,15 +79,15 @@ class TextTable:
         for number, name in enumerate(self.header):
             table.add_column(Text(name), justify="left" if number < self.names else "right")
         for number, row in enumerate(self.rows):
-            table.add_row(*map(Text, row), end_section=number + 1 in self.groups)
+            table.add_row(*(Text(_plain(cell)) for cell in row), end_section=number + 1 in self.groups)
         return table
 
     def text(self) -> str:
         """Return the table for a text file, without its title: columns aligned by blanks."""
-        return self._formatted("simple", self.rows)
+        return self._formatted("simple", [[_plain(cell) for cell in row] for row in self.rows])
 
     def markdown(self) -> str:
-        rows = [[cell.replace("|", r"\|") for cell in row] for row in self.rows]
+        rows = [[_with(cell.replace("|", r"\|"), "**", "**") for cell in row] for row in self.rows]
         title = f"{self.title}\n\n" if self.title else ""
         return f"{title}{self._formatted('pipe', rows)}\n"
 
@@ -77,13 +97,22 @@ class TextTable:
         for number, row in enumerate(self.rows):
             rows += [SEPARATING_LINE, row] if number in self.groups else [row]
         caption = "".join(LATEX_ESCAPE_RULES.get(character, character) for character in self.title)
-        begin = ("% \\usepackage{booktabs}", r"\begin{table}", r"\centering", rf"\caption{{{caption}}}")
-        table = self._formatted("latex_booktabs", rows)
+        begin = ["% \\usepackage{booktabs}", r"\begin{table}", r"\centering", rf"\caption{{{caption}}}"]
+        begin += [rf"\label{{{self.label}}}"] if self.label else []
+        table = _with(self._formatted("latex_booktabs", rows), r"\textbf{", "}")
         return "\n".join([*begin, table, r"\end{table}", ""]).translate(_UNICODE)
 
     def _formatted(self, style: str, rows: Sequence[Sequence[str] | str]) -> str:
         sides = ["left"] * self.names + ["right"] * (len(self.header) - self.names)
         return str(tabulate(rows, self.header, tablefmt=style, colalign=sides, disable_numparse=True))
+
+
+def _with(text: str, before: str, after: str) -> str:
+    return text.replace(_STRONG[0], before).replace(_STRONG[1], after)
+
+
+def _plain(text: str) -> str:
+    return _with(text, "", "")
 
 
 def group_starts(rows: Sequence[Sequence[str]]) -> tuple[int, ...]:
@@ -103,12 +132,61 @@ def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
             names = (getattr(contrast, name) for name in several)
             value, difference = contrast.value, contrast.difference
             by = ("baseline", "") if difference is None else _figures(metric, difference, "+")
-            p = "" if np.isnan(contrast.p) else f"{contrast.p:.3f}" if contrast.p >= 0.001 else "<0.001"
-            mark = "*" if contrast.significant else ""
-            rows.append((*names, str(value.count), *_figures(metric, value), *by, p, mark))
-        header = (*several, "runs", "mean", "95 %", "difference", "95 %", "p", "")
+            tested = (_p(contrast.p), _p(contrast.wilcoxon), "*" if contrast.significant else "")
+            rows.append((*names, str(contrast.runs), *_figures(metric, value), *by, *tested))
+        header = (*several, "runs", "mean", "95 %", "difference", "95 %", "p", "Wilcoxon", "")
         tables.append(TextTable(metric.heading, header, tuple(rows), names=len(several)))
     return tables
+
+
+def results_table(
+    study: Study, frame: pd.DataFrame, keys: Sequence[str] = (), label: str = "tab:results"
+) -> TextTable:
+    """Return a row for each combination and a column for each metric, by default those of the study.
+
+    A cell is the mean and its interval over the tracks, at the end of the last lap. The best mean of a noise
+    is bold, where a metric has a best.
+    """
+    shown = [METRICS[key] for key in keys or study.metrics if key in frame]
+    several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["estimator"]
+    columns = {metric.key: contrasts(study, frame, metric.key) for metric in shown}
+    rows = []
+    for row, first in enumerate(columns[shown[0].key]) if shown else ():
+        cells = [_mean(metric, columns[metric.key], row) for metric in shown]
+        rows.append((*(getattr(first, name) for name in several), *cells))
+    header, names = (*several, *(metric.heading for metric in shown)), len(several)
+    title = f"{_about(study)} Mean and {_interval(frame)}{_laps(study)}."
+    return TextTable(title, header, tuple(rows), group_starts(rows), names, label)
+
+
+def _mean(metric: Metric, column: Sequence[Contrast], row: int) -> str:
+    """Return the mean of a combination with its interval, bold where it is the best of its noise."""
+    text = " ".join(filter(None, _figures(metric, column[row].value))) or UNKNOWN
+    sign = (metric.key in LOWER) - (metric.key in HIGHER)
+    means = [sign * of.value.mean for of in column if of.noise == column[row].noise and of.value.count]
+    is_best = bool(sign and len(means) > 1) and sign * column[row].value.mean <= min(means)
+    return strong(text) if is_best else text
+
+
+def _about(study: Study) -> str:
+    return f"{study.name}: {study.question}".strip()
+
+
+def _laps(study: Study) -> str:
+    return f", at the end of the last of {study.laps} laps" if study.tracks else ""
+
+
+def _interval(frame: pd.DataFrame) -> str:
+    """Return which interval stands beside a mean, and over what."""
+    tracks = frame["track"].nunique()
+    over = f"{tracks} tracks, each the mean of its drives" if tracks > 1 else "the drives of one track"
+    samples = tracks if tracks > 1 else len(frame.groupby([*RUN]))
+    kind = "bootstrap-t" if samples >= FEWEST else "Student's t"
+    return f"{100 * LEVEL:g} % interval ({kind}) over {over}"
+
+
+def _p(p: float) -> str:
+    return "" if np.isnan(p) else f"{p:.3f}" if p >= 0.001 else "<0.001"
 
 
 def caption(study: Study, frame: pd.DataFrame) -> str:
@@ -117,11 +195,12 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
     against = f"{base.estimator}: {study.baseline_variant}" if base.estimator else study.baseline_variant
     runs = frame.groupby(list(RUN_OF), sort=False)["failure"].first()
     return (
-        f"{study.name}: {study.question} "
-        f"{len(runs)} runs ({int((runs != '').sum())} failed) of {study.laps} laps, at the end of the last. "
-        f"Mean and {100 * LEVEL:g} % interval (Student's t) over track x seed; difference from {against} "
-        f"paired over track and seed; p of the paired t-test, corrected by Holm's method over all "
-        f"comparisons of the metric; * where p < {1 - LEVEL:.2f}."
+        f"{_about(study)} "
+        f"{len(runs)} runs ({int((runs != '').sum())} failed){_laps(study)}. "
+        f"Mean and {_interval(frame)}; difference from {against} in the "
+        f"same drives; p of the paired t-test over them, corrected by Holm's method over all comparisons of "
+        f"the metric that differ at all, and p of Wilcoxon's signed-rank test, not corrected; * where p < "
+        f"{1 - LEVEL:.2f}. Wall times are not tested."
     )
 
 
@@ -193,6 +272,7 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
     for suffix, form in (("txt", as_text), ("md", as_markdown), ("tex", as_latex)):
         write_text(out / f"summary.{suffix}", form(tables, note))
+    write_text(out / "table.tex", results_table(study, frame).latex())
     figure = plot_differences(study, frame)
     save_figures(out / "figures", {} if figure is None else {"differences": figure})
     return as_text(tables, note)
@@ -239,7 +319,7 @@ def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
 def _name(study: Study, contrast: Contrast) -> str:
     """Return the names of a combination that others have differently, `sigma_spacing=1` for
     `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
-    counts = {"noise": study.noise, "estimator": study.estimators, "variant": study.points}
+    counts = {"noise": study.noises, "estimator": study.estimators, "variant": study.points}
     several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
     name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
     last = {field: field.rpartition(".")[2] for field in study.varied}

@@ -8,6 +8,7 @@ import numpy as np
 
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.front_end.front_end import seen_cycles
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
@@ -27,6 +28,7 @@ from .consistency import (
     with_marginals,
 )
 from .reference import limit
+from .registration import end_by_registration
 from .summary import has_cones, lap_times
 
 WHOLE: Final = "whole"  # name of the whole cycle among its stages
@@ -103,6 +105,8 @@ def measure(
         values |= _map_values(run.map, log.truth, ghost_settings, marginals)
         values |= _drive_values(run, log.truth, -np.inf, np.inf)
     values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
+    if not has_cones(log.truth):
+        values |= _values_without_truth(run, log)
     health = [record.health for record in run.cycles]
     if any(health):
         values |= {f"reported_{level}": health.count(level) / len(health) for level in (DEGRADED, LOST)}
@@ -202,6 +206,16 @@ def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
         values |= trajectory.longest_divergence(run.trajectory_t, run.trajectory, truth, closing_stamp(run))
     jumps = [np.hypot(*record.jump[:2]) for record in run.cycles if record.jump is not None]
     return values | ({"jump": float(max(jumps))} if jumps else {})
+
+
+def _values_without_truth(run: RunResult, log: Log) -> dict[str, float]:
+    """Return crossings of the map, and how far (m) the last pose is from its registration."""
+    values: dict[str, float] = {"crossings": sum(accuracy.crossings(run.map))}
+    if log.measured is not None and len(run.trajectory):
+        end = end_by_registration(seen_cycles(log)[0], log.measured)
+        if end is not None:
+            values["end_off"] = float(np.hypot(*(run.trajectory[-1, :2] - end[:2])))
+    return values
 
 
 def closes_falsely(run: RunResult, truth: Truth) -> bool:

@@ -111,6 +111,9 @@ _ALL: Final = (
     Metric("false_closing", "loop closed falsely", "%", 1, "run"),
     Metric("jump", "jump of the pose where the map is replaced", "m", 2, "run"),
     Metric("error_max", "largest trajectory error", "m", 2, "run"),
+    Metric("end_off", "last pose from its registration on the beginning", "m", 2, "run"),
+    Metric("crossings", "crossings of the boundaries", "", 0, "run"),
+    Metric("agreement", "distance from the maps of the other drives", "m", 3, "run"),
     Metric("lost_at_end", "vehicle lost at the end", "%", 0, "run"),
     Metric("divergence_time", "longest time with an error of over 1 m, after closing", "s", 1, "run"),
     Metric("divergence_distance", "longest way with an error of over 1 m, after closing", "m", 0, "run"),
@@ -143,6 +146,32 @@ _ALL: Final = (
     Metric("ms_mean", "update, mean", "ms", 2, time=True),
     Metric("ms_p99", "update, 99th percentile", "ms", 2, time=True),
     Metric("seconds", "whole run", "s", 1, "run", time=True),
+)
+HIGHER: Final = ("reach_median", "reach_p10", "closed", "closed_at_end", "converged")
+"""Metrics of which more is better."""
+LOWER: Final = (  # of which less is better; others, such as a NEES, have no best
+    *(
+        "rmse",
+        "missed",
+        "missed_2m",
+        "missed_1m",
+        "rmse_capped",
+        "mapped_to_truth",
+        "truth_to_mapped",
+        "centre",
+    ),
+    *(
+        "half_width",
+        "ghost_landmarks",
+        "ghost_metres",
+        "ate",
+        "along",
+        "across",
+        "reach_short",
+        "reach_error",
+    ),
+    *("rmse_aligned", "false_closing", "error_max", "lost_at_end", "end_off", "crossings", "agreement"),
+    *("ms_mean", "ms_p99", "seconds"),
 )
 METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}  # in the order of tables
 

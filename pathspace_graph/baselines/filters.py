@@ -30,7 +30,7 @@ from .ckf_curves import CurveState, Expansion, in_map
 from .ckf_update import OnCurve, classify, update
 from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
-from .online import OnlineBaseline
+from .online import FRONT_END, OnlineBaseline
 
 FILTER_REACH: Final = 9.0  # how far ahead of the vehicle a curve is extended (m along the predicted path)
 SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the loop closes (m)
@@ -49,6 +49,8 @@ class _Filter(OnlineBaseline):
 
 class CkfMapper(_Filter):
     """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points."""
+
+    READS: ClassVar = (*FRONT_END, "ckf", "gauge")
 
     def _begin(self) -> None:
         super()._begin()
@@ -207,6 +209,8 @@ class LandmarkCkf(_Filter):
     landmark after `ckf.sightings` detections, and the odometry is calibrated. Landmarks are never merged, and
     the loop never closes, so ghosts stay.
     """
+
+    READS: ClassVar = (*FRONT_END, "ckf")
 
     def _begin(self) -> None:
         super()._begin()

@@ -5,7 +5,7 @@ With oracle associations it gives the limit of a run, without robust weights, si
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -45,6 +45,8 @@ GAIN_TOLERANCE: Final = 1e-6  # largest relative gain of the last step
 
 class LandmarkBatch:
     """Maps cones as points with all poses of a log; the start is the online run of `LandmarkFixedLag`."""
+
+    READS: ClassVar = LandmarkFixedLag.READS
 
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None

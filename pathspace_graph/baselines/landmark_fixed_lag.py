@@ -4,7 +4,7 @@ The loop closes where enough of the landmarks seen now are those of the beginnin
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from pathspace_graph.run import CycleResult, Readings, Stopwatch
 from . import landmark_association as association
 from .landmark_association import CREATE, MATCH_GATE, difference_covariances
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
-from .online import OnlineBaseline
+from .online import FRONT_END, OnlineBaseline
 
 UNSEEN_PATH: Final = 40.0  # path (m) without a detection: a landmark is not associated near the start
 MIN_PAIRS: Final = 4  # recognized landmarks that close the loop, a third of them of each colour
@@ -41,6 +41,8 @@ class LandmarkFixedLag(OnlineBaseline):
     Window, odometry and robust weights are those of `FixedLagMapper`, but each detection has one landmark in
     place of a curve.
     """
+
+    READS: ClassVar = (*FRONT_END, "lag", "max_poses", "relinearize", "steps", "steps_grown")
 
     def _begin(self) -> None:
         self.smoother = FixedLagSmoother(motions.smoother_settings(self.settings), LandmarkMap(self.settings))

@@ -1,6 +1,7 @@
 """What the online baselines share: the front end that the mapper has too, the scale, and the map's metres."""
 
 from abc import abstractmethod
+from typing import Final
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
@@ -12,6 +13,9 @@ from pathspace_graph.lengths import scaled
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
+
+FRONT_END: Final = ("closing", "gate", "growth", "motion", "noise", "sides", "spline")
+"""Settings that the front end and the growth of landmarks read."""
 
 
 class OnlineBaseline:

@@ -66,6 +66,7 @@ class OpenLap:
     detections: DetectionTable  # detections of all cycles; their associations are found anew
     first_kept: int  # the poses from this cycle on stay variables of the window
     start: ClosedMap | Revisit  # a map, or the revisit that ended the lap, from which odometry begins
+    factors: tuple[Rows, ...] = ()  # of the user's factors on poses, at values of zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem
     """Return the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
     start, settings = lap.start, own_settings(lap.settings)
     revisits = [start] if isinstance(start, Revisit) else []
-    system = BatchSystem(lap.detections.copy(), lap.chain, settings, revisits)
+    system = BatchSystem(lap.detections.copy(), lap.chain, settings, revisits, lap.factors)
     if isinstance(start, Revisit):
         state, usual = start_odometry(system), FROM_ODOMETRY
     else:

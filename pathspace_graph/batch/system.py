@@ -13,7 +13,7 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.rows import Rows, at_values, by_widths
 from pathspace_graph.graph.variables import POINT, Layout, are_poses, pose_keys
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, rows_across
@@ -155,11 +155,13 @@ class BatchSystem:
         chain: LogOdometry,
         settings: MapperSettings,
         revisits: Sequence[Revisit] = (),
+        factors: Sequence[Rows] = (),
     ) -> None:
         self.detections = detections
         self.chain = chain
         self.settings = settings
         self.revisits = tuple(revisits)  # where the road was driven twice
+        self.factors = by_widths(factors)  # of the user's factors, at values of zero
         self.kernel = Biweight(LOOSE_GATE)
         self.gauges: dict[int, CurveGauge] = {}  # of each boundary
         self.matches: StationMatches | None = None  # cones of closed curves, where they hold detections
@@ -191,6 +193,7 @@ class BatchSystem:
         """
         drive = self.chain.rows_at(state.variables, self.settings.calibration)
         drive += [one.rows(state.poses) for one in self.revisits]
+        drive += [at_values(rows, state.variables) for rows in self.factors]
         across, u = self._across(state, hold) if state.boundaries else (NO_ROWS, np.zeros(0))
         along = self._along(state, self.matches) if self.matches else NO_ROWS
         unused = len(self.detections) - int(np.isfinite(across.sigma).sum())

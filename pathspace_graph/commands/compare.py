@@ -36,6 +36,7 @@ PICTURE_DPI: Final = 150.0  # resolution of the picture, dots per inch, which su
 class Compare:
     """Run every estimator on a log, or on a folder of logs, and write tables, figures and all maps.
 
+    The paper's table is printed, or without truth what can be said without it; files have all metrics.
     For several logs the tables have means, and differences from the reference, paired over the logs, with
     their 95 % confidence interval. An estimator that fails is reported and does not stop the others; the exit
     code is 3 then.
@@ -73,7 +74,8 @@ class Compare:
 
     def _report(self, comparison: Comparison) -> None:
         console = output(wide=True)
-        for table in experiment.tables(comparison).values():
+        tables = experiment.tables(comparison)
+        for table in (table for name, table in tables.items() if name != "metrics"):
             console.print(table.title, highlight=False, markup=False)
             for part in table.parts(console.width):
                 console.print(part.rich())

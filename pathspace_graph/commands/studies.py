@@ -1,7 +1,5 @@
 """`ablate`, `faults`, `scale` and `report`: studies over many logs, in parallel and resumable."""
 
-import shutil
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -17,9 +15,12 @@ from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online
 from pathspace_graph.eval.benchmark import scaling as timing
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import measure_scaling
+from pathspace_graph.eval.experiment.cells import of_other_code
+from pathspace_graph.eval.experiment.drives import log_folders
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
+from pathspace_graph.eval.experiment.provenance import commit_of
 from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
-from pathspace_graph.eval.experiment.study import Study, find_study, read_study
+from pathspace_graph.eval.experiment.study import Study, find_study, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figures, render_pages, to_json
 from pathspace_graph.io.files import check_target, write_json, write_manifest, write_text
@@ -39,10 +40,14 @@ class StudyCommand:
     """Number of processes at a time, -1 for one on each core."""
     cluster: str | None = None
     """Address of a Dask scheduler (tcp://HOST:8786) on whose workers the study runs instead."""
+    keep: bool = False
+    """Keep map, trajectory, cycles and summary of each run, in a folder of its cell."""
     retry_failed: bool = False
     """Run again what failed before."""
     tracks: tuple[str, ...] = ()
     """Track files, and seeds of generated tracks, in place of the study's own."""
+    logs: tuple[Path, ...] = ()
+    """Recorded logs, or folders of them, in place of the study's own drives, each of a track of its own."""
     seeds: tuple[int, ...] = ()
     """Seeds in place of the study's own."""
     laps: int | None = None
@@ -51,9 +56,9 @@ class StudyCommand:
     def execute(self, study: Study, write: Callable[[Study, pd.DataFrame, Path], str]) -> None:
         """Check and run a study, `write` it and print the text of it; exit with 3 where cells failed."""
         check_jobs(self.jobs)
-        study = with_drives(study, self.tracks, self.seeds, self.laps)
-        plan = make_plan(study)
-        if stale := plan.stale(self.out):
+        study = with_drives(study, self)
+        plan = make_plan(study, keep=self.keep)
+        if stale := of_other_code(self.out, plan.cells):
             note(f"{stale} runs in {self.out} are of other code, and are not used")
         with progress("runs", lines=LINES) as advance:
             how: dict[str, Any] = {"cluster": self.cluster, "retry_failed": self.retry_failed}
@@ -67,13 +72,16 @@ class StudyCommand:
             raise SystemExit(CELLS_FAILED)
 
 
-def with_drives(study: Study, tracks: tuple[str, ...], seeds: tuple[int, ...], laps: int | None) -> Study:
-    """Return the study with tracks (files, or seeds of generated ones), seeds and laps that are given."""
-    if laps is not None and laps < 1:
-        raise SettingsError(f"--laps: expected at least 1, found {laps}")
-    chosen = tuple(int(track) if track.isdecimal() else Path(track) for track in tracks)
-    given: dict[str, Any] = {"tracks": chosen, "seeds": seeds, "laps": laps}
-    return replace(study, **{name: value for name, value in given.items() if value})
+def with_drives(study: Study, given: StudyCommand) -> Study:
+    """Return the study with the tracks (files, or seeds of generated ones), logs, seeds and laps given."""
+    if given.laps is not None and given.laps < 1:
+        raise SettingsError(f"--laps: expected at least 1, found {given.laps}")
+    tracks = tuple(int(track) if track.isdecimal() else Path(track) for track in given.tracks)
+    logs = {name: (folder,) for path in given.logs for name, folder in log_folders(path).items()}
+    if tracks or logs:
+        study = replace(study, tracks=tracks, logs=logs)
+    chosen: dict[str, Any] = {"seeds": given.seeds, "laps": given.laps}
+    return replace(study, **{name: value for name, value in chosen.items() if value})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +92,7 @@ class Ablate(StudyCommand):
     """TOML file of the study, or name of one that comes with the package."""
 
     def run(self) -> None:
-        self.execute(read_study(find_study(self.study)), write_study)
+        self.execute(read_study_file(find_study(self.study)), write_study)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,12 +201,3 @@ class Report:
             written += [self.pages / FIGURES, *pages]
         say(*(f"{name}\n{table.markdown(table.sources)}".rstrip("\n") for name, table in tables.items()))
         say(f"\nwritten to {', '.join(map(str, written))}")
-
-
-def commit_of(root: Path | None) -> str:
-    """Return the short hash of the commit that is checked out at a root; empty where there is none."""
-    git = shutil.which("git")
-    if git is None or root is None:
-        return ""
-    command = [git, "-C", str(root), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

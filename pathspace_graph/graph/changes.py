@@ -142,6 +142,7 @@ def restart(smoother: Smoother, first_cycle: int, removed: IntArray, added: IntA
 def _drop_before(smoother: Smoother, first_cycle: int) -> None:
     """Remove the poses before a cycle, and all factors of the window."""
     leaving = np.arange(smoother.first_cycle, first_cycle)
+    smoother.user_factors.remove(pose_keys(leaving), smoother.variables)
     for cycle in leaving.tolist():
         smoother.drop_oldest(cycle)
     smoother.variables.first_cycle = first_cycle

@@ -77,6 +77,11 @@ def _widths(letters: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(sizes(np.array(letters) << INDEX_BITS).tolist())
 
 
+def at_values(rows: Rows, variables: Variables) -> Rows:
+    """Return rows that were linearized at values of zero, such as `A x - c`, at the variables' values."""
+    return replace(rows, residual=kernels.moved_residual(variables.layout, rows, -variables.values))
+
+
 def at_reference(groups: Sequence[Rows], variables: Variables) -> list[Rows]:
     """Return rows linearized at the variables' values as `J d + r` with d = value - reference."""
     change, layout = variables.values - variables.reference, variables.layout
@@ -133,6 +138,14 @@ def among(keys: IntArray, ascending: IntArray) -> BoolArray:
 def stacked_rows(groups: Sequence[Rows]) -> Rows:
     """Return the rows of groups on variables of the same widths as one group."""
     return Rows(*map(np.concatenate, zip(*(rows.parts for rows in groups), strict=True)))
+
+
+def by_widths(groups: Sequence[Rows]) -> list[Rows]:
+    """Return few groups: one for all rows on variables of the same widths."""
+    alike: dict[tuple[int, ...], list[Rows]] = {}
+    for rows in groups:
+        alike.setdefault(rows.widths, []).append(rows)
+    return [stacked_rows(same) for same in alike.values()]
 
 
 def newton_system(

@@ -141,18 +141,19 @@ class FixedLagSmoother(Generic[M_co]):
     def check_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
         check_factors(factors, self.variables, self.next_cycle)
 
-    def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
+    def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> bool:
         """Add the user's factors on any variables, and on the pose of the next cycle, after their check.
 
         Factors on poses may be absolute, which a submap cannot be: submaps are dropped then, and the prior
         keeps its linearization point when the loop closes. Inactive variables of a factor become active.
+        Return whether submaps were dropped, or an open map got a frame of its own.
         """
-        if not factors:
-            return
+        had_submaps, had_chain = self.submaps is not None, self.chain is not None
         if self.user_factors.add(factors):
             self.submaps = None
         if self.chain is not None or np.isin(self.user_factors.keys, self.inactive.keys).any():
             self.reactivate()
+        return (had_submaps and self.submaps is None) or (had_chain and self.chain is None)
 
     def set_calibration_priors(self, mean: Array, sigma: Array) -> None:
         """Give the priors of the calibrations other means and standard deviations, (2,) or (7,).

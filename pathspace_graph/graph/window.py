@@ -277,6 +277,23 @@ class UserFactors:
         return taken
 
 
+def rows_on_poses(
+    factors: Sequence[gtsam.NonlinearFactor], variables: Variables, cycle: int
+) -> list[Rows] | None:
+    """Return user's factors on poses and calibrations as rows at values of zero, linearized now.
+
+    None where one holds points of the map, which are others in a batch. The rows are owned by the cycle.
+    """
+    found = []
+    for linear in _linear([one for one in factors if _holds_pose(one)], variables):
+        keys, (A, b) = keys_of_factor(linear), linear.jacobian()
+        if not (are_poses(keys) | np.isin(keys, variables.calibration_keys)).all():
+            return None
+        residual = -np.ravel(b) - A @ variables.reference[variables.layout.entries(keys)]
+        found.append(Rows(np.tile(keys, (len(A), 1)), np.array(A), residual, np.full(len(A), cycle)))
+    return found
+
+
 def _holds_pose(factor: gtsam.NonlinearFactor) -> bool:
     return bool(are_poses(keys_of_factor(factor)).any())
 

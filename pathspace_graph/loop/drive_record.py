@@ -1,6 +1,6 @@
 """The drive as it was measured, and its poses along the curves: what a batch of the lap is made of."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as chain_of
 from typing import Final, Generic, Self, TypeVar
@@ -16,6 +16,7 @@ from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.constellation import SeenIn
@@ -98,6 +99,7 @@ class DriveRecord:
         self.corrected: Array = self.poses  # (k, 3) of the first k cycles, as they were replaced last
         self.stamps: CycleList[float] = CycleList()  # stamp of each cycle (s)
         self._measured: CycleList[MeasuredCycle] = CycleList()
+        self._factors: tuple[Rows, ...] = ()  # of the user's factors on poses, at values of zero
 
     def copy(self) -> Self:
         """Return a record that can go on independently."""
@@ -109,7 +111,7 @@ class DriveRecord:
     def give_up(self, reason: str) -> None:
         """Drop the measurements; the first reason counts."""
         self.unsolvable = self.unsolvable or reason
-        self._measured = CycleList()
+        self._measured, self._factors = CycleList(), ()
 
     def measured(self, reading: Reading) -> None:
         """Add the motion that leads to a pose, and the detections there as they came."""
@@ -119,6 +121,13 @@ class DriveRecord:
         self._measured.append(MeasuredCycle(reading.motion, *reading.stated))
         if len(self.stamps) > self.settings.open_lap.max_cycles:
             self.give_up("the lap is too long for a batch")
+
+    def given(self, rows: Sequence[Rows] | None) -> None:
+        """Add the user's factors on poses, as rows at values of zero; None where a batch can't have them."""
+        if rows is None and self.unsolvable is None:
+            self.give_up("the user's factors hold control points, which are others in a batch")
+        elif rows and self.unsolvable is None:
+            self._factors = (*self._factors, *rows)
 
     def estimated(self, road: Road) -> None:
         """Add the newest pose, unless the loop has closed and no batch needs it."""
@@ -161,7 +170,7 @@ class DriveRecord:
         motions = noise.motions_of_lap([one.motion for one in cycles])
         chain = chained([*self.stamps], motions, settings.odometry)
         table = DetectionTable.of([one.seen for one in cycles], twists=chain.twists)
-        return OpenLap(settings, chain, _for_map(table, noise), first_kept, start)
+        return OpenLap(settings, chain, _for_map(table, noise), first_kept, start, self._factors)
 
 
 def _for_map(table: C, noise: NoiseLearner) -> C:

@@ -75,7 +75,7 @@ class Lost:
         Return whether both boundaries are there, and the estimate is good.
         """
         if self.new_road is None:
-            self.new_road, self._monitor = Road(_as_known(road, drive)), HealthMonitor()
+            self.new_road, self._monitor = type(road)(_as_known(road, drive)), HealthMonitor()
         new = self.new_road
         motion, detections = reading.motion, reading.detections
         new.predict(motion, reading.orange)

@@ -1,7 +1,7 @@
 """The open road: its map grows, until a return to its beginning starts the batch that closes the loop."""
 
 from dataclasses import replace
-from typing import Final, Self
+from typing import ClassVar, Final, Self
 
 from pathspace_graph.batch.association import LINE_STEP
 from pathspace_graph.copies import shallow
@@ -32,6 +32,7 @@ REVISITED: Final = "the road was met again, and the open map is laid on its earl
 class Open:
     """The search for a return, and for road that is met again on the way."""
 
+    CLOSED: ClassVar = Closed  # class of the phase after the loop has closed
     uses_detections = True
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -113,7 +114,7 @@ class Open:
             return Step(self, notice=joined([STAYS_OPEN, outcome.objection], ": "))
         road.smoother.settle()
         jump = drive.close(road, outcome, self.returned_by)
-        return Step(Closed(road, drive), jump)
+        return Step(self.CLOSED(road, drive), jump)
 
     def _close_by_prior(self, road: Road, drive: Drive, found: RefinedMotion) -> Step:
         """Close the loop by the window's own prior, since no batch can come."""
@@ -124,4 +125,4 @@ class Open:
         simplify(smoother)
         smoother.settle()
         drive.record.replaced(drive.record.with_window(road))
-        return Step(Closed(road, drive), notice=f"{OWN_PRIOR}: {drive.record.unsolvable}")
+        return Step(self.CLOSED(road, drive), notice=f"{OWN_PRIOR}: {drive.record.unsolvable}")

@@ -5,12 +5,14 @@ The order of a cycle is that of the paper: predict, classify, expand, update, an
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import ClassVar, Final, Self
 
 import gtsam
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.window import rows_on_poses
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.settings.mapper import MapperSettings
@@ -21,6 +23,8 @@ from .motion import MeasuredMotion, predict
 from .orange import OrangeCones, Sighting
 from .path import DrivenPath
 from .smoother import CurveSmoother, Gating
+
+HELD: Final = "the user's factors hold the open map in its frame: it is not relinearized as a whole any more"
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +41,11 @@ class Road:
     `copy` returns a road that goes on independently: it is what a failed cycle goes back to.
     """
 
+    SMOOTHER: ClassVar = CurveSmoother  # class of its window and prior
+
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self.smoother = CurveSmoother(settings)
+        self.smoother: CurveSmoother = self.SMOOTHER(settings)
         """Variables, factors of the window, and the prior."""
         self.path = DrivenPath()
         self.growth = Growth(settings.growth)
@@ -65,9 +71,13 @@ class Road:
 
     # --- the steps of a cycle ----------------------------------------------------------------------------
 
-    def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
-        """Add the user's factors, after their check."""
-        self.smoother.add_factors(factors)
+    def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> str:
+        """Add the user's factors, after their check; return a notice where that switches something off."""
+        return HELD if factors and self.smoother.add_factors(factors) else ""
+
+    def rows_of(self, factors: Sequence[gtsam.NonlinearFactor]) -> list[Rows] | None:
+        """Return the user's factors on poses as rows for a batch; None where one holds points of the map."""
+        return rows_on_poses(factors, self.smoother.variables, self.next_cycle - 1)
 
     def predict(self, motion: MeasuredMotion, orange: Detections) -> None:
         """Add the pose of a cycle by the calibrated odometry, extend the path, and place the orange cones."""

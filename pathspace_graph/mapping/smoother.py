@@ -1,6 +1,7 @@
 """The fixed-lag engine on both boundaries' curves: association, and the active part of the map."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,8 +32,10 @@ class Gating:
 class CurveSmoother(FixedLagSmoother[CurveMap]):
     """Window, prior and map of the two curves, with the association of detections with them."""
 
+    MAP: ClassVar = CurveMap  # class of the curves' rows
+
     def __init__(self, settings: MapperSettings) -> None:
-        super().__init__(smoother_settings(settings), CurveMap(settings))
+        super().__init__(smoother_settings(settings), self.MAP(settings))
         self.window.exact = True
         self.attached = [self.map]
 

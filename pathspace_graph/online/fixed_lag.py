@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import gtsam
 import numpy as np
@@ -54,6 +54,9 @@ class FixedLagMapper(MapperEstimate):
     twist (m/s, m/s, rad/s).
     """
 
+    ROAD: ClassVar = Road  # class of what is estimated
+    FIRST_PHASE: ClassVar = Open  # class of the phase that a drive begins with
+
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
@@ -63,9 +66,9 @@ class FixedLagMapper(MapperEstimate):
         noise = known_noise(odometry_sigma, self.scale)
         self.failures = 0  # number of updates that have failed
         self.front_end = FrontEnd(self.settings, noise, self.scale)
-        self.road = Road(self.settings)
+        self.road: Road = self.ROAD(self.settings)
         self.drive = Drive(self.settings)
-        self.phase: Phase = Open(self.settings)
+        self.phase: Phase = self.FIRST_PHASE(self.settings)
         self.health = Health()  # how far the newest estimate can be trusted
         self._unused: Odometry | None = None  # twists of a cycle that was left out
         if self.settings.open_lap.prior == "window":
@@ -91,7 +94,8 @@ class FixedLagMapper(MapperEstimate):
         `factors` are GTSAM factors of your own, at scale 1, on poses in the window (`pose_key`,
         `next_pose_key`: `Pose2`), on control points (`control_keys`: `Point2`) and on the calibration. Each
         is relinearized at every step until one of its poses leaves the window; then it is part of the prior.
-        One on control points alone is kept until the loop closes. SettingsError is raised, and nothing is
+        The batch of the lap has those on poses as well, as they are linearized in this cycle; one on control
+        points leaves no batch, and is kept until the loop closes. SettingsError is raised, and nothing is
         changed, if a key is not a variable of the graph or a number not finite.
 
         Nothing else is raised, unless `strict`: where a step fails, the mapper goes back to before the cycle
@@ -114,12 +118,11 @@ class FixedLagMapper(MapperEstimate):
     def _process(self, cycle: Admitted, factors: Sequence[gtsam.NonlinearFactor]) -> CycleResult:
         """Take the steps of the paper, and that of the phase."""
         watch, road, drive = Stopwatch(), self.road, self.drive
-        if factors:
-            road.add_factors(factors)
-            drive.record.give_up("the batch of the lap does not know the user's factors")
+        held = road.add_factors(factors)
         reading = self.front_end.update(cycle.odometry, cycle.detections)
         road.predict(reading.motion, reading.orange)
         drive.record.measured(reading)
+        drive.record.given(road.rows_of(factors))
         watch.lap("predict")
         twist, use = reading.motion.odometry.twist, self.phase.uses_detections
         classified = road.classify(reading.detections, twist, use=use)
@@ -134,7 +137,7 @@ class FixedLagMapper(MapperEstimate):
         road.marginalize(drive.solver.first_kept)
         watch.lap("marginalize")
         self.phase, self.health = step.phase, step.health or health
-        notice = joined([step.notice, grown, reading.notice])
+        notice = joined([held, step.notice, grown, reading.notice])
         return self._result(cycle.detections.t, watch.laps, step.jump, notice)
 
     def _without(

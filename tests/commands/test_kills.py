@@ -21,6 +21,7 @@ from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, READINGS, Scalin
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import Comparison, compare, read_logs
 from pathspace_graph.eval.experiment.tables import TextTable
+from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.log import Log, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.results import RunResult, write_result
@@ -210,8 +211,9 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     name: str, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}]
-    monkeypatch.setattr(f"{study}.cells.Drive.load", lambda _: recorded.log)
+    monkeypatch.setattr(f"{study}.drives.Drive.load", lambda _: recorded.log)
     monkeypatch.setattr(f"{study}.cells.lap_rows", lambda *_, **__: rows)
+    monkeypatch.setattr(f"{study}.cells.made", lambda _: versions() | {"date": "then"})
     monkeypatch.setattr(f"{study}.tables.plot_differences", lambda *_: Figure())
     monkeypatch.setattr(f"{study}.faults.plot_faults", lambda *_: Figure())
     track = write_round_track(tmp_path)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from pathspace_graph.eval.experiment.study import read_study
+from pathspace_graph.eval.experiment.study import read_study_file
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
@@ -80,7 +80,7 @@ TARGETS = {
     "map": Target({"map.json": ""}, read_map),
     "trajectory": Target({"trajectory.tum": ""}, lambda folder: read_trajectory(folder / "trajectory.tum")),
     "track": Target({"track.yaml": "", "track.csv": ""}, read_tracks),
-    "study": Target({"study.toml": ""}, lambda folder: read_study(folder / "study.toml")),
+    "study": Target({"study.toml": ""}, lambda folder: read_study_file(folder / "study.toml")),
     "snapshot": Target({"mapper.snap": "", "content.pickle": ""}, read_snapshots),
     "manifest": Target({"manifest.json": "", "odometry.csv": LOG["odometry.csv"]}, verify_all),
 }

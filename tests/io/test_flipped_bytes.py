@@ -14,14 +14,8 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.experiment.cells import (
-    Cell,
-    Drive,
-    Outcome,
-    read_record,
-    record_of,
-    write_record,
-)
+from pathspace_graph.eval.experiment.cells import Cell, Outcome, read_record, record_of, write_record
+from pathspace_graph.eval.experiment.drives import Drive
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.log import FILES, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all

@@ -8,7 +8,8 @@ import pytest
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.experiment import cells
-from pathspace_graph.eval.experiment.cells import Cell, NamedLog, run_cell
+from pathspace_graph.eval.experiment.cells import Cell, run_cell
+from pathspace_graph.eval.experiment.drives import NamedLog
 from pathspace_graph.io.log import Log, read_log
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.settings.mapper import MapperSettings

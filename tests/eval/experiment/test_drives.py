@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.experiment.cells import Drive, load_tracks, track_digest
+from pathspace_graph.eval.experiment.drives import Drive, load_tracks, track_digest
 from pathspace_graph.sim.simulate import SimulationSettings
 
 from ...scenes.pretenders import write_round_track

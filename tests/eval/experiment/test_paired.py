@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
-from pathspace_graph.eval.experiment.frame import difference, estimate, holm, paired_p
+from pathspace_graph.eval.experiment.statistics import (
+    by_track,
+    difference,
+    estimate,
+    holm,
+    paired_p,
+    wilcoxon_p,
+)
 
 
 def test_the_interval_is_student_s_by_hand() -> None:
@@ -41,8 +49,8 @@ def test_pairs_that_lack_a_value_are_left_out_and_few_have_no_interval() -> None
     assert (same.low, same.mean, same.high) == (1.0, 1.0, 1.0)
 
 
-def test_the_interval_and_p_are_those_of_scipy() -> None:
-    values = np.random.default_rng(1).normal(0.3, 1.0, 12)
+def test_the_interval_of_few_and_p_are_those_of_scipy() -> None:
+    values = np.random.default_rng(1).normal(0.3, 1.0, 7)
     made = estimate(values)
     low, high = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
     assert made.mean - made.half == pytest.approx(low)
@@ -69,3 +77,27 @@ def test_holm_keeps_false_alarms_of_a_whole_study_rare() -> None:
     for _ in range(400):
         alarms += bool((holm(np.array([paired_p(rng.standard_normal(6)) for _ in range(10)])) < 0.05).any())
     assert alarms / 400 < 0.08
+
+
+def test_the_bootstrap_covers_skewed_values_better_than_student_s_interval() -> None:
+    """Lognormal values, n = 8: Student's interval holds the mean in 85 % of the cases."""
+    rng, true, hits = np.random.default_rng(2), np.exp(0.5), []
+    for _ in range(300):
+        values = rng.lognormal(0.0, 1.0, 8)
+        found, student = estimate(values), stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+        hits.append((found.low <= true <= found.high, student.low <= true <= student.high))
+    bootstrap, t = np.mean(hits, axis=0)
+    assert t + 0.02 < bootstrap < 0.96
+
+
+def test_drives_of_a_track_are_one_sample_and_of_a_single_track_each_is_one() -> None:
+    index = pd.MultiIndex.from_product([["a", "b"], [0, 1]], names=["track", "seed"])
+    values = pd.Series([1.0, 3.0, 5.0, 9.0], index)
+    assert by_track(values).to_dict() == {"a": 2.0, "b": 7.0}
+    assert len(by_track(values.loc[["a"]])) == 2
+
+
+def test_wilcoxon_by_hand() -> None:
+    """Five positive differences: one of 2^5 orders of signs on each side, p = 2 / 32."""
+    assert wilcoxon_p(np.array([0.1, 0.2, 0.3, 0.4, 0.5])) == pytest.approx(2.0 / 32.0)
+    assert np.isnan(wilcoxon_p(np.zeros(3)))

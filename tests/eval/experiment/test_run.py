@@ -13,9 +13,10 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.errors import OutputError, SettingsError
-from pathspace_graph.eval.experiment import cells as drives
+from pathspace_graph.eval.experiment import cells as store
+from pathspace_graph.eval.experiment import drives
 from pathspace_graph.eval.experiment import run as study_run
-from pathspace_graph.eval.experiment.cells import Drive
+from pathspace_graph.eval.experiment.drives import Drive
 from pathspace_graph.eval.experiment.frame import TIMES, without_times
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study
@@ -163,10 +164,14 @@ def test_cells_of_other_code_are_run_again_and_counted(
     study: Study, ran: tuple[Path, pd.DataFrame], finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, first = ran
-    assert study_run.make_plan(study).stale(finished) == 0
-    monkeypatch.setattr(drives, "code_digest", lambda rooms: "other")
-    assert study_run.make_plan(study).stale(finished) == len(first)
-    pd.testing.assert_frame_equal(without_times(run_study(study, finished)), without_times(first))
+    assert store.of_other_code(finished, study_run.make_plan(study).cells) == 0
+    code = study_run.code_of("pretender")
+    monkeypatch.setattr(study_run, "code_of", lambda name: code | {"tests": "other"})
+    monkeypatch.setattr(store, "check_code", lambda *_: None)
+    assert store.of_other_code(finished, study_run.make_plan(study).cells) == len(first)
+    again = run_study(study, finished)
+    assert not set(again["cell"]) & set(first["cell"])
+    pd.testing.assert_frame_equal(*(without_times(of).drop(columns="cell") for of in (again, first)))
     assert Pretender.calls == CALLS
 
 
@@ -204,14 +209,21 @@ def test_a_log_that_cannot_be_simulated_fails_its_cells_only(
     assert set(frame[frame["seed"] == 0]["failure"]) == {""}
 
 
+def test_a_study_that_grows_keeps_every_cell_that_means_the_same(study: Study, finished: Path) -> None:
+    grown = replace(study, seeds=(0, 1, 2), grids=({"lag": [1.0, 2.0, 4.0]},), metrics=("size",))
+    frame = run_study(grown, finished)
+    assert (Pretender.calls, Fragile.calls) == (3 * 4 - CALLS, 3 * 4 - CALLS)
+    assert len(frame) == 2 * 3 * 4
+    assert set(json.loads((finished / "study.json").read_text())["variants"]) == {*grown.points}
+    run_study(replace(grown, seeds=(2,), estimators=("pretender",), question="Why?"), finished)
+    assert Pretender.calls == 3 * 4 - CALLS
+
+
 def test_a_folder_of_another_study_is_refused(study: Study, finished: Path, tmp_path: Path) -> None:
     before = contents(finished)
-    with pytest.raises(OutputError, match=r"laps = 2, found another, with 1"):
-        run_study(replace(study, laps=2), finished)
-    with pytest.raises(OutputError, match="varied"):
-        run_study(replace(study, grids=()), finished)
+    with pytest.raises(OutputError, match=r"expected the study other, found 'small'"):
+        run_study(replace(study, name="other"), finished)
     assert contents(finished) == before
-    run_study(replace(study, question="Why?", metrics=("size",)), finished)
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "thesis.tex").write_text("mine")
     with pytest.raises(OutputError, match=r"study\.json"):

@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.eval.experiment.cells import load_tracks
+from pathspace_graph.estimators import known_estimators
+from pathspace_graph.eval.experiment.drives import load_tracks
 from pathspace_graph.eval.experiment.run import make_plan
 from pathspace_graph.eval.experiment.study import (
     SHIPPED,
     Baseline,
     Study,
     find_study,
-    known_estimators,
-    read_study,
+    read_study_file,
     shipped_studies,
     study_from,
 )
@@ -71,9 +71,9 @@ def test_a_whole_study_is_read() -> None:
     assert read.simulation("quiet").odometry.white == (0.1, 0.1, 0.01)
     assert read.simulation("quiet").laps == 2
     assert read.simulation("loud").sensor.bearing_sigma == 1.0
-    assert read.points["soft"].gate.huber == float("inf")
-    assert read.points["lag=1, spline.degree=2"].lag == 1.0
-    assert read.points["lag=1, spline.degree=2"].spline.degree == 2
+    assert read.points["soft"].settings.gate.huber == float("inf")
+    assert read.points["lag=1, spline.degree=2"].settings.lag == 1.0
+    assert read.points["lag=1, spline.degree=2"].settings.spline.degree == 2
     assert read.varied == ("gate.huber", "gauge.sigma_spacing", "lag", "spline.degree", "steps")
     assert read.varied_noise == ("odometry.white", "sensor.bearing_sigma")
 
@@ -153,15 +153,15 @@ def test_what_is_unknown_or_wrong_is_refused(text: str, says: str) -> None:
 def test_a_file_that_is_wrong_is_named(tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
     with pytest.raises(InputError, match=r"mine\.toml"):
-        read_study(file)
+        read_study_file(file)
     file.write_text("tracks = [")
     with pytest.raises(InputError, match=r"mine.toml: expected TOML"):
-        read_study(file)
+        read_study_file(file)
     file.write_text("tracks = [0]\nlap = 1")
     with pytest.raises(InputError, match=r"mine.toml: expected a known key"):
-        read_study(file)
+        read_study_file(file)
     file.write_text("tracks = [0]")
-    assert read_study(file).name == "mine"
+    assert read_study_file(file).name == "mine"
 
 
 def test_a_missing_track_names_the_nearest_file(tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_every_shipped_track_can_be_driven_whole_and_in_part(file: Path) -> None
 
 @pytest.mark.parametrize("name", shipped_studies())
 def test_every_shipped_study_is_sound_and_listed(name: str) -> None:
-    read = read_study(find_study(Path(name)))
+    read = read_study_file(find_study(Path(name)))
     assert len(read.tracks) * len(read.seeds) >= {
         "acceleration": 10,
         "hard": 16,
@@ -249,7 +249,8 @@ def test_every_shipped_study_is_sound_and_listed(name: str) -> None:
 
 def test_the_examples_of_the_pages_are_sound() -> None:
     text = (ROOT / "docs" / "ablate.md").read_text()
-    (example,) = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
+    logs, example = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
+    assert set(tomllib.loads(logs.split("\n\n")[1])["drives"]) == {"logs"}
     assert len(study(example).points) == 1 + 1 + 3
     (code,) = re.findall(r"```python\n(.*?)frame = ", text, flags=re.DOTALL)
     known: dict[str, object] = {}

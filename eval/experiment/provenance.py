@@ -1,0 +1,182 @@
+"""What made a result: the sources that it depends on, and the libraries, the commit and the machine."""
+
+import ast
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from datetime import UTC, datetime
+from functools import cache
+from hashlib import sha256
+from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec
+from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+from threadpoolctl import threadpool_info
+
+from pathspace_graph import estimators as registry
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.metrics.summary import versions
+
+HOUSE: Final = __name__.partition(".")[0]
+MEASURED: Final = (  # modules on which every result depends, whatever the estimator is
+    *("run", "scale", "front_end.kind", "sim.simulate", "sim.track_generator", "plausibility.diagnosis"),
+    "eval.metrics.measures",
+)
+NUMERICS: Final = {name: version(name) for name in ("gtsam", "numpy", "scipy")}
+Code = dict[str, str]  # digest of each source by its module, and version of each library by its name
+
+
+def code_of(estimator: str) -> Code:
+    """Return what a result of an estimator depends on: its sources, those of the metrics, libraries."""
+    return _code((registry.module_of(estimator), *(f"{HOUSE}.{module}" for module in MEASURED)))
+
+
+@cache
+def _code(roots: tuple[str, ...]) -> Code:
+    """Return the code of modules and of all that they import; it is that of this process, which has read it.
+
+    Of what is installed, the version stands for the sources, except in the packages of the roots: an editable
+    package has no version that changes with it. The standard library doesn't count.
+    """
+    for root in roots:
+        if _spec(root) is None:  # a class of a notebook, or of the program itself
+            raise SettingsError(f"estimators: expected one of a module with sources, found {root}")
+    own, found, libraries = {root.partition(".")[0] for root in roots}, Code(), set[str]()
+    remaining = [(root, HOUSE) for root in roots]
+    while remaining:
+        name, importer = remaining.pop()
+        package, spec = name.partition(".")[0], None if name in found else _spec(name)
+        if spec is None or spec.origin is None:
+            continue  # known already, an optional package that is not here, or a folder without sources
+        if package not in own and {"site-packages", "dist-packages"} & set(Path(spec.origin).parts):
+            libraries |= {package} - ({package} if importer == HOUSE else set())
+            continue
+        found[name] = _digest(Path(spec.origin))
+        remaining += [(imported, package) for imported in _imports(name)]
+    return dict(sorted(found.items())) | NUMERICS | _library_versions(libraries)
+
+
+@cache
+def _spec(name: str) -> ModuleSpec | None:
+    """Return where a module is; None where it is none, is not here, or is of the standard library."""
+    if name.partition(".")[0] in sys.stdlib_module_names:
+        return None
+    try:
+        return find_spec(name)
+    except (ImportError, ValueError):  # something else than a module, in a module or in a program
+        return None
+
+
+def _digest(file: Path) -> str:
+    """Return the digest of a source; for a compiled module it is that of its sources, if they are here."""
+    compiled = file.name.endswith(tuple(EXTENSION_SUFFIXES))
+    files = sorted(file.parent.rglob("*.[ch]pp")) if compiled else []
+    return sha256(b"".join(one.read_bytes() for one in files or [file])).hexdigest()[:12]
+
+
+@cache
+def _imports(name: str) -> tuple[str, ...]:
+    """Return the modules that a module imports anywhere in it, and the package that it lies in.
+
+    Our own package runs nothing in its root that a module in it needs.
+    """
+    spec, parents = _spec(name), name.split(".")[:-1]
+    found = [".".join(parents)] if parents and parents[0] != HOUSE else []
+    if spec is None or not str(spec.origin).endswith(".py"):
+        return tuple(found)
+    package = name.split(".") if spec.submodule_search_locations is not None else parents
+    for node in ast.walk(ast.parse(Path(str(spec.origin)).read_bytes())):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else []
+            found += _imported_from(".".join([*above, *filter(None, [node.module])]), node)
+    return tuple(dict.fromkeys(found))
+
+
+def _imported_from(base: str, node: ast.ImportFrom) -> list[str]:
+    """Return the modules among the names that are imported, and the one that has the others."""
+    spec = _spec(base)
+    if spec is None or spec.submodule_search_locations is None:
+        return [base]
+    inner = [f"{base}.{alias.name}" for alias in node.names]
+    modules = [one for one in inner if _spec(one) is not None]
+    return modules if len(modules) == len(inner) else [base, *modules]
+
+
+def _library_versions(names: set[str]) -> Code:
+    known = packages_distributions() if names else {}
+    distributions = {distribution for name in names for distribution in known.get(name, [])}
+    return {distribution: version(distribution) for distribution in sorted(distributions)}
+
+
+def check_code(estimator: str, expected: Code, began: str) -> None:
+    """Raise a SettingsError that names both unless this process has the code with which a study began."""
+    found = code_of(estimator)
+    if found == expected:
+        return
+    name = next(name for name in [*expected, *found] if expected.get(name) != found.get(name))
+    own, other = (code.get(name, "missing") for code in (found, expected))
+    raise SettingsError(
+        f"{estimator}: expected the code of {began}, where the study began, "
+        f"with {name} {other}, found {name} {own} on {here()}"
+    )
+
+
+def here() -> str:
+    return f"{platform.node()} (process {os.getpid()})"
+
+
+# --- where and when ----------------------------------------------------------------------------------------
+
+
+def made(estimator: str) -> dict[str, Any]:
+    """Return where and when a result of an estimator is made, and with which libraries."""
+    packages = {HOUSE, registry.module_of(estimator).partition(".")[0]}
+    commits = {name: commit for name in sorted(packages) if (commit := commit_of(_folder(name)))}
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return {
+        **versions(),
+        "commit": " ".join(commits.values() if len(packages) == 1 else map(" ".join, commits.items())),
+        **_machine(),
+        "date": now,
+    }
+
+
+def _folder(package: str) -> Path | None:
+    spec = _spec(package)
+    return None if spec is None or spec.origin is None else Path(spec.origin).parent
+
+
+@cache
+def _machine() -> dict[str, str]:
+    file, blas = Path("/proc/cpuinfo"), {pool.get("architecture") for pool in threadpool_info()}
+    model = re.search(r"model name\s*: (.*)", file.read_text()) if file.exists() else None
+    processor = model[1] if model else platform.processor() or platform.machine()
+    return {"host": platform.node(), "processor": processor, "blas": " ".join(sorted(filter(None, blas)))}
+
+
+def sources_digest() -> str:
+    """Return the digest of the sources of our own estimators and of the simulator, not of the metrics."""
+    own = [name for name in registry.known_estimators() if registry.module_of(name).startswith(f"{HOUSE}.")]
+    sources = {module: digest for name in own for module, digest in code_of(name).items()}
+    estimating = {m: d for m, d in sources.items() if m.startswith(HOUSE) and ".eval." not in m}
+    return sha256(repr(sorted(estimating.items())).encode()).hexdigest()[:16]
+
+
+@cache
+def commit_of(folder: Path | None) -> str:
+    """Return the short hash of the commit that is checked out, with `+` where something differs from it.
+
+    It is empty where there is none.
+    """
+    git = shutil.which("git")
+    if git is None or folder is None:
+        return ""
+    command = [git, "-C", str(folder), "describe", "--always", "--dirty=+", "--exclude=*"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
