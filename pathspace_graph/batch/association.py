@@ -10,6 +10,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import sigma_across
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
+from pathspace_graph.graph.drives import Drives
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
@@ -69,10 +70,23 @@ def locate_poses(state: State) -> None:
         against = headings(poses) @ tangent.T < SAME_DIRECTION
         np.add(square, DIRECTION_PENALTY**2, out=square, where=against)
         if boundary.periodic:
-            state.pose_u[label] = np.unwrap(u[square.argmin(axis=1)], period=boundary.length)
+            state.pose_u[label] = _from_lap_to_lap(u[square.argmin(axis=1)], boundary.length, state.drives)
         else:
             driven = np.hypot(*np.diff(poses[:, :2], axis=0).T) + POSE_ROOM
+            driven[state.drives.begins(len(poses))] = boundary.length
             state.pose_u[label] = u[_along(square, driven * count / boundary.length)]
+
+
+def _from_lap_to_lap(u: Array, length: float, drives: Drives) -> Array:
+    """Return parameters (P,) that go on from lap to lap, and from drive to drive by some lap more."""
+    parts, last = list[Array](), -np.inf
+    for part in drives.parts(len(u)):
+        own = np.unwrap(u[part], period=length)
+        if parts:
+            own = own + length * np.ceil((last - own[0]) / length)
+        parts.append(own)
+        last = float(own[-1])
+    return np.concatenate(parts)
 
 
 def _along(square: Array, steps: Array) -> IntArray:
@@ -225,11 +239,12 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     off_curve = clustered(others[~near])
     cones = cones.merged(off_curve.where(off_curve.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
-        pose_u = state.pose_u[label]
+        longest = state.drives.longest(len(state.poses))
+        poses, pose_u = state.poses[longest], state.pose_u[label][longest]
         lap = pose_u > pose_u[-1] - boundary.length  # the last one
         apart = np.mod(cones.u[:, None] + begin - pose_u[lap], boundary.length)
         own = np.minimum(apart, boundary.length - apart) < PASS_STRETCH
-        cones = along_drive(cones, state.poses[lap], own, label)
+        cones = along_drive(cones, poses[lap], own, label)
     return without_folds(cones, boundary.periodic)
 
 

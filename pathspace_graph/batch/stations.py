@@ -18,6 +18,7 @@ from .association import ROW_CONES, cones_of_curve, feet_of_cones
 
 SIGMA_STATION: Final = 0.02  # of a cone along a curve that has a control point for each and follows it (m)
 SHIFT_BLOCK: Final = 20.0  # length of the stretches of a later lap that are shifted together (m)
+DRIVES_APART: Final = 3.0 * SHIFT_BLOCK  # added from drive to drive: no stretch or neighbour is of both (m)
 SHIFT_REACH: Final = 4.0  # most of a shift (m)
 SHIFT_STEP: Final = 0.1  # between the shifts that are tried (m)
 SIGMA_SHIFT: Final = 1.0  # standard deviation of a shift before it is known (m)
@@ -94,7 +95,8 @@ class SeenAgain:
         tangent, poses = state.spline(label).tangent_unit(u), state.variables.poses_at(cycle)
         sigma = sigma_across(tangent, detections.covariance[rows], poses, 0.0)
         again = laps_of(state, detections, label)[rows] > 0
-        block = (path_lengths(state.poses)[cycle] // SHIFT_BLOCK).astype(np.intp)
+        driven = path_lengths(state.poses)[cycle] + DRIVES_APART * state.drives.of(cycle)
+        block = (driven // SHIFT_BLOCK).astype(np.intp)
         return cls(curve, rows, u, sigma, np.where(again, block, -1))
 
 

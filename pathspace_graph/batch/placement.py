@@ -1,0 +1,153 @@
+"""The place of a drive on the map of others: hypotheses along the road, until one is left.
+
+The way that was driven is laid rigidly beside each place of the known road, and the best places are refined
+by the registration of what was detected. A place is taken if nearly all of that lies on the curves there, and
+no other place is nearly as good.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.se2 import move_points, path_lengths, rotation
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.registration import Motion, Registration, Sightings
+from pathspace_graph.mapping.state import State
+from pathspace_graph.settings.mapper import MapperSettings
+
+PLACE_STEP: Final = 2.0  # distance of the places that are tried, and of the points of a way (m)
+LEAST_DRIVEN: Final = 30.0  # shortest drive that is placed (m)
+MISFIT: Final = 6.0  # most rms distance of both ways at a place that is refined (m)
+SHARE_MISFIT: Final = 0.02  # added to it, as a share of the length of the way
+MOST_PLACES: Final = 12  # places that are refined
+APART: Final = 6.0  # distance of the drive's first pose below which two places are one (m)
+DETECTIONS: Final = 800  # most detections, evenly chosen, that are registered
+SIGMAS_PLACE: Final = (3.0, 3.0, 0.1)  # of the motion about a place before it is refined (m, m, rad)
+REFINEMENTS: Final = 2  # registrations, one from the other
+SIGMA_FIT: Final = 0.5  # a detection at a distance d from its curve scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)
+MIN_SCORE: Final = 0.6  # least score of a place that is taken
+MARGIN: Final = 0.1  # least lead of its score over that of every other place
+
+OTHER_TRACK: Final = "it fits nowhere on the map of the other drives"
+OTHER_WAY: Final = "it goes the other way round"
+TWO_PLACES: Final = "it fits in two places of the map of the other drives"
+TOO_SHORT: Final = f"it is shorter than {LEAST_DRIVEN:g} m"
+
+
+class NotPlacedError(Exception):
+    """No place of the map is that of a drive, and why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A motion of a drive onto the known map."""
+
+    score: float  # 0 to 1
+    motion: Array  # (3,) from the frame of the drive to that of the map
+
+
+def find_place(known: State, state: State, detections: DetectionTable, settings: MapperSettings) -> Array:
+    """Return the motion (3,) that lays a drive's state on a known one; NotPlacedError where none is sure.
+
+    The detections are those of the drive. The known map is closed.
+    """
+    driven = path_lengths(state.poses)
+    if driven[-1] < LEAST_DRIVEN:
+        raise NotPlacedError(TOO_SHORT)
+    loop = way_around(known)
+    way = resampled(state.poses[:, :2], min(float(driven[-1]), PLACE_STEP * len(loop)))
+    motions = beside(loop, way)
+    if len(motions) == 0:
+        backwards = len(beside(loop[::-1], way)) > 0
+        raise NotPlacedError(OTHER_WAY if backwards else OTHER_TRACK)
+    seen = sightings(state, detections)
+    places = [_refined(known, seen, motion, settings) for motion in motions]
+    places.sort(key=lambda place: -place.score)
+    best, first = places[0], state.poses[:1, :2]
+    if best.score < MIN_SCORE:
+        raise NotPlacedError(OTHER_TRACK)
+    at = move_points(best.motion, first)
+    rivals = [p.score for p in places if np.hypot(*(move_points(p.motion, first) - at)[0]) > APART]
+    if rivals and rivals[0] > best.score - MARGIN:
+        raise NotPlacedError(TWO_PLACES)
+    return best.motion
+
+
+def way_around(known: State) -> Array:
+    """Return points (n, 2), `PLACE_STEP` apart, of the first lap that was driven around a closed map."""
+    label = next(iter(known.boundaries))
+    part = known.drives.longest(len(known.poses))
+    pose_u = known.pose_u[label][part]
+    lap = pose_u - pose_u[0] < known.boundaries[label].length
+    around = known.poses[part][lap, :2]
+    around = np.concatenate([around, around[:1]])
+    return resampled(around, float(path_lengths(around)[-1]))[:-1]
+
+
+def resampled(path: Array, length: float) -> Array:
+    """Return points of the first length (m) of a path (n, 2), `PLACE_STEP` apart or slightly less."""
+    driven = path_lengths(path)
+    at = np.linspace(0.0, length, int(np.ceil(length / PLACE_STEP)) + 1)
+    return np.column_stack([np.interp(at, driven, axis) for axis in path.T])
+
+
+def beside(loop: Array, way: Array) -> Sequence[Array]:
+    """Return the motions (3,) that lay a way (m, 2) on a loop (n, 2) where it fits best, the best first."""
+    path, around = way @ np.array([1.0, 1j]), loop @ np.array([1.0, 1j])
+    places = (np.arange(len(loop))[:, None] + np.arange(len(way))) % len(loop)
+    target = around[places]
+    mean, means = path.mean(), target.mean(axis=1)
+    turn = ((path - mean).conj() * (target - means[:, None])).sum(axis=1)
+    turn /= np.maximum(np.abs(turn), np.finfo(float).tiny)
+    off = np.abs(turn[:, None] * (path - mean) - (target - means[:, None]))
+    misfit = np.sqrt((off**2).mean(axis=1))
+    shift = means - turn * mean
+    motions, chosen = np.column_stack([shift.real, shift.imag, np.angle(turn)]), list[int]()
+    most = MISFIT + SHARE_MISFIT * PLACE_STEP * len(way)
+    begins = turn * path[0] + shift
+    for i in np.argsort(misfit).tolist():
+        if misfit[i] > most or len(chosen) == MOST_PLACES:
+            break
+        if (np.abs(begins[chosen] - begins[i]) > APART).all():
+            chosen.append(i)
+    return list(motions[chosen])
+
+
+def sightings(state: State, detections: DetectionTable) -> Sightings:
+    """Return detections in use on the curves of their own drive, in its frame."""
+    rows = np.flatnonzero(detections.used & np.isin(detections.boundary, BOUNDARIES))
+    rows = rows[:: max(-(-len(rows) // DETECTIONS), 1)]
+    points = detections.points_map(rows, state.variables)
+    return Sightings.of_points(rows, detections.boundary[rows], points)
+
+
+def _refined(known: State, seen: Sightings, motion: Array, settings: MapperSettings) -> Place:
+    """Return the place that is registered from a motion (3,)."""
+    centre = seen.points.mean(axis=0)
+    vector = np.append(move_points(motion, centre[None])[0] - centre, motion[2])
+    stretches = {label: (b.tables.low, b.tables.high) for label, b in known.boundaries.items()}
+    kept = np.isin(seen.labels, list(stretches))
+    seen = Sightings.of_points(seen.rows[kept], seen.labels[kept], seen.points[kept])
+    registration = Registration(known, seen, stretches, settings.closing)
+    for _ in range(REFINEMENTS):
+        start = Motion(centre, vector)
+        vector = registration.refine(start, vector, np.diag(np.array(SIGMAS_PLACE) ** -2)).motion.vector
+    moved = Motion(centre, vector)
+    distance = _distances(known, seen.labels, moved.apply(seen.points))
+    shift = centre + vector[:2] - rotation(float(vector[2])) @ centre
+    score = float(np.exp(-0.5 * (distance / SIGMA_FIT) ** 2).mean())
+    return Place(score, np.append(shift, vector[2]))
+
+
+def _distances(known: State, labels: IntArray, points: Array) -> Array:
+    """Return the distance (m,) of points (m, 2) from the curves of their labels."""
+    distance = np.full(len(points), np.inf)
+    for label, boundary in known.boundaries.items():
+        own = labels == label
+        foot = boundary.find_anywhere(known.control_points(label), points[own])
+        distance[own] = np.hypot(*(points[own] - foot.position).T)
+    return distance
