@@ -26,7 +26,7 @@ from pathspace_graph.sim.curves import arc_lengths
 
 from .experiment.cells import run_estimator
 from .metrics.accuracy import crossings
-from .metrics.reference import aligned_distance
+from .metrics.alignment import aligned_distance
 from .metrics.summary import summarize
 from .views import Figure, View
 

@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.spatial import KDTree
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
@@ -245,7 +246,32 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
         apart = np.mod(cones.u[:, None] + begin - pose_u[lap], boundary.length)
         own = np.minimum(apart, boundary.length - apart) < PASS_STRETCH
         cones = along_drive(cones, poses[lap], own, label)
+    if len(detections.drives) > 1:
+        cones = cones.where(seen_by_most(state, label, cones, points, cycles, settings))
     return without_folds(cones, boundary.periodic)
+
+
+def seen_by_most(
+    state: State, label: int, cones: Cones, points: Array, cycles: IntArray, settings: MapperSettings
+) -> BoolArray:
+    """Return (k,) whether at least half of the drives that passed a cone have detected it.
+
+    What stands is seen by all. The detections (m, 2) of the boundary, map frame, are of cycles (m,).
+    """
+    u = first_parameter(state, label) + cones.u
+    boundary, drive, growth = state.boundaries[label], state.drives.of(cycles), settings.growth
+    seen, passed = np.zeros(len(u)), np.zeros(len(u))
+    for d, part in enumerate(state.drives.parts(len(state.poses))):
+        apart = np.abs(u[:, None] - state.pose_u[label][part])
+        if boundary.periodic:
+            apart = np.mod(apart, boundary.length)
+            apart = np.minimum(apart, boundary.length - apart)
+        passes = apart.min(axis=1) < PASS_STRETCH
+        own, radius = KDTree(points[drive == d]), growth.merge_radius
+        near = own.query_ball_point(cones.points, radius, return_length=True)
+        passed += passes
+        seen += passes & (near >= growth.sightings)
+    return np.asarray(2.0 * seen >= passed)
 
 
 def first_parameter(state: State, label: int) -> float:

@@ -10,7 +10,6 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.errors import SolveError, solving
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse
-from pathspace_graph.graph.drives import ONE_DRIVE
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.moved import moved
 from pathspace_graph.lengths import scaled
@@ -162,8 +161,8 @@ class _Joint:
         for d, (one, part) in enumerate(zip(self.placed, system.drives.parts(len(state.poses)), strict=True)):
             poses, seconds = state.poses[part], sum(watch.laps.values()) / len(self.placed)
             records, laps = records_of(few, one.chain, seconds, d)
-            own = few.detections.where(np.flatnonzero(system.drives.of(few.detections.cycle) == d))
-            own = replace(own, cycle=own.cycle - part.start, drives=ONE_DRIVE)
+            own = few.detections.of_drive(d)
+            own = replace(own, cycle=own.cycle - part.start)
             vehicle = vehicle_of(state, self.known, settings, d)
             drive = BatchResult(
                 estimator=NAME,

@@ -46,7 +46,7 @@ class StationMatches:
 def match_stations(
     state: State, detections: DetectionTable, settings: MapperSettings
 ) -> StationMatches | None:
-    """Return the cones of the first lap as stations of closed curves, with the detections of all laps.
+    """Return the cones of the first drive's first lap as stations of closed curves, with all detections.
 
     None where a curve has too few cones, or one is a line. A lap ends beside its beginning by some
     decimetres: cones of both ends would be smeared, and those of a later lap matched with their neighbours.
@@ -57,7 +57,7 @@ def match_stations(
     if settings.lines:
         return None
     for label in state.boundaries:
-        first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0))
+        first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0)).of_drive(0)
         cones = cones_of_curve(state, first, label, settings)
         if len(cones.u) < ROW_CONES:
             return None

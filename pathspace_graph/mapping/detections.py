@@ -11,7 +11,7 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.factors.sensor import corrected
-from pathspace_graph.graph.drives import ONE_DRIVE, Drives
+from pathspace_graph.graph.drives import ONE_DRIVE, Drives, of_sensor
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
@@ -141,6 +141,14 @@ class DetectionColumns:
         """Return the table of the given rows."""
         chosen = {column: vars(self)[column][rows] for column in self._columns()}
         return replace(self, **chosen)
+
+    def of_drive(self, drive: int) -> Self:
+        """Return the table of one of its drives, whose cycles keep their numbers."""
+        if len(self.drives) == 1:
+            return self
+        own = self.where(np.flatnonzero(self.drives.of(self.cycle) == drive))
+        sensor = of_sensor(self.sensor, self.drives.sensors[drive])
+        return replace(own, sensor=sensor, drives=ONE_DRIVE)
 
     def keep_from(self, cycle: int) -> None:
         """Remove the detections of all cycles before `cycle`."""
