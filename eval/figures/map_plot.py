@@ -183,8 +183,9 @@ def plot_apart(first: Map, second: Map, apart: MapsApart, *, title: str | None =
         points = np.concatenate([*apart.points.values()])
         distances = np.concatenate([*apart.distances.values()])
         order = np.argsort(distances)
+        x, y = points[order].T
         dots: dict[str, Any] = {"s": 9.0, "cmap": "YlOrRd", "vmin": 0.0, "linewidths": 0.0, "zorder": 2}
-        drawn = axes.scatter(*points[order].T, c=distances[order], **dots)
+        drawn = axes.scatter(x, y, c=distances[order], **dots)
         figure.colorbar(drawn, ax=axes, label="distance from the other map [m]", shrink=0.8)
         finish(figure, axes, title)
     return figure

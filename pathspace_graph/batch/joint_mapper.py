@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import SolveError, solving
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, inverse
+from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.moved import moved
 from pathspace_graph.lengths import scaled
@@ -32,7 +32,7 @@ from .mapper import (
 )
 from .objections import unmapped
 from .optimizer import Optimizer
-from .placement import NotPlacedError, find_place
+from .placement import Driven, NotPlacedError, find_place
 from .simplification import simplified
 
 
@@ -84,21 +84,30 @@ def solve_together(
 def place_all(
     alone: Mapping[str, BatchResult], vehicles: Mapping[str, str]
 ) -> tuple[list[PlacedDrive], dict[str, str]]:
-    """Return the drives that lie on the map of the first closed one, and why each other doesn't, by name."""
-    known = next((name for name, one in alone.items() if one.map.closed), next(iter(alone)))
+    """Return the drives that lie on the map of the base, and why each other doesn't, by name."""
+    known = base_of(alone)
     motions, left_out = {known: np.zeros(3)}, dict[str, str]()
     for name, one in alone.items():
         if name == known:
             continue
         try:
-            place = one.optimum.state, one.system.detections, one.system.settings
-            motions[name] = find_place(alone[known].optimum.state, *place)
+            motions[name] = find_place(driven(alone[known]), driven(one))
         except NotPlacedError as error:
             left_out[name] = str(error)
     names = [name for name in alone if name in motions]
     back = inverse(motions[names[0]])
     placed = [PlacedDrive(name, alone[name], compose(back, motions[name]), vehicles[name]) for name in names]
     return placed, left_out
+
+
+def base_of(alone: Mapping[str, BatchResult]) -> str:
+    """Return the name of the drive with whose curves all begin: the first closed one, or else the longest."""
+    closed = (name for name, one in alone.items() if one.map.closed)
+    return next(closed, max(alone, key=lambda name: float(path_lengths(alone[name].trajectory)[-1])))
+
+
+def driven(result: BatchResult) -> Driven:
+    return Driven(result.optimum.state, result.system.detections, result.system.settings)
 
 
 class _Joint:
@@ -112,9 +121,9 @@ class _Joint:
 
     def solve(self) -> None:
         """Search the optimum, and again without drives that contradict it."""
-        known = next((one for one in self.placed if one.alone.map.closed), self.placed[0])
+        base = base_of({one.name: one.alone for one in self.placed})
         self.system = JointSystem(self.placed)
-        state = joint_state(self.system, known)
+        state = joint_state(self.system, next(one for one in self.placed if one.name == base))
         self.system.revisits += tuple(revisits_between(self.system, state))
         self.optimizer = Optimizer(self.system, on_round=self._on_round)
         self.at, self.convergence = self.optimizer.find(state)
@@ -134,10 +143,10 @@ class _Joint:
 
     def _widen_priors(self) -> None:
         """Search the optimum again while it contradicts the prior of a calibration."""
-        self.known, state, widened = known_of(self.system, self.at), self.at.state, False
+        self.marginal, state, widened = known_of(self.system, self.at), self.at.state, False
         for d, settings in enumerate(self.system.priors):
             keys = state.calibration_keys(d)
-            variance = np.diag(self.known.covariance(keys))
+            variance = np.diag(self.marginal.covariance(keys))
             wider = with_inflated_priors(state.variables.of(keys), variance, settings)
             if wider != settings:
                 self.system.widen_priors_of(d, wider)
@@ -152,7 +161,7 @@ class _Joint:
         """Return the result in metres of the logs, whose scene has a scale."""
         system, state, watch = self.system, self.at.state, self._watch
         settings = system.settings
-        joint = map_covariance(state, self.known, settings)
+        joint = map_covariance(state, self.marginal, settings)
         few = simplified(state, system.detections, settings)
         joint = few.change @ joint @ few.change.T
         watch.lap("simplify")
@@ -163,7 +172,7 @@ class _Joint:
             records, laps = records_of(few, one.chain, seconds, d)
             own = few.detections.of_drive(d)
             own = replace(own, cycle=own.cycle - part.start)
-            vehicle = vehicle_of(state, self.known, settings, d)
+            vehicle = vehicle_of(state, self.marginal, settings, d)
             drive = BatchResult(
                 estimator=NAME,
                 settings=one.alone.settings,

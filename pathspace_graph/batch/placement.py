@@ -5,8 +5,8 @@ by the registration of what was detected. A place is taken if nearly all of that
 no other place is nearly as good.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import move_points, path_lengths, rotation
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.constellation import Constellation, lay
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import Motion, Registration, Sightings
 from pathspace_graph.mapping.state import State
@@ -32,14 +33,40 @@ SIGMA_FIT: Final = 0.5  # a detection at a distance d from its curve scores `exp
 MIN_SCORE: Final = 0.6  # least score of a place that is taken
 MARGIN: Final = 0.1  # least lead of its score over that of every other place
 
+FIRST_SEEN: Final = 60.0  # path from whose start cones tell the place on an open road (m)
+ABOUT_START: Final = (15.0, 0.3)  # farthest that drives of an open road begin from each other (m, rad)
+SIGMAS_START: Final = (5.0, 2.0, 0.1)  # of that (m, m, rad)
+
 OTHER_TRACK: Final = "it fits nowhere on the map of the other drives"
 OTHER_WAY: Final = "it goes the other way round"
 TWO_PLACES: Final = "it fits in two places of the map of the other drives"
+OTHER_START: Final = "its cones do not tell where it begins on the open road of the other drives"
 TOO_SHORT: Final = f"it is shorter than {LEAST_DRIVEN:g} m"
 
 
 class NotPlacedError(Exception):
     """No place of the map is that of a drive, and why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """A drive that was solved alone: its curves and poses, and its detections on them."""
+
+    state: State
+    detections: DetectionTable
+    settings: MapperSettings
+
+    @cached_property
+    def driven(self) -> Array:
+        """Return the length (m) of the path to each pose (P,)."""
+        return path_lengths(self.state.poses)
+
+    def beginning(self, length: float) -> Constellation:
+        """Return the cones that were seen in the first length (m) of the drive, in its frame."""
+        cycles = np.flatnonzero(self.driven < length)
+        table = self.detections.cones(self.settings.lines)
+        table = table.where(np.flatnonzero(table.in_cycles(cycles)))
+        return Constellation.of(table, self.state.poses, self.settings.growth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,24 +77,18 @@ class Place:
     motion: Array  # (3,) from the frame of the drive to that of the map
 
 
-def find_place(known: State, state: State, detections: DetectionTable, settings: MapperSettings) -> Array:
-    """Return the motion (3,) that lays a drive's state on a known one; NotPlacedError where none is sure.
+def find_place(known: Driven, drive: Driven) -> Array:
+    """Return the motion (3,) that lays a drive on a known one; NotPlacedError where none is sure.
 
-    The detections are those of the drive. The known map is closed.
+    On an open road, which hypotheses along it can't tell apart, both drives began about the same place.
     """
-    driven = path_lengths(state.poses)
-    if driven[-1] < LEAST_DRIVEN:
+    if drive.driven[-1] < LEAST_DRIVEN:
         raise NotPlacedError(TOO_SHORT)
-    loop = way_around(known)
-    way = resampled(state.poses[:, :2], min(float(driven[-1]), PLACE_STEP * len(loop)))
-    motions = beside(loop, way)
-    if len(motions) == 0:
-        backwards = len(beside(loop[::-1], way)) > 0
-        raise NotPlacedError(OTHER_WAY if backwards else OTHER_TRACK)
-    seen = sightings(state, detections)
-    places = [_refined(known, seen, motion, settings) for motion in motions]
+    motions = _around(known, drive) if known.state.closed else _about_start(known, drive)
+    seen = sightings(drive.state, drive.detections)
+    places = [_refined(known.state, seen, motion, drive.settings) for motion in motions]
     places.sort(key=lambda place: -place.score)
-    best, first = places[0], state.poses[:1, :2]
+    best, first = places[0], drive.state.poses[:1, :2]
     if best.score < MIN_SCORE:
         raise NotPlacedError(OTHER_TRACK)
     at = move_points(best.motion, first)
@@ -75,6 +96,25 @@ def find_place(known: State, state: State, detections: DetectionTable, settings:
     if rivals and rivals[0] > best.score - MARGIN:
         raise NotPlacedError(TWO_PLACES)
     return best.motion
+
+
+def _around(known: Driven, drive: Driven) -> list[Array]:
+    """Return the motions (3,) that lay the way driven on the loop of a closed map where it fits best."""
+    loop = way_around(known.state)
+    way = resampled(drive.state.poses[:, :2], min(float(drive.driven[-1]), PLACE_STEP * len(loop)))
+    motions = beside(loop, way)
+    if len(motions) == 0:
+        raise NotPlacedError(OTHER_WAY if beside(loop[::-1], way) else OTHER_TRACK)
+    return motions
+
+
+def _about_start(known: Driven, drive: Driven) -> list[Array]:
+    """Return the motion (3,) that lays the first cones of a drive on those of another one."""
+    seen, others = drive.beginning(FIRST_SEEN), known.beginning(FIRST_SEEN + ABOUT_START[0])
+    laid = lay(seen, others, np.zeros(3), np.diag(np.array(SIGMAS_START) ** -2), ABOUT_START)
+    if laid is None or not laid.is_sure:
+        raise NotPlacedError(OTHER_START)
+    return [laid.pose]
 
 
 def way_around(known: State) -> Array:
@@ -95,7 +135,7 @@ def resampled(path: Array, length: float) -> Array:
     return np.column_stack([np.interp(at, driven, axis) for axis in path.T])
 
 
-def beside(loop: Array, way: Array) -> Sequence[Array]:
+def beside(loop: Array, way: Array) -> list[Array]:
     """Return the motions (3,) that lay a way (m, 2) on a loop (n, 2) where it fits best, the best first."""
     path, around = way @ np.array([1.0, 1j]), loop @ np.array([1.0, 1j])
     places = (np.arange(len(loop))[:, None] + np.arange(len(way))) % len(loop)
