@@ -21,7 +21,8 @@ STEP: Final = 0.5  # distance of the points of a curve that are compared (m)
 AHEAD: Final = (0.0, -4.0, -2.0, 2.0, 4.0)  # where the other drive may have started, if in the same place (m)
 TURN: Final = np.deg2rad(2.0)  # step of the headings that are tried where it may have started anywhere
 TURNS: Final = 3  # best ones of these that are refined
-STEPS: Final = 30  # of Gauss-Newton
+STEPS: Final = 30  # most steps of Gauss-Newton
+STILL: Final = 1e-6  # largest move of a step after which there is no further one (m, rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,5 +142,8 @@ def aligning(points: Sequence[Array], boundaries: Sequence[MapBoundary], start: 
             lever = np.einsum("kd,kd->k", normal, left_of(point - motion[:2]))
             rows.append(np.column_stack([normal, lever]))
             errors.append(np.einsum("kd,kd->k", normal, position - point))
-        motion = motion + np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
+        step = np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
+        motion = motion + step
+        if np.abs(step).max() < STILL:
+            break
     return motion

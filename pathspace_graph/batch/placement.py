@@ -5,7 +5,8 @@ by the registration of what was detected. A place is taken if nearly all of that
 no other place is nearly as good.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import move_points, path_lengths, rotation
-from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.constellation import Constellation, lay
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import Motion, Registration, Sightings
@@ -84,37 +85,38 @@ def find_place(known: Driven, drive: Driven) -> Array:
     """
     if drive.driven[-1] < LEAST_DRIVEN:
         raise NotPlacedError(TOO_SHORT)
-    motions = _around(known, drive) if known.state.closed else _about_start(known, drive)
-    seen = sightings(drive.state, drive.detections)
-    places = [_refined(known.state, seen, motion, drive.settings) for motion in motions]
-    places.sort(key=lambda place: -place.score)
+    seen = sightings(drive)
+    places = _around(known, drive, seen) if known.state.closed else _about_start(known, drive, seen)
     best, first = places[0], drive.state.poses[:1, :2]
-    if best.score < MIN_SCORE:
-        raise NotPlacedError(OTHER_TRACK)
-    at = move_points(best.motion, first)
-    rivals = [p.score for p in places if np.hypot(*(move_points(p.motion, first) - at)[0]) > APART]
-    if rivals and rivals[0] > best.score - MARGIN:
+    begins = [move_points(place.motion, first)[0] for place in places]
+    rivals = [p.score for p, at in zip(places, begins, strict=True) if np.hypot(*(at - begins[0])) > APART]
+    if max(rivals, default=0.0) > best.score - MARGIN:
         raise NotPlacedError(TWO_PLACES)
     return best.motion
 
 
-def _around(known: Driven, drive: Driven) -> list[Array]:
-    """Return the motions (3,) that lay the way driven on the loop of a closed map where it fits best."""
+def _around(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
+    """Return the places around a closed map where a drive fits, the best first."""
     loop = way_around(known.state)
     way = resampled(drive.state.poses[:, :2], min(float(drive.driven[-1]), PLACE_STEP * len(loop)))
-    motions = beside(loop, way)
-    if len(motions) == 0:
-        raise NotPlacedError(OTHER_WAY if beside(loop[::-1], way) else OTHER_TRACK)
-    return motions
+    places = _places(known.state, seen, beside(loop, way), drive.settings)
+    if places:
+        return places
+    other_side = replace(seen, labels=LEFT + RIGHT - seen.labels)
+    backwards = _places(known.state, other_side, beside(loop[::-1], way), drive.settings)
+    raise NotPlacedError(OTHER_WAY if backwards else OTHER_TRACK)
 
 
-def _about_start(known: Driven, drive: Driven) -> list[Array]:
-    """Return the motion (3,) that lays the first cones of a drive on those of another one."""
-    seen, others = drive.beginning(FIRST_SEEN), known.beginning(FIRST_SEEN + ABOUT_START[0])
-    laid = lay(seen, others, np.zeros(3), np.diag(np.array(SIGMAS_START) ** -2), ABOUT_START)
+def _about_start(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
+    """Return the place where the first cones of a drive lie on those of another one."""
+    first, others = drive.beginning(FIRST_SEEN), known.beginning(FIRST_SEEN + ABOUT_START[0])
+    laid = lay(first, others, np.zeros(3), np.diag(np.array(SIGMAS_START) ** -2), ABOUT_START)
     if laid is None or not laid.is_sure:
         raise NotPlacedError(OTHER_START)
-    return [laid.pose]
+    places = _places(known.state, seen, [laid.pose], drive.settings)
+    if not places:
+        raise NotPlacedError(OTHER_TRACK)
+    return places
 
 
 def way_around(known: State) -> Array:
@@ -147,8 +149,7 @@ def beside(loop: Array, way: Array) -> list[Array]:
     misfit = np.sqrt((off**2).mean(axis=1))
     shift = means - turn * mean
     motions, chosen = np.column_stack([shift.real, shift.imag, np.angle(turn)]), list[int]()
-    most = MISFIT + SHARE_MISFIT * PLACE_STEP * len(way)
-    begins = turn * path[0] + shift
+    most, begins = MISFIT + SHARE_MISFIT * PLACE_STEP * len(way), turn * path[0] + shift
     for i in np.argsort(misfit).tolist():
         if misfit[i] > most or len(chosen) == MOST_PLACES:
             break
@@ -157,27 +158,33 @@ def beside(loop: Array, way: Array) -> list[Array]:
     return list(motions[chosen])
 
 
-def sightings(state: State, detections: DetectionTable) -> Sightings:
-    """Return detections in use on the curves of their own drive, in its frame."""
+def sightings(drive: Driven) -> Sightings:
+    """Return detections that lie on the curves of their own drive, in its frame."""
+    detections = drive.detections
     rows = np.flatnonzero(detections.used & np.isin(detections.boundary, BOUNDARIES))
     rows = rows[:: max(-(-len(rows) // DETECTIONS), 1)]
-    points = detections.points_map(rows, state.variables)
+    points = detections.points_map(rows, drive.state.variables)
     return Sightings.of_points(rows, detections.boundary[rows], points)
 
 
-def _refined(known: State, seen: Sightings, motion: Array, settings: MapperSettings) -> Place:
-    """Return the place that is registered from a motion (3,)."""
-    centre = seen.points.mean(axis=0)
+def _places(known: State, seen: Sightings, motions: Sequence[Array], settings: MapperSettings) -> list[Place]:
+    """Return the places registered from motions (3,) where detections lie on the curves, the best first."""
+    kept = np.isin(seen.labels, list(known.boundaries))
+    if not kept.any():
+        return []
+    seen = Sightings.of_points(seen.rows[kept], seen.labels[kept], seen.points[kept])
+    places = [_registered(known, seen, motion, settings) for motion in motions]
+    return sorted((place for place in places if place.score >= MIN_SCORE), key=lambda place: -place.score)
+
+
+def _registered(known: State, seen: Sightings, motion: Array, settings: MapperSettings) -> Place:
+    centre, prior = seen.points.mean(axis=0), np.diag(np.array(SIGMAS_PLACE) ** -2)
     vector = np.append(move_points(motion, centre[None])[0] - centre, motion[2])
     stretches = {label: (b.tables.low, b.tables.high) for label, b in known.boundaries.items()}
-    kept = np.isin(seen.labels, list(stretches))
-    seen = Sightings.of_points(seen.rows[kept], seen.labels[kept], seen.points[kept])
     registration = Registration(known, seen, stretches, settings.closing)
     for _ in range(REFINEMENTS):
-        start = Motion(centre, vector)
-        vector = registration.refine(start, vector, np.diag(np.array(SIGMAS_PLACE) ** -2)).motion.vector
-    moved = Motion(centre, vector)
-    distance = _distances(known, seen.labels, moved.apply(seen.points))
+        vector = registration.refine(Motion(centre, vector), vector, prior).motion.vector
+    distance = _distances(known, seen.labels, Motion(centre, vector).apply(seen.points))
     shift = centre + vector[:2] - rotation(float(vector[2])) @ centre
     score = float(np.exp(-0.5 * (distance / SIGMA_FIT) ** 2).mean())
     return Place(score, np.append(shift, vector[2]))

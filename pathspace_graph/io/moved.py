@@ -41,6 +41,7 @@ def _moved_points(cones: PointBoundary, motion: Array) -> PointBoundary:
 def _turned(covariance: Array, motion: Array) -> Array:
     """Return a covariance (2m, 2m) of points in the turned frame."""
     turn = rotation(float(motion[2]))
-    blocks = covariance.reshape(len(covariance) // 2, 2, -1, 2)
+    count = len(covariance) // 2
+    blocks = covariance.reshape(count, 2, count, 2)
     turned = np.einsum("ij,ajbk,lk->aibl", turn, blocks, turn)
     return np.asarray(turned.reshape(covariance.shape), np.float64)
