@@ -16,7 +16,7 @@ from pathspace_graph.io.log import write_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory
 
-from ..scenes.several import lap
+from ..batch.joint.several import lap
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:
         (
             ["a", "b"],
             ["--estimator", "landmark-batch"],
-            "expected spline for several logs, found landmark-batch",
+            "expected spline for several logs, found",
         ),
         (["a", "nowhere"], [], "nowhere: expected a log folder, found none"),
     ],

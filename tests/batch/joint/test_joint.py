@@ -21,7 +21,7 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.moved import moved_run
 
-from ...scenes.several import Solved, alone, lap, together, true_start
+from .several import Solved, alone, lap, together, true_start
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from ...scenes.batch import course_log
-from ...scenes.several import backwards, cut, driven_alone, lap, track, true_start
+from .several import backwards, cut, driven_alone, lap, track, true_start
 
 
 def test_a_way_is_laid_on_the_loop_where_it_belongs() -> None:

@@ -19,7 +19,7 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.track_generator import generate_track
 
-from .drives import SHORT
+from ...scenes.drives import SHORT
 
 Array = NDArray[np.float64]
 
