@@ -60,9 +60,9 @@ def solve_together(
     `make` makes the mapper by which each log is solved alone. A log that can't be solved alone, or whose
     drive fits nowhere on the map of the others, is left out. SolveError where none is left.
     """
-    settings, watch = known_settings(settings), Stopwatch()
-    scale = chosen_scale(settings, next(iter(logs.values())))
-    settings, alone, left_out = replace(settings, scale=scale), dict[str, BatchResult](), dict[str, str]()
+    settings = known_settings(settings)
+    settings = replace(settings, scale=chosen_scale(settings, next(iter(logs.values()))))
+    alone, left_out = dict[str, BatchResult](), dict[str, str]()
     for name, log in logs.items():
         try:
             alone[name] = make(settings, log).solve(log, start, on_round)
@@ -70,15 +70,27 @@ def solve_together(
             left_out[name] = str(error)
     if not alone:
         raise SolveError(next(iter(left_out.values())))
-    watch.lap("alone")
-    vehicles = {name: log.source.get("vehicle", "") for name, log in logs.items()}
+    joint = join(alone, {name: log.source.get("vehicle", "") for name, log in logs.items()}, on_round)
+    return replace(joint, left_out=left_out | joint.left_out)
+
+
+def join(
+    alone: Mapping[str, BatchResult],
+    vehicles: Mapping[str, str] | None = None,
+    on_round: Callable[[], None] | None = None,
+) -> JointResult:
+    """Return one map of drives that were solved alone, at one scale.
+
+    Drives of one vehicle, where its name is known, share the calibration of the sensor.
+    """
+    scale, watch = next(iter(alone.values())).scale, Stopwatch()
     with threadpool_limits(limits=1), solving("the joint batch"):
-        placed, apart = place_all(alone, vehicles)
+        placed, left_out = place_all(alone, vehicles or {})
         watch.lap("place")
         joint = _Joint(placed, on_round, watch)
         joint.solve()
-    result = joint.result(scale)
-    return replace(result, left_out=left_out | apart | joint.left_out)
+        result = joint.result(scale)
+    return replace(result, left_out=left_out | joint.left_out)
 
 
 def place_all(
@@ -96,7 +108,9 @@ def place_all(
             left_out[name] = str(error)
     names = [name for name in alone if name in motions]
     back = inverse(motions[names[0]])
-    placed = [PlacedDrive(name, alone[name], compose(back, motions[name]), vehicles[name]) for name in names]
+    placed = [
+        PlacedDrive(name, alone[name], compose(back, motions[name]), vehicles.get(name, "")) for name in names
+    ]
     return placed, left_out
 
 

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.joint_mapper import JointResult, driven, solve_together
+from pathspace_graph.batch.joint_mapper import JointResult, driven, join
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.placement import Driven
 from pathspace_graph.factors.se2 import compose, inverse, to_vehicle
@@ -79,18 +79,8 @@ def driven_alone(log: Log) -> Driven:
     return driven(alone(log))
 
 
-class Solved:
-    """A mapper that has solved its log already."""
-
-    def __init__(self, _: MapperSettings, log: Log) -> None:
-        self._log = log
-
-    def solve(self, log: Log, *_: object) -> BatchResult:
-        return alone(log)
-
-
 @cache
 def together() -> JointResult:
     """Two drives of a track, begun in two places, and one of another track, as one batch."""
     logs = {"first": lap(0), "elsewhere": lap(1, 9.0), "other": lap(0, 0.0, 5)}
-    return solve_together(logs, Solved)  # type: ignore[arg-type]
+    return join({name: alone(log) for name, log in logs.items()})

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.association import Cones, first_parameter, seen_by_most
 from pathspace_graph.batch.joint import JointSystem, PlacedDrive, drives_of, joint_state
 from pathspace_graph.batch.joint_mapper import solve_together
+from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.optimizer import Optimizer
 from pathspace_graph.batch.placement import OTHER_TRACK
 from pathspace_graph.batch.system import moved as stepped
@@ -20,8 +21,9 @@ from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.moved import moved_run
+from pathspace_graph.settings.mapper import MapperSettings
 
-from .several import Solved, alone, lap, together, true_start
+from .several import alone, lap, together, true_start
 
 Array = NDArray[np.float64]
 
@@ -120,18 +122,24 @@ def test_each_drive_has_its_own_calibration_and_covariances() -> None:
     assert np.abs(first - second).max() > 1e-4
 
 
-def test_a_log_that_cannot_be_solved_alone_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    def solve(self: Solved, log: Log, *_: object) -> object:
+class Solved(BatchMapper):
+    """A mapper that knows the result of a log already, or that there is none."""
+
+    def solve(self, log: Log, *_: Any) -> BatchResult:
         if log is lap(0):
             raise SolveError("no way to an optimum")
         return alone(log)
 
-    monkeypatch.setattr(Solved, "solve", solve)
-    result = solve_together({"broken": lap(0), "good": lap(1, 9.0)}, Solved)
+
+def test_a_log_that_cannot_be_solved_alone_is_left_out() -> None:
+    def mapper(settings: MapperSettings, log: Log) -> BatchMapper:
+        return Solved(settings)
+
+    result = solve_together({"broken": lap(0), "good": lap(1, 9.0)}, mapper)
     assert [*result.drives] == ["good"]
     assert result.left_out == {"broken": "no way to an optimum"}
     with pytest.raises(SolveError, match="no way to an optimum"):
-        solve_together({"broken": lap(0)}, Solved)
+        solve_together({"broken": lap(0)}, mapper)
 
 
 def test_a_cone_that_most_drives_have_not_seen_is_none() -> None:
