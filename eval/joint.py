@@ -65,9 +65,7 @@ class JointStudy:
         """Return the rows of one track, each drive of which is solved alone once."""
         track, settings = generate_track(np.random.default_rng(number)), self.cars[car]
         logs = {str(seed): simulate(track, settings, seed) for seed in range(self.drives)}
-        alone = {
-            name: make_batch(DEFAULT_BATCH, MapperSettings(), log).solve(log) for name, log in logs.items()
-        }
+        alone = {name: solve_alone(log) for name, log in logs.items()}
         names, rows, count = [*logs], list[dict[str, Any]](), 1
         while count <= self.drives:
             for begin in range(0, self.drives, count):
@@ -76,6 +74,13 @@ class JointStudy:
                 rows.append(about | metrics_of_group(group, alone))
             count *= 2
         return rows
+
+
+def solve_alone(log: Log) -> BatchResult:
+    """Return the default batch of a log."""
+    result = make_batch(DEFAULT_BATCH, MapperSettings(), log).solve(log)
+    assert isinstance(result, BatchResult)
+    return result
 
 
 def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) -> dict[str, Any]:

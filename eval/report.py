@@ -43,7 +43,7 @@ PAGES: Final = {  # tables of each page, from the root of the project
     "docs/results.md": (
         *("results-speed", "results-tracks", "results-laps", "results-compared", "results-scaling"),
     ),
-    "docs/real.md": ("real-runs", "real-maps", "real-measured"),
+    "docs/real.md": ("real-runs", "real-maps", "real-joint", "real-measured"),
     "docs/closing.md": ("skidpad",),
     "docs/studies.md": ("camera", "closing", "hard", "lines", "endurance", "reach", "joint", "paper"),
     "docs/reliability.md": ("faults", "recovery", "hints"),
@@ -216,6 +216,7 @@ class Plan:
             "readme-real": real.ends_table(drives),
             "real-runs": real.runs_table(drives),
             "real-maps": real.maps_table(drives),
+            "real-joint": real.joint_table(drives),
             "real-measured": real.measured_table(drives),
         }
 

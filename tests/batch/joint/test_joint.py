@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,7 +15,7 @@ from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.optimizer import Optimizer
 from pathspace_graph.batch.placement import OTHER_TRACK
 from pathspace_graph.batch.system import moved as stepped
-from pathspace_graph.errors import SolveError
+from pathspace_graph.errors import SettingsError, SolveError
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.alignment import shape_rmse
 from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_errors
@@ -120,6 +122,11 @@ def test_each_drive_has_its_own_calibration_and_covariances() -> None:
         assert np.linalg.eigvalsh(drive.pose_covariances).min() > 0.0
     first, second = (one.calibration for one in result.drives.values())
     assert np.abs(first - second).max() > 1e-4
+
+
+def test_the_graph_of_several_drives_is_refused() -> None:
+    with pytest.raises(SettingsError, match="expected the batch of one drive, found 2 drives"):
+        together().drives["first"].graph()
 
 
 class Solved(BatchMapper):
