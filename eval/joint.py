@@ -12,7 +12,7 @@ from pathspace_graph.batch.joint_mapper import join
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.estimators import DEFAULT_BATCH, make_batch
 from pathspace_graph.factors.se2 import inverse
-from pathspace_graph.io.log import Log
+from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.moved import moved_run
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -84,28 +84,27 @@ def solve_alone(log: Log) -> BatchResult:
 
 
 def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) -> dict[str, Any]:
-    """Return the metrics of the map of some drives: those of the first, and the mean trajectory error."""
-    first = next(iter(logs))
-    result, own = alone[first], [alone[first]]
+    """Return the metrics of the map of some drives, in the frame of the first, and of their trajectories."""
+    first, mapped = next(iter(logs)), {name: alone[name] for name in logs}
+    own = mapped
     if len(logs) > 1:
-        joint = join({name: alone[name] for name in logs})
-        result, drives = joint.drives[first], joint.drives.items()
-        own = [moved_run(drive, inverse(joint.frames[name])) for name, drive in drives]
-    truths = [log.truth for log in logs.values()]
-    errors = [
-        position_rms(trajectory_errors(run.trajectory_t, run.trajectory, truth))
-        for run, truth in zip(own, truths, strict=False)
-        if truth is not None
-    ]
-    truth = truths[0]
-    assert truth is not None
+        joint = join(mapped)
+        first, mapped = next(iter(joint.drives)), joint.drives
+        own = {name: moved_run(drive, inverse(joint.frames[name])) for name, drive in mapped.items()}
+    track, truths = mapped[first].map, {name: _truth(logs[name]) for name in mapped}
+    errors = [trajectory_errors(own[name].trajectory_t, own[name].trajectory, truths[name]) for name in own]
     return {
-        "shape": shape_rmse(result.map, truth),
-        "nees": map_nees(result.map, truth).ratio,
-        "inside": consistency_at_cones(result.map, truth)["inside"],
-        "ate": float(np.mean(errors)),
+        "shape": shape_rmse(track, truths[first]),
+        "nees": map_nees(track, truths[first]).ratio,
+        "inside": consistency_at_cones(track, truths[first])["inside"],
+        "ate": float(np.mean([position_rms(one) for one in errors])),
         "mapped": len(own),
     }
+
+
+def _truth(log: Log) -> Truth:
+    assert log.truth is not None
+    return log.truth
 
 
 def joint_table(frame: pd.DataFrame) -> View:
