@@ -1,8 +1,8 @@
 """The place of a drive on the map of others: hypotheses along the road, until one is left.
 
 The way that was driven is laid rigidly beside each place of the known road, and the best places are refined
-by the registration of what was detected. A place is taken if nearly all of that lies on the curves there, and
-no other place is nearly as good.
+by the registration of what was detected. A place is taken if nearly all of that lies on the curves there, the
+cones of a stretch surely lie on known ones, and no other place is nearly as good.
 """
 
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.se2 import move_points, path_lengths, rotation
+from pathspace_graph.factors.se2 import compose, move_points, path_lengths, rotation
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.mapping.constellation import Constellation, lay
+from pathspace_graph.mapping.constellation import LAID_NEWEST, NEARBY, Constellation, lay
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import Motion, Registration, Sightings
 from pathspace_graph.mapping.state import State
@@ -23,6 +23,8 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 PLACE_STEP: Final = 2.0  # distance of the places that are tried, and of the points of a way (m)
 LEAST_DRIVEN: Final = 30.0  # shortest drive that is placed (m)
+LEAST_OF_LINE: Final = 150.0  # the same where no cones confirm the place (m)
+STRETCH: Final = LAID_NEWEST  # of a drive whose cones confirm its place (m)
 MISFIT: Final = 6.0  # most rms distance of both ways at a place that is refined (m)
 SHARE_MISFIT: Final = 0.02  # added to it, as a share of the length of the way
 MOST_PLACES: Final = 12  # places that are refined
@@ -42,7 +44,6 @@ OTHER_TRACK: Final = "it fits nowhere on the map of the other drives"
 OTHER_WAY: Final = "it goes the other way round"
 TWO_PLACES: Final = "it fits in two places of the map of the other drives"
 OTHER_START: Final = "its cones do not tell where it begins on the open road of the other drives"
-TOO_SHORT: Final = f"it is shorter than {LEAST_DRIVEN:g} m"
 
 
 class NotPlacedError(Exception):
@@ -62,12 +63,17 @@ class Driven:
         """Return the length (m) of the path to each pose (P,)."""
         return path_lengths(self.state.poses)
 
-    def beginning(self, length: float) -> Constellation:
-        """Return the cones that were seen in the first length (m) of the drive, in its frame."""
-        cycles = np.flatnonzero(self.driven < length)
+    def cones(self, begin: float = 0.0, end: float = np.inf) -> Constellation:
+        """Return the cones that were seen on a stretch of the drive (m), in its frame."""
+        cycles = np.flatnonzero((self.driven >= begin) & (self.driven < end))
         table = self.detections.cones(self.settings.lines)
         table = table.where(np.flatnonzero(table.in_cycles(cycles)))
         return Constellation.of(table, self.state.poses, self.settings.growth)
+
+    @cached_property
+    def all_cones(self) -> Constellation:
+        """Return the cones of the whole drive."""
+        return self.cones()
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +89,15 @@ def find_place(known: Driven, drive: Driven) -> Array:
 
     On an open road, which hypotheses along it can't tell apart, both drives began about the same place.
     """
-    if drive.driven[-1] < LEAST_DRIVEN:
-        raise NotPlacedError(TOO_SHORT)
+    least = LEAST_OF_LINE if drive.settings.lines else LEAST_DRIVEN
+    if drive.driven[-1] < least:
+        raise NotPlacedError(f"it is shorter than {least:g} m")
     seen = sightings(drive)
     places = _around(known, drive, seen) if known.state.closed else _about_start(known, drive, seen)
+    if not drive.settings.lines:
+        places = [place for place in places if cones_agree(known, drive, place.motion)]
+    if not places:
+        raise NotPlacedError(OTHER_TRACK)
     best, first = places[0], drive.state.poses[:1, :2]
     begins = [move_points(place.motion, first)[0] for place in places]
     rivals = [p.score for p, at in zip(places, begins, strict=True) if np.hypot(*(at - begins[0])) > APART]
@@ -109,7 +120,7 @@ def _around(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
 
 def _about_start(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
     """Return the place where the first cones of a drive lie on those of another one."""
-    first, others = drive.beginning(FIRST_SEEN), known.beginning(FIRST_SEEN + ABOUT_START[0])
+    first, others = drive.cones(0.0, FIRST_SEEN), known.cones(0.0, FIRST_SEEN + ABOUT_START[0])
     laid = lay(first, others, np.zeros(3), np.diag(np.array(SIGMAS_START) ** -2), ABOUT_START)
     if laid is None or not laid.is_sure:
         raise NotPlacedError(OTHER_START)
@@ -117,6 +128,21 @@ def _about_start(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
     if not places:
         raise NotPlacedError(OTHER_TRACK)
     return places
+
+
+def cones_agree(known: Driven, drive: Driven, motion: Array) -> bool:
+    """Return whether the cones of a stretch of a drive, after a motion (3,), surely lie on known ones.
+
+    A short way fits on many roads; its cones do not.
+    """
+    for begin in np.arange(0.0, max(float(drive.driven[-1]) - 0.5 * STRETCH, 1.0), STRETCH).tolist():
+        pose = drive.state.poses[drive.driven.searchsorted(begin)]
+        seen = drive.cones(begin, begin + STRETCH).seen_from(pose)
+        reach = NEARBY.radius, NEARBY.turn
+        laid = lay(seen, known.all_cones, compose(motion, pose), NEARBY.information, reach)
+        if laid is not None and laid.is_sure:
+            return True
+    return False
 
 
 def way_around(known: State) -> Array:

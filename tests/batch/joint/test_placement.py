@@ -11,7 +11,6 @@ from pathspace_graph.batch.placement import (
     OTHER_START,
     OTHER_TRACK,
     OTHER_WAY,
-    TOO_SHORT,
     TWO_PLACES,
     Driven,
     NotPlacedError,
@@ -61,7 +60,7 @@ def course(laps: float) -> Driven:
     [
         (lambda: lap(0), lambda: lap(0, 0.0, 5), OTHER_TRACK),
         (lambda: lap(0), backwards, OTHER_WAY),
-        (lambda: lap(0), lambda: cut(lap(1), 0.0, 3.0), TOO_SHORT),
+        (lambda: lap(0), lambda: cut(lap(1), 0.0, 3.0), "it is shorter than 30 m"),
         (lambda: course_log(1.4), lambda: course_log(1.3), TWO_PLACES),
         (lambda: lap(0, 0.0, 4, 9.0), lambda: lap(0, 0.0, 5, 9.0), OTHER_START),
     ],
