@@ -193,7 +193,7 @@ class Plan:
         return {"hints": views.hints_table(study.measure(self.on_cell))}
 
     def joint(self, _: Path) -> Views:
-        small: dict[str, Any] = {"tracks": (40,), "drives": 2} if self.quick else {}
+        small: dict[str, Any] = {"tracks": (50,), "drives": 2} if self.quick else {}
         frame = JointStudy(jobs=self.jobs, **small).measure(self.on_cell)
         return {"joint": joint_table(frame)}
 
