@@ -185,7 +185,7 @@ class Batch:
         summary = summarize_batch(result, logs[name], hints[name]) | summary_of_drives(joint, logs)
         write_result(self.out, result, summary, joint.drives)
         report(result, logs[name])
-        say(*drive_lines(joint, logs), f"written to {self.out}")
+        say(*drive_lines(joint), f"written to {self.out}")
         left_out = [f"{name} is left out: {why}" for name, why in joint.left_out.items()]
         end_untrusted([*left_out, *untrusted(result)])
 
@@ -225,7 +225,7 @@ def summary_of_drives(joint: JointResult, logs: Mapping[str, Log]) -> dict[str, 
     return {"drives": drives, "left_out": joint.left_out}
 
 
-def drive_lines(joint: JointResult, logs: Mapping[str, Log]) -> list[str]:
+def drive_lines(joint: JointResult) -> list[str]:
     """Return a line for each drive of a joint map."""
     lines = []
     for name, result in joint.drives.items():
