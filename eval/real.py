@@ -9,8 +9,10 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph import estimators as registry
+from pathspace_graph.batch.joint_mapper import join
+from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import wrap_angle
+from pathspace_graph.factors.se2 import compose, inverse, wrap_angle
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import seen_cycles
 from pathspace_graph.io.log import Log
@@ -20,7 +22,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .experiment.cells import run_estimator
 from .metrics.accuracy import crossings
-from .metrics.reference import aligned_distance
+from .metrics.alignment import aligned_distance, maps_apart
 from .metrics.registration import end_by_registration
 from .metrics.summary import summarize
 from .views import Figure, View
@@ -108,6 +110,23 @@ def maps_table(drives: Sequence[RealDrive]) -> View:
         if min(apart) < 1.0:
             rows.append((f"{first.name}, {second.name}", Figure.row(apart, 2)))
     return ("maps", *(f"{name} [m]" for name in RUNS)), tuple(rows)
+
+
+def joint_table(drives: Sequence[RealDrive]) -> View:
+    """Return how far each drive's own batch is from that of all drives, and both from the last pose."""
+    alone = {drive.name: run for drive in drives if isinstance(run := drive.runs["batch"], BatchResult)}
+    joint, rows = join(alone), []
+    for drive in drives:
+        if drive.name not in joint.drives:
+            continue
+        own = joint.drives[drive.name]
+        apart = maps_apart(alone[drive.name].map, own.map).statistics()["both"]
+        pose = compose(inverse(joint.frames[drive.name]), own.trajectory[-1])
+        ends = drive.off(alone[drive.name].trajectory[-1])[0], drive.off(pose)[0]
+        values = [apart["mean"], apart["rms"], apart["p95"], apart["max"], *ends]
+        rows.append((drive.name, Figure.row(values, 2)))
+    apart_by = ("map apart, mean [m]", "rms [m]", "p95 [m]", "largest [m]")
+    return ("drive", *apart_by, "end off by, alone [m]", "together [m]"), tuple(rows)
 
 
 def measured_table(drives: Sequence[RealDrive]) -> View:

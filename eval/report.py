@@ -29,6 +29,7 @@ from .experiment.run import run_study
 from .experiment.study import Baseline, Study, find_study, read_study_file
 from .experiment.tables import TextTable
 from .hints import HintStudy
+from .joint import JointStudy, joint_table
 from .views import ESTIMATORS, LANDMARKS, ONLINE, Figure, Rows, View
 
 FORMAT: Final = "pathspace-figures/1"
@@ -41,9 +42,9 @@ PAGES: Final = {  # tables of each page, from the root of the project
     "docs/results.md": (
         *("results-speed", "results-tracks", "results-laps", "results-compared", "results-scaling"),
     ),
-    "docs/real.md": ("real-runs", "real-maps", "real-measured"),
+    "docs/real.md": ("real-runs", "real-maps", "real-joint", "real-measured"),
     "docs/closing.md": ("skidpad",),
-    "docs/studies.md": ("camera", "closing", "hard", "lines", "endurance", "reach", "paper"),
+    "docs/studies.md": ("camera", "closing", "hard", "lines", "endurance", "reach", "joint", "paper"),
     "docs/reliability.md": ("faults", "recovery", "hints"),
     "docs/ablations.md": ("centerline", *ABLATIONS),
 }
@@ -190,6 +191,11 @@ class Plan:
         study = HintStudy(out=folder, tracks=tracks, seeds=(0,), jobs=self.jobs, **small)
         return {"hints": views.hints_table(study.measure(self.on_cell))}
 
+    def joint(self, _: Path) -> Views:
+        small: dict[str, Any] = {"tracks": (50,), "drives": 2} if self.quick else {}
+        frame = JointStudy(jobs=self.jobs, **small).measure(self.on_cell)
+        return {"joint": joint_table(frame)}
+
     def speed(self, _: Path) -> Views:
         seeds, laps = (GENERATED[:1], 1) if self.quick else (GENERATED, 5)
         runs = [{m.key: m.value for m in metrics(measure_drive(seed, laps))} for seed in seeds]
@@ -209,6 +215,7 @@ class Plan:
             "readme-real": real.ends_table(drives),
             "real-runs": real.runs_table(drives),
             "real-maps": real.maps_table(drives),
+            "real-joint": real.joint_table(drives),
             "real-measured": real.measured_table(drives),
         }
 
@@ -242,6 +249,7 @@ EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "centerline": Plan.centerline,
     **dict.fromkeys(ABLATIONS, Plan.ablation),
     "hints": Plan.hints,
+    "joint": Plan.joint,
     "speed": Plan.speed,
     "scale": Plan.scale,
     "real": Plan.real_logs,

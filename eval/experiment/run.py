@@ -16,7 +16,7 @@ from joblib import Parallel, delayed, parallel_config
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, OutputError, SettingsError
-from pathspace_graph.eval.metrics.reference import aligned_distance
+from pathspace_graph.eval.metrics.alignment import aligned_distance
 from pathspace_graph.io.files import check_target, remove_manifest, write_json
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.parsing import read_json, shown

@@ -11,12 +11,15 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.metrics.accuracy import mapped_points
+from pathspace_graph.eval.metrics.alignment import MapsApart
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary
+from pathspace_graph.io.moved import moved
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, POINTS, RIGHT, UNKNOWN
 
 from . import style
@@ -163,6 +166,29 @@ def finish(figure: Figure, axes: Axes, title: str | None) -> None:
     style.grouped_legend(figure)
     width, height = high - low
     figure.set_size_inches(WIDTH, min(7.5, WIDTH * height / width + 0.85))
+
+
+def plot_apart(first: Map, second: Map, apart: MapsApart, *, title: str | None = None) -> Picture:
+    """Draw two maps, the first laid on the second, and how far they are apart there, in colours."""
+    with style.figure_context():
+        figure = Picture(layout="constrained")
+        axes = figure.add_subplot()
+        for track, color, name in ((moved(first, apart.motion), BLUE, "first"), (second, DARK, "second")):
+            for boundary in track.boundaries.values():
+                points = mapped_points(boundary)
+                if isinstance(boundary, PointBoundary):
+                    style.draw_points(axes, points, "o", color, name, markersize=1.4, zorder=3)
+                else:
+                    style.draw_curve(axes, boundary.spline, color, name, 0.7, zorder=3)
+        points = np.concatenate([*apart.points.values()])
+        distances = np.concatenate([*apart.distances.values()])
+        order = np.argsort(distances)
+        x, y = points[order].T
+        dots: dict[str, Any] = {"s": 9.0, "cmap": "YlOrRd", "vmin": 0.0, "linewidths": 0.0, "zorder": 2}
+        drawn = axes.scatter(x, y, c=distances[order], **dots)
+        figure.colorbar(drawn, ax=axes, label="distance from the other map [m]", shrink=0.8)
+        finish(figure, axes, title)
+    return figure
 
 
 def plot_log(log: Log, *, title: str | None = None) -> style.Picture:

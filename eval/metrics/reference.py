@@ -1,16 +1,14 @@
 """What a run is held against: the least error to be expected of its log, and another run."""
 
 from dataclasses import dataclass, replace
-from itertools import repeat
 
 import numpy as np
 
 from pathspace_graph.baselines.landmark_batch import LandmarkSystem, solve_landmarks
 from pathspace_graph.baselines.landmark_map import LandmarkState
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.se2 import inverse, left_of, to_map
 from pathspace_graph.io.log import Detections, Log, Truth, ray_covariances
-from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
+from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.settings.mapper import MapperSettings
@@ -18,8 +16,7 @@ from pathspace_graph.settings.online import CalibrationSettings
 from pathspace_graph.spline.knots import fit_spline
 
 from . import accuracy
-from .accuracy import boundary_distances, closest_points, mapped_points, root_mean_square
-from .consistency import near_pairs
+from .accuracy import closest_points, root_mean_square
 from .trajectory import pose_errors
 
 
@@ -179,35 +176,3 @@ def gap(run: RunResult, reference: RunResult) -> Gap:
     curves = {NAMES[label]: accuracy.two_way_distance(own[label], others[label]) for label in shared}
     errors = pose_errors(run.trajectory_t, run.trajectory, reference.trajectory_t, reference.trajectory)
     return Gap(curves, *(root_mean_square(column) for column in errors.T))
-
-
-def aligned_distance(track: Map, reference: Map) -> float:
-    """Return the mean two-way distance (m) of a map from another one of the same cones, rigidly aligned.
-
-    Each drive has its own map frame, and may have started farther ahead. The least distance by closest points
-    from several starts counts; it is infinite where the maps share no boundary.
-    """
-    shared = sorted(set(track.boundaries) & set(reference.boundaries))
-    first, second = ([of.boundaries[label] for label in shared] for of in (track, reference))
-    points, others = ([mapped_points(boundary, 0.5) for boundary in of] for of in (first, second))
-    best = np.inf
-    for start in (0.0, -4.0, -2.0, 2.0, 4.0) if shared else ():
-        motion = _aligning(points, second, start)
-        ways = [*zip(second, points, repeat(motion)), *zip(first, others, repeat(inverse(motion)))]
-        distances = [boundary_distances(boundary, to_map(of, way[None])) for boundary, of, way in ways]
-        best = min(best, float(np.mean(np.concatenate(distances))))
-    return float(best)
-
-
-def _aligning(points: list[Array], boundaries: list[MapBoundary], start: float) -> Array:
-    """Return the motion (3,) that lays points (k, 2) of curves on the boundaries of another map."""
-    motion = np.array([start, 0.0, 0.0])
-    for _ in range(30):
-        rows, errors = [np.zeros((0, 3))], [np.zeros(0)]
-        for own, boundary in zip(points, boundaries, strict=True):
-            point, normal, position, _ = near_pairs(boundary, to_map(own, motion[None]))
-            lever = np.einsum("kd,kd->k", normal, left_of(point - motion[:2]))
-            rows.append(np.column_stack([normal, lever]))
-            errors.append(np.einsum("kd,kd->k", normal, position - point))
-        motion = motion + np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
-    return motion

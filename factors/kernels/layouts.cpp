@@ -5,6 +5,8 @@
 namespace kernels {
 namespace {
 
+constexpr Index kIndices = Index{1} << 56;  // keys of one letter
+
 Ints spread(const Ints& starts, const Ints& widths) {
   const Index count = starts.shape(0);
   expect(widths.size() == count);
@@ -26,7 +28,8 @@ py::tuple laid_out(const Ints& keys, Index sensor_key, Index first_pose, const p
   for (Index i = 0; i < count; ++i) {
     const Index key = keys.data()[i];
     starts.mutable_data()[i] = total;
-    total += widths.mutable_data()[i] = key >= first_pose ? pose : key == sensor_key ? sensor : point;
+    const bool senses = key >= sensor_key && key - sensor_key < kIndices;  // of any sensor
+    total += widths.mutable_data()[i] = key >= first_pose ? pose : senses ? sensor : point;
   }
   py::list begins(bounds.shape(0));
   for (Index b = 0; b < bounds.shape(0); ++b) {

@@ -5,11 +5,13 @@ from typing import Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.spatial import KDTree
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import sigma_across
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
+from pathspace_graph.graph.drives import Drives
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionTable
@@ -69,10 +71,23 @@ def locate_poses(state: State) -> None:
         against = headings(poses) @ tangent.T < SAME_DIRECTION
         np.add(square, DIRECTION_PENALTY**2, out=square, where=against)
         if boundary.periodic:
-            state.pose_u[label] = np.unwrap(u[square.argmin(axis=1)], period=boundary.length)
+            state.pose_u[label] = _from_lap_to_lap(u[square.argmin(axis=1)], boundary.length, state.drives)
         else:
             driven = np.hypot(*np.diff(poses[:, :2], axis=0).T) + POSE_ROOM
+            driven[state.drives.begins(len(poses))] = boundary.length
             state.pose_u[label] = u[_along(square, driven * count / boundary.length)]
+
+
+def _from_lap_to_lap(u: Array, length: float, drives: Drives) -> Array:
+    """Return parameters (P,) that go on from lap to lap, and from drive to drive by some lap more."""
+    parts, last = list[Array](), -np.inf
+    for part in drives.parts(len(u)):
+        own = np.unwrap(u[part], period=length)
+        if parts:
+            own = own + length * np.ceil((last - own[0]) / length)
+        parts.append(own)
+        last = float(own[-1])
+    return np.concatenate(parts)
 
 
 def _along(square: Array, steps: Array) -> IntArray:
@@ -225,12 +240,38 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     off_curve = clustered(others[~near])
     cones = cones.merged(off_curve.where(off_curve.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
-        pose_u = state.pose_u[label]
+        longest = state.drives.longest(len(state.poses))
+        poses, pose_u = state.poses[longest], state.pose_u[label][longest]
         lap = pose_u > pose_u[-1] - boundary.length  # the last one
         apart = np.mod(cones.u[:, None] + begin - pose_u[lap], boundary.length)
         own = np.minimum(apart, boundary.length - apart) < PASS_STRETCH
-        cones = along_drive(cones, state.poses[lap], own, label)
+        cones = along_drive(cones, poses[lap], own, label)
+    if len(detections.drives) > 1:
+        cones = cones.where(seen_by_most(state, label, cones, points, cycles, settings))
     return without_folds(cones, boundary.periodic)
+
+
+def seen_by_most(
+    state: State, label: int, cones: Cones, points: Array, cycles: IntArray, settings: MapperSettings
+) -> BoolArray:
+    """Return (k,) whether at least half of the drives that passed a cone have detected it.
+
+    What stands is seen by all. The detections (m, 2) of the boundary, map frame, are of cycles (m,).
+    """
+    u = first_parameter(state, label) + cones.u
+    boundary, drive, growth = state.boundaries[label], state.drives.of(cycles), settings.growth
+    seen, passed = np.zeros(len(u)), np.zeros(len(u))
+    for d, part in enumerate(state.drives.parts(len(state.poses))):
+        apart = np.abs(u[:, None] - state.pose_u[label][part])
+        if boundary.periodic:
+            apart = np.mod(apart, boundary.length)
+            apart = np.minimum(apart, boundary.length - apart)
+        passes = apart.min(axis=1) < PASS_STRETCH
+        own, radius = KDTree(points[drive == d]), growth.merge_radius
+        near = own.query_ball_point(cones.points, radius, return_length=True)
+        passed += passes
+        seen += passes & (near >= growth.sightings)
+    return np.asarray(2.0 * seen >= passed)
 
 
 def first_parameter(state: State, label: int) -> float:

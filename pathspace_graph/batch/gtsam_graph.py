@@ -7,6 +7,7 @@ from typing import Any, Final
 import gtsam
 import numpy as np
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.gtsam_factors import (
     fill,
@@ -35,8 +36,10 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
 
     A graph of plain least squares, with the associations of `at` and the sigmas across the curve over the
     roots of their robust weights. Each control point is anchored where it is. At an optimum its linearization
-    is that of the optimization; its error isn't the robust cost.
+    is that of the optimization; its error isn't the robust cost. SettingsError for several drives.
     """
+    if len(at.state.drives) > 1:
+        raise SettingsError(f"graph: expected the batch of one drive, found {len(at.state.drives)} drives")
     factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
     for label, gauge in system.gauges.items():
         factors += _priors(gauge, at.state)

@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.errors import SettingsError, SolveError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.factors.se2 import compose, inverse
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.front_end.log_odometry import LogOdometry
@@ -73,6 +74,8 @@ class BatchResult(BatchRun):
     optimum: Evaluation
     objection: str = ""
     """What speaks against the map as a whole; empty where nothing does."""
+    drive: int = 0
+    """Number of the drive, of those in the problem."""
 
     @cached_property
     def pose_covariances(self) -> Array:
@@ -83,7 +86,13 @@ class BatchResult(BatchRun):
             lengths = self.optimum.state.poses * [1.0, 1.0, 0.0]
             size = self.system.settings.odometry.sigma_size
             marginals = marginals + size**2 * lengths[:, :, None] * lengths[:, None, :]
-            return np.outer(weights, weights) * marginals
+            return (np.outer(weights, weights) * marginals)[self.cycles_of_drive]
+
+    @property
+    def cycles_of_drive(self) -> slice:
+        """Return the drive's cycles among those of the problem."""
+        state = self.optimum.state
+        return state.drives.parts(len(state.poses))[self.drive]
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return the whole problem at the optimum by `nonlinear_graph`; its lengths are over the scale."""
@@ -155,16 +164,16 @@ class BatchMapper:
         found, known = _with_wider_priors(begun)
         watch.lap("optimum")
         at, convergence, settings = found.at, found.convergence, found.system.settings
-        joint, vehicle = _map_covariance(at.state, known, settings), _vehicle(at.state, known, settings)
+        joint, vehicle = map_covariance(at.state, known, settings), vehicle_of(at.state, known, settings)
         watch.lap("covariance")
         few = simplified(at.state, found.system.detections, settings)
         joint = few.change @ joint @ few.change.T
         watch.lap("simplify")
-        records, laps = _records(few, judged.chain, sum(watch.laps.values()))
+        records, laps = records_of(few, judged.chain, sum(watch.laps.values()))
         return BatchResult(
             estimator=NAME,
             settings=settings_dict(given),
-            map=replace(_map(few, joint), points=_orange(judged, at.state)),
+            map=replace(map_of(few, joint), points=_orange(judged, at.state)),
             scatter=few.scatter,
             trajectory_t=judged.chain.stamps,
             trajectory=at.state.poses.copy(),
@@ -250,7 +259,7 @@ def find_closed_optimum(optimizer: Optimizer) -> Found | None:
 def _with_wider_priors(found: Found) -> tuple[Found, FactoredSystem]:
     """Return the optimum, searched again while it contradicts the prior of a calibration, and `_known`."""
     system, variables = found.system, found.at.state.variables
-    known = _known(system, found.at)
+    known = known_of(system, found.at)
     variance = np.diag(known.covariance(variables.calibration_keys))
     inflated = with_inflated_priors(variables.calibrations, variance, system.settings)
     if inflated == system.settings:
@@ -259,32 +268,34 @@ def _with_wider_priors(found: Found) -> tuple[Found, FactoredSystem]:
     return _with_wider_priors(Found(found.optimizer, *found.optimizer.find(found.at.state)))
 
 
-def _known(system: BatchSystem, at: Evaluation) -> FactoredSystem:
-    """Return the system of the map, the calibrations and the last pose, with all other poses eliminated."""
-    keys = at.state.variables.layout.keys
-    kept = Layout(keys[~are_poses(keys) | (keys == pose_key(len(at.state.poses) - 1))])
-    return FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
-
-
 # --- the parts of a result -------------------------------------------------------------------------------
 
 
-def _map_covariance(state: State, known: FactoredSystem, settings: MapperSettings) -> Array:
+def known_of(system: BatchSystem, at: Evaluation) -> FactoredSystem:
+    """Return the system of the map, the calibrations and each last pose, with all other poses eliminated."""
+    keys, state = at.state.variables.layout.keys, at.state
+    last = [pose_key(part.stop - 1) for part in state.drives.parts(len(state.poses))]
+    kept = Layout(keys[~are_poses(keys) | np.isin(keys, last)])
+    return FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
+
+
+def map_covariance(state: State, known: FactoredSystem, settings: MapperSettings) -> Array:
     """Return the joint covariance (n, n) of the control points, in m^2."""
     points = state.map_points.ravel()
     return with_size(known.covariance(state.map_keys), points, settings.odometry.sigma_size)
 
 
-def _vehicle(state: State, known: FactoredSystem, settings: MapperSettings) -> VehicleState:
-    """Return the last pose and the calibration, with their joint covariance."""
-    variables, last = state.variables, pose_key(len(state.poses) - 1)
-    covariance = known.covariance(np.append(last, variables.calibration_keys))
-    values = size_of_vehicle(state.poses[-1], len(variables.calibrations))
+def vehicle_of(state: State, known: FactoredSystem, settings: MapperSettings, drive: int = 0) -> VehicleState:
+    """Return the last pose of a drive and its calibration, with their joint covariance."""
+    last, keys = state.drives.parts(len(state.poses))[drive].stop - 1, state.calibration_keys(drive)
+    pose, calibrations = state.poses[last], state.variables.of(keys)
+    covariance = known.covariance(np.append(pose_key(last), keys))
+    values = size_of_vehicle(pose, len(calibrations))
     covariance = with_size(covariance, values, settings.odometry.sigma_size)
-    return VehicleState.split(state.poses[-1], variables.calibrations, covariance)
+    return VehicleState.split(pose, calibrations, covariance)
 
 
-def _map(few: Simplified, joint: Array) -> Map:
+def map_of(few: Simplified, joint: Array) -> Map:
     """Return the curves with their covariance, to which the scatter of the cones is added."""
     state, boundaries = few.state, {}
     for label, boundary in state.boundaries.items():
@@ -303,15 +314,25 @@ def _orange(judged: JudgedLog, state: State) -> dict[int, PointBoundary]:
     return cones.points()
 
 
-def _records(few: Simplified, chain: LogOdometry, seconds: float) -> tuple[tuple[CycleRecord, ...], int]:
-    """Return a record of each cycle, with its share of the seconds, and the number of complete laps."""
+def records_of(
+    few: Simplified, chain: LogOdometry, seconds: float, drive: int = 0
+) -> tuple[tuple[CycleRecord, ...], int]:
+    """Return a record of each cycle of a drive, with its share of the seconds, and its complete laps."""
     state, detections = few.state, few.detections
+    part = state.drives.parts(len(state.poses))[drive]
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
-    used = np.bincount(detections.cycle[detections.used], minlength=len(chain)).tolist()
-    offered = np.bincount(detections.cycle, minlength=len(chain)).tolist()
-    counter, share = LapCounter(), seconds / len(chain)
+    used = np.bincount(detections.cycle[detections.used], minlength=part.stop)[part].tolist()
+    offered = np.bincount(detections.cycle, minlength=part.stop)[part].tolist()
+    poses, counter, share = state.poses[part], LapCounter(), seconds / len(chain)
+    if drive > 0:  # laps are counted from where the drive began
+        poses = compose(inverse(frame_of(chain, poses)), poses)
     records = tuple(
-        CycleRecord(k, t, share, left, right, used[k], counter.update(state.poses[k]), offered=offered[k])
+        CycleRecord(k, t, share, left, right, used[k], counter.update(poses[k]), offered=offered[k])
         for k, t in enumerate(chain.stamps.tolist())
     )
     return records, counter.completed
+
+
+def frame_of(chain: LogOdometry, poses: Array) -> Array:
+    """Return the pose (3,) of the vehicle at the first stamp of a drive with poses (P, 3) of its cycles."""
+    return compose(poses[0], inverse(chain.first))

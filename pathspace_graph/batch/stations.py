@@ -18,6 +18,7 @@ from .association import ROW_CONES, cones_of_curve, feet_of_cones
 
 SIGMA_STATION: Final = 0.02  # of a cone along a curve that has a control point for each and follows it (m)
 SHIFT_BLOCK: Final = 20.0  # length of the stretches of a later lap that are shifted together (m)
+DRIVES_APART: Final = 3.0 * SHIFT_BLOCK  # added from drive to drive: no stretch or neighbour is of both (m)
 SHIFT_REACH: Final = 4.0  # most of a shift (m)
 SHIFT_STEP: Final = 0.1  # between the shifts that are tried (m)
 SIGMA_SHIFT: Final = 1.0  # standard deviation of a shift before it is known (m)
@@ -45,7 +46,7 @@ class StationMatches:
 def match_stations(
     state: State, detections: DetectionTable, settings: MapperSettings
 ) -> StationMatches | None:
-    """Return the cones of the first lap as stations of closed curves, with the detections of all laps.
+    """Return the cones of the first drive's first lap as stations of closed curves, with all detections.
 
     None where a curve has too few cones, or one is a line. A lap ends beside its beginning by some
     decimetres: cones of both ends would be smeared, and those of a later lap matched with their neighbours.
@@ -56,7 +57,7 @@ def match_stations(
     if settings.lines:
         return None
     for label in state.boundaries:
-        first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0))
+        first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0)).of_drive(0)
         cones = cones_of_curve(state, first, label, settings)
         if len(cones.u) < ROW_CONES:
             return None
@@ -94,7 +95,8 @@ class SeenAgain:
         tangent, poses = state.spline(label).tangent_unit(u), state.variables.poses_at(cycle)
         sigma = sigma_across(tangent, detections.covariance[rows], poses, 0.0)
         again = laps_of(state, detections, label)[rows] > 0
-        block = (path_lengths(state.poses)[cycle] // SHIFT_BLOCK).astype(np.intp)
+        driven = path_lengths(state.poses)[cycle] + DRIVES_APART * state.drives.of(cycle)
+        block = (driven // SHIFT_BLOCK).astype(np.intp)
         return cls(curve, rows, u, sigma, np.where(again, block, -1))
 
 

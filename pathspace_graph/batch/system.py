@@ -185,14 +185,17 @@ class BatchSystem:
         """Return the standard deviation of a control point's slide along its curve (m)."""
         return SIGMA_SLIDE if self.matches else self.settings.batch.sigma_slide
 
+    def drive_rows(self, state: State) -> list[Rows]:
+        """Return the rows of odometry, and of the priors of the first pose and the calibrations."""
+        return self.chain.rows_at(state.variables, self.settings.calibration)
+
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
         """Return the problem at a state; foot points are refined from those that the detections have.
 
         `hold` sets what later evaluations keep. That the sigma depends on the curve's direction has no
         derivative.
         """
-        drive = self.chain.rows_at(state.variables, self.settings.calibration)
-        drive += [one.rows(state.poses) for one in self.revisits]
+        drive = self.drive_rows(state) + [one.rows(state.poses) for one in self.revisits]
         drive += [at_values(rows, state.variables) for rows in self.factors]
         across, u = self._across(state, hold) if state.boundaries else (NO_ROWS, np.zeros(0))
         along = self._along(state, self.matches) if self.matches else NO_ROWS
@@ -278,8 +281,10 @@ class BatchSystem:
         """
         linear = moved(state, step)
         after, poses, goal = linear.copy(), state.poses, linear.poses
-        driven = seen_from(poses[1:, :2], poses[:-1], goal[1:, :2], goal[:-1])
-        after.poses[1:, :2] = goal[0, :2] + np.cumsum(turned(driven, goal[:-1, 2]), axis=0)
+        for part in state.drives.parts(len(poses)):
+            own, aim = poses[part], goal[part]
+            driven = seen_from(own[1:, :2], own[:-1], aim[1:, :2], aim[:-1])
+            after.poses[part][1:, :2] = aim[0, :2] + np.cumsum(turned(driven, aim[:-1, 2]), axis=0)
         for label, gauge in self.gauges.items():
             points, k = after.control_points(label), gauge.cycle
             seen = seen_from(state.control_points(label), poses[k], points, goal[k])

@@ -8,6 +8,7 @@ from joblib import Parallel, delayed
 from tyro.conf import Positional, arg
 
 from pathspace_graph.console import note, output, progress, say
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment.cells import run_estimator
@@ -24,6 +25,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .estimate import map_online, outline, tell
+from .maps import compare_maps
 from .simulate import describe, generated_track
 
 FAILED: Final = 3  # exit code of a comparison that is written, but in which an estimator failed
@@ -34,7 +36,9 @@ PICTURE_DPI: Final = 150.0  # resolution of the picture, dots per inch, which su
 
 @dataclass(frozen=True, kw_only=True)
 class Compare:
-    """Run every estimator on a log, or on a folder of logs, and write tables, figures and all maps.
+    """Run every estimator on a log, or on a folder of logs; or lay a map on another one.
+
+    Of logs, tables, figures and all maps are written; of two maps, their distances and a picture.
 
     The paper's table is printed, or without truth what can be said without it; files have all metrics.
     For several logs the tables have means, and differences from the reference, paired over the logs, with
@@ -42,8 +46,8 @@ class Compare:
     code is 3 then.
     """
 
-    log: Positional[Path]
-    """Folder of the log, or of several logs."""
+    log: Positional[tuple[Path, ...]]
+    """Folder of the log, or of several logs; or the folders of two maps of one track."""
     out: Path
     """Folder for tables, figures and maps; an earlier comparison there is kept as a numbered backup."""
     estimators: tuple[str, ...] = ()
@@ -58,11 +62,16 @@ class Compare:
     """Settings of every estimator."""
 
     def run(self) -> None:
+        if len(self.log) == 2:
+            compare_maps(*self.log, self.out)
+            return
+        if len(self.log) != 1:
+            raise SettingsError(f"LOG: expected one log, or two maps, found {len(self.log)} folders")
         estimators = experiment.choose(self.estimators)
         reference = experiment.choose_reference(self.reference, estimators)
         check_jobs(self.jobs)
         check_target(self.out, experiment.MARKER)
-        logs = experiment.read_logs(self.log, self.settings.limits)
+        logs = experiment.read_logs(self.log[0], self.settings.limits)
         for named in logs:
             tell(named.hints, of=named.name if len(logs) > 1 else "")
         with progress("comparing", len(logs) * len(estimators)) as advance:

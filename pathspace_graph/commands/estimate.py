@@ -1,18 +1,21 @@
 """`online` and `batch`: a log is mapped cycle by cycle, without reading ahead, or optimized at once."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
+import numpy as np
 from rich.table import Table
 from rich.text import Text
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from pathspace_graph import estimators
+from pathspace_graph.batch.joint_mapper import JointResult, solve_together
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
@@ -21,10 +24,12 @@ from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
+from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map
+from pathspace_graph.io.moved import moved_run
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.io.ribbon import as_ribbon
 from pathspace_graph.labels import NAMES
@@ -124,10 +129,14 @@ class Online:
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """Optimize a whole log at once, and write the map, the trajectory, the cycles and a summary."""
+    """Optimize whole logs at once, and write the map, the trajectory, the cycles and a summary.
 
-    log: Positional[Path]
-    """Folder of the log."""
+    Several logs of one track give one map, in the frame of the first, and a trajectory for each. A drive that
+    does not fit the map of the others is left out, and the exit code is 3.
+    """
+
+    log: Positional[tuple[Path, ...]]
+    """Folder of the log, or folders of several drives of one track."""
     out: Path
     """Folder for the map; an earlier map there is kept as a numbered backup."""
     estimator: str = DEFAULT_BATCH
@@ -143,8 +152,13 @@ class Batch:
         estimators.check_batch(self.estimator)
         if self.start == "odometry" and self.estimator != DEFAULT_BATCH:
             raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
+        if not self.log:
+            raise SettingsError("LOG: expected the folder of a log, found none")
         check_target(self.out, MAP_FILE)
-        log, hints = read_plausible_log(self.log, self.settings.limits)
+        if len(self.log) > 1:
+            self._run_together()
+            return
+        log, hints = read_plausible_log(self.log[0], self.settings.limits)
         tell(hints)
         with progress("optimizing") as advance:
             estimator = estimators.make_batch(self.estimator, self.settings, log)
@@ -153,13 +167,72 @@ class Batch:
         write_result(self.out, result, summarize_batch(result, log, hints))
         report(result, log)
         say(f"written to {self.out}")
-        known, wrong = result if isinstance(result, BatchResult) else None, list[str]()
-        if not result.converged:
-            reason = known.convergence.reason if known else "associations still change"
-            wrong.append(f"not converged: {reason}")
-        objections = [known.objection if known else "", crossings_told(crossings_of(result))]
-        wrong += [f"not a map of the drive: {objection}" for objection in objections if objection]
-        end_untrusted(wrong)
+        end_untrusted(untrusted(result))
+
+    def _run_together(self) -> None:
+        """Map several drives at once."""
+        if self.estimator != DEFAULT_BATCH:
+            expected = f"--estimator: expected {DEFAULT_BATCH} for several logs"
+            raise SettingsError(f"{expected}, found {self.estimator}")
+        logs, hints = dict[str, Log](), dict[str, list[Hint]]()
+        for name, folder in unique_names(self.log).items():
+            logs[name], hints[name] = read_plausible_log(folder, self.settings.limits)
+            tell(hints[name], of=name)
+        with progress("optimizing") as advance:
+            joint = solve_together(logs, self._mapper, self.settings, self.start, advance)
+        name, result = next(iter(joint.drives.items()))
+        result = of_kind(result, self.map, self.settings)
+        summary = summarize_batch(result, logs[name], hints[name]) | summary_of_drives(joint, logs)
+        write_result(self.out, result, summary, joint.drives)
+        report(result, logs[name])
+        say(*drive_lines(joint), f"written to {self.out}")
+        left_out = [f"{name} is left out: {why}" for name, why in joint.left_out.items()]
+        end_untrusted([*left_out, *untrusted(result)])
+
+    def _mapper(self, settings: MapperSettings, log: Log) -> BatchMapper:
+        estimator = estimators.make_batch(DEFAULT_BATCH, settings, log)
+        assert isinstance(estimator, BatchMapper)
+        return estimator
+
+
+def untrusted(result: BatchRun) -> list[str]:
+    """Return what is wrong with the result of a batch."""
+    known, wrong = result if isinstance(result, BatchResult) else None, list[str]()
+    if not result.converged:
+        reason = known.convergence.reason if known else "associations still change"
+        wrong.append(f"not converged: {reason}")
+    objections = [known.objection if known else "", crossings_told(crossings_of(result))]
+    return wrong + [f"not a map of the drive: {objection}" for objection in objections if objection]
+
+
+def unique_names(folders: Sequence[Path]) -> dict[str, Path]:
+    """Return folders by their names, of which one that is there already gets a number."""
+    named = dict[str, Path]()
+    for folder in folders:
+        name = folder.resolve().name
+        same = (f"{name}-{number}" for number in count(2))
+        named[name if name not in named else next(one for one in same if one not in named)] = folder
+    return named
+
+
+def summary_of_drives(joint: JointResult, logs: Mapping[str, Log]) -> dict[str, Any]:
+    """Return what is known of each drive of a joint map, with truth in the drive's own frame."""
+    drives = dict[str, Any]()
+    shown = ("lap_count", "noise", "calibration", "final", "ate", "inside_two_sigma")
+    for name, result in joint.drives.items():
+        own = summarize(moved_run(result, inverse(joint.frames[name])), logs[name])
+        drives[name] = {"frame": joint.frames[name], **{key: own[key] for key in shown if key in own}}
+    return {"drives": drives, "left_out": joint.left_out}
+
+
+def drive_lines(joint: JointResult) -> list[str]:
+    """Return a line for each drive of a joint map."""
+    lines = []
+    for name, result in joint.drives.items():
+        x, y, heading = joint.frames[name].tolist()
+        laps = f"{result.laps} lap{'' if result.laps == 1 else 's'}"
+        lines.append(f"{name}: {laps}, begins at ({x:.2f}, {y:.2f}) m, turned by {np.rad2deg(heading):.2f}°")
+    return lines
 
 
 def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:

@@ -38,9 +38,12 @@ class LogOdometry:
 
     def rows(self, poses: Array, calibration: Array) -> list[Rows]:
         """Return the rows of `odometry` and `priors` at poses (P, 3) and a calibration (2,)."""
+        return [self.odometry_rows(poses, calibration), *self.priors(poses[0], calibration)]
+
+    def odometry_rows(self, poses: Array, calibration: Array) -> Rows:
+        """Return the rows of the motion from each of the poses (P, 3) to the next."""
         start, terms = np.arange(len(self.odometry)), self.odometry.terms(slice(None), poses, calibration)
-        odometry = odometry_rows(start, terms, owners(start))
-        return [odometry, *self.priors(poses[0], calibration)]
+        return odometry_rows(start, terms, owners(start))
 
     def rows_at(self, variables: Variables, settings: CalibrationSettings) -> list[Rows]:
         """Return all rows at the values of variables, with the prior of the sensor's calibration."""
@@ -49,11 +52,12 @@ class LogOdometry:
     def priors(self, first: Array, calibration: Array) -> list[Rows]:
         """Return the rows of the priors at a first pose (3,) and a calibration (2,)."""
         root = np.asarray(np.linalg.cholesky(self.first_information).T, np.float64)
+        return [_prior(pose_key(0), root, first - self.first), *self.calibration_priors(calibration)]
+
+    def calibration_priors(self, calibration: Array) -> list[Rows]:
+        """Return the rows of the priors at a calibration (2,)."""
         weights = np.diag(1.0 / self.calibration_sigma)
-        priors = [
-            _prior(pose_key(0), root, first - self.first),
-            _prior(CALIBRATION_KEY, weights, calibration - self.calibration_mean),
-        ]
+        priors = [_prior(CALIBRATION_KEY, weights, calibration - self.calibration_mean)]
         if self.bias is not None:
             root = np.array([[0.0, 1.0 / self.bias.sigma]])
             priors.append(_prior(CALIBRATION_KEY, root, calibration - [0.0, self.bias.value]))

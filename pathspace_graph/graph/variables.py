@@ -1,7 +1,7 @@
 """Variables: what a GTSAM key means, and values by key in one flat vector, in the order of the keys.
 
-    b_0   calibration of the odometry (scale error [-], yaw-rate bias [rad/s])
-    c_0   calibration of the sensor (`factors.sensor:SENSOR`), where it is estimated
+    b_0   calibration of the odometry (scale error [-], yaw-rate bias [rad/s]); b_d of drive d, if several
+    c_0   calibration of the sensor (`factors.sensor:SENSOR`), where it is estimated; c_s of sensor s
     l_j   control point j of the left boundary (m, m), map frame
     m_i   landmark i of the landmark graphs (m, m), map frame
     r_j   control point j of the right boundary (m, m), map frame
@@ -48,7 +48,8 @@ def letter_keys(letter: str) -> tuple[int, int]:
 
 
 CALIBRATION_KEY: Final = letter_keys(CALIBRATION_LETTER)[0]
-SENSOR_KEY: Final = letter_keys(SENSOR_LETTER)[0]  # the keys of all points and poses are greater
+SENSOR_KEY: Final = letter_keys(SENSOR_LETTER)[0]
+FIRST_POINT: Final = letter_keys(SENSOR_LETTER)[1]  # the keys of all points and poses are not smaller
 FIRST_POSE: Final = letter_keys(POSE_LETTER)[0]  # every key from this one on belongs to a pose
 ORIGIN_KEY: Final = letter_keys("y")[0]  # the origin of the map frame, a pose at (0, 0, 0) by definition
 _FIRST_LANDMARK: Final = letter_keys(LANDMARK_LETTER)[0]
@@ -117,7 +118,7 @@ class Layout:
     @cached_property
     def turning(self) -> IntArray:
         """Return the columns of the x of all points and poses, which a rigid motion turns with y."""
-        return np.asarray(self.starts[self.keys > SENSOR_KEY])
+        return np.asarray(self.starts[self.keys >= FIRST_POINT])
 
     @cached_property
     def headings(self) -> IntArray:
@@ -257,7 +258,7 @@ class Variables:
     @property
     def calibration_keys(self) -> IntArray:
         """Return the keys of the calibrations: the odometry's, and the sensor's if it is estimated."""
-        return np.asarray(self.keys[self.keys <= SENSOR_KEY])
+        return np.asarray(self.keys[self.keys < FIRST_POINT])
 
     def insert_calibrations(self, values: Array) -> None:
         """Insert the calibration of the odometry (2,), or of odometry and sensor (7,)."""

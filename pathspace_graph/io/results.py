@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 TRAJECTORY_FILE: Final = "trajectory.tum"
 SMOOTHED_FILE: Final = "smoothed.tum"
+DRIVES_FOLDER: Final = "drives"  # of the folders of the drives, where several were mapped at once
 _COLUMNS: Final = 8
 NoiseSource = Literal["stated", "measured", "assumed"]  # by the log, by the drive, by default
 
@@ -250,13 +251,30 @@ class BatchRun(RunResult):
     """Cost at its end, half the sum of squared whitened residuals, where it is known."""
 
 
-def write_result(folder: Path | str, result: RunResult, summary: Mapping[str, Any]) -> None:
-    """Write map.json, the trajectories, cycles.csv and summary.json to a folder, as by `atomic_folder`."""
+def write_result(
+    folder: Path | str,
+    result: RunResult,
+    summary: Mapping[str, Any],
+    drives: Mapping[str, RunResult] | None = None,
+) -> None:
+    """Write map.json, the trajectories, cycles.csv and summary.json to a folder, as by `atomic_folder`.
+
+    Where several drives were mapped at once, trajectory and cycles of each are in a folder of its name.
+    """
     with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
-        write_trajectory(temporary / TRAJECTORY_FILE, result.trajectory_t, result.trajectory)
-        if result.smoothed is not None:
-            write_trajectory(temporary / SMOOTHED_FILE, result.trajectory_t, result.smoothed)
-        columns = [[getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS]
-        write_table(temporary / CYCLES_FILE, CYCLE_COLUMNS, *columns)
+        _write_drive(temporary, result)
+        for name, drive in (drives or {}).items():
+            own = temporary / DRIVES_FOLDER / name
+            own.mkdir(parents=True)
+            _write_drive(own, drive)
         write_json(temporary / "summary.json", summary)
+
+
+def _write_drive(folder: Path, result: RunResult) -> None:
+    """Write the trajectories and the cycles of a drive."""
+    write_trajectory(folder / TRAJECTORY_FILE, result.trajectory_t, result.trajectory)
+    if result.smoothed is not None:
+        write_trajectory(folder / SMOOTHED_FILE, result.trajectory_t, result.smoothed)
+    columns = [[getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS]
+    write_table(folder / CYCLES_FILE, CYCLE_COLUMNS, *columns)

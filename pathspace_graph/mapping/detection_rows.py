@@ -8,6 +8,7 @@ import numpy as np
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.graph.drives import Drives
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, Variables
 
@@ -58,23 +59,29 @@ def rows_across(
     The foot points are on `State.curves`, and the terms those of `factors._kernels:detection_rows`.
     """
     cycle, variables = detections.cycle[rows], state.variables
-    residual, sigma, jacobian = kernels.detection_rows(
-        points,
-        detections.covariance[rows],
-        variables.poses_at(cycle),
-        foot.normal_unit,
-        foot.distance,
-        foot.basis,
-        detections.measured[rows],
-        detections.twist[rows],
-        variables.sensor,
-        sigma_model,
-    )
-    keys = np.concatenate([measuring_keys(cycle, variables), state.curves.keys[foot.columns]], axis=1)
-    return DetectionRows(rows, keys, residual, sigma, jacobian)
+    measuring = measuring_keys(cycle, variables, state.drives)
+    keys = np.concatenate([measuring, state.curves.keys[foot.columns]], axis=1)
+
+    def terms(own: IntArray | slice, sensor: Array) -> tuple[Array, Array, Array]:
+        chosen = rows[own]
+        return kernels.detection_rows(
+            points[own],
+            detections.covariance[chosen],
+            variables.poses_at(cycle[own]),
+            foot.normal_unit[own],
+            foot.distance[own],
+            foot.basis[own],
+            detections.measured[chosen],
+            detections.twist[chosen],
+            sensor,
+            sigma_model,
+        )
+
+    return DetectionRows(rows, keys, *state.drives.by_sensor(terms, cycle, variables.sensor))
 
 
-def measuring_keys(cycle: IntArray, variables: Variables) -> IntArray:
+def measuring_keys(cycle: IntArray, variables: Variables, drives: Drives) -> IntArray:
     """Return the keys (m, 1) of the poses of cycles (m,), or (m, 2) with the sensor's calibration."""
-    keys = np.array([FIRST_POSE, SENSOR_KEY]) + np.outer(cycle, [1, 0])
+    sensors = np.asarray(drives.sensors)[drives.of(cycle)]
+    keys = np.column_stack([FIRST_POSE + cycle, SENSOR_KEY + sensors])
     return np.asarray(keys[:, : 2 if len(variables.sensor) else 1])

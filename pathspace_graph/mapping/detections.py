@@ -9,8 +9,9 @@ import numpy as np
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import rotated
+from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.factors.sensor import corrected
+from pathspace_graph.graph.drives import ONE_DRIVE, Drives, of_sensor
 from pathspace_graph.graph.variables import Variables
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
@@ -37,6 +38,7 @@ class DetectionColumns:
     changed: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
     """Whether the association has changed since the detection's cycle was last linearized."""
     sensor: Array = field(default_factory=lambda: np.zeros(0))  # by which `point` is corrected; no column
+    drives: Drives = ONE_DRIVE  # whose detections these are; no column
 
     def __len__(self) -> int:
         return len(self.cycle)
@@ -56,6 +58,14 @@ class DetectionColumns:
             np.concatenate([np.zeros((0, 2, 2)), *(one.covariances for one in cycles)]),
             np.concatenate([np.zeros(0, np.intp), *(one.labels for one in cycles)]),
         )
+
+    @classmethod
+    def of_drives(cls, tables: Sequence[Self], drives: Drives) -> Self:
+        """Build the table of several drives, whose cycles are counted on, with no detection in use."""
+        names = ("cycle", "measured", "twist", "covariance", "label")
+        cycle, *columns = (np.concatenate([vars(table)[name] for table in tables]) for name in names)
+        begins = np.repeat(drives.first, [len(table) for table in tables])
+        return replace(cls._unused(cycle + begins, *columns), drives=drives)
 
     @classmethod
     def _unused(
@@ -85,11 +95,19 @@ class DetectionColumns:
     @classmethod
     @cache
     def _columns(cls) -> list[str]:
-        return [column.name for column in fields(cls) if column.name != "sensor"]
+        return [column.name for column in fields(cls) if column.name not in ("sensor", "drives")]
 
-    def corrected(self, rows: IntArray | slice, sensor: Array) -> Array:
-        """Return positions (m, 2), vehicle frame, corrected by the sensor's calibration: (5,) or empty."""
-        return corrected(self.measured[rows], self.twist[rows], sensor)
+    def corrected(self, rows: IntArray | BoolArray | slice, sensor: Array) -> Array:
+        """Return positions (m, 2), vehicle frame, corrected by the sensor's calibration: (5,) or empty.
+
+        Of several drives, it is that of all sensors (5 s,).
+        """
+        measured, twist = self.measured[rows], self.twist[rows]
+
+        def terms(own: IntArray | slice, sensor: Array) -> tuple[Array]:
+            return (corrected(measured[own], twist[own], sensor),)
+
+        return self.drives.by_sensor(terms, self.cycle[rows], sensor)[0]
 
     def correct(self, sensor: Array) -> None:
         """Set the calibration of the sensor by which `point` is corrected."""
@@ -108,6 +126,8 @@ class DetectionColumns:
         """Return corrected positions (m, 2) in the map frame, by the poses of their cycles."""
         if isinstance(rows, slice) or rows.dtype == np.bool_:
             rows = np.arange(len(self))[rows]
+        if len(self.drives) > 1:
+            return to_map(self.corrected(rows, variables.sensor), variables.poses_at(self.cycle[rows]))
         poses = variables.poses, variables.first_cycle
         return kernels.placed(
             rows.astype(np.intp, copy=False), self.cycle, self.measured, self.twist, *poses, variables.sensor
@@ -121,6 +141,14 @@ class DetectionColumns:
         """Return the table of the given rows."""
         chosen = {column: vars(self)[column][rows] for column in self._columns()}
         return replace(self, **chosen)
+
+    def of_drive(self, drive: int) -> Self:
+        """Return the table of one of its drives, whose cycles keep their numbers."""
+        if len(self.drives) == 1:
+            return self
+        own = self.where(np.flatnonzero(self.drives.of(self.cycle) == drive))
+        sensor = of_sensor(self.sensor, self.drives.sensors[drive])
+        return replace(own, sensor=sensor, drives=ONE_DRIVE)
 
     def keep_from(self, cycle: int) -> None:
         """Remove the detections of all cycles before `cycle`."""

@@ -13,7 +13,14 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points
-from pathspace_graph.graph.variables import CONTROL_LETTERS, Variables, control_keys
+from pathspace_graph.graph.drives import ONE_DRIVE, Drives
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    CONTROL_LETTERS,
+    SENSOR_KEY,
+    Variables,
+    control_keys,
+)
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
@@ -108,12 +115,13 @@ def _tail(boundary: Boundary, first: int) -> SpanPolynomials:
 class State:
     """The boundaries and the variables: control points (m) and poses (m, m, rad), map frame."""
 
-    def __init__(self, variables: Variables | None = None) -> None:
+    def __init__(self, variables: Variables | None = None, drives: Drives = ONE_DRIVE) -> None:
         self.variables = variables or Variables()  # control points, calibration and poses by key
         self.boundaries: dict[int, Boundary] = {}  # curves, sorted by label as their control points are
         self.active_stretch: dict[int, IntArray] = {}
         """Active control points (k,) of a boundary that is partly inactive: one stretch in driving order, by
         index from the boundary's first control point."""
+        self.drives = drives  # whose poses these are
         self.pose_u: dict[int, Array] = {}  # (P,) parameters of the poses, increasing from lap to lap
         self._curves: Curves | None = None
         self._whole_curves: Curves | None = None
@@ -153,6 +161,11 @@ class State:
     def poses(self) -> Array:
         """Return a view of the poses (P, 3), the oldest first."""
         return self.variables.poses
+
+    def calibration_keys(self, drive: int) -> IntArray:
+        """Return the keys of a drive's calibrations: the odometry's, and the sensor's if it is estimated."""
+        keys = [CALIBRATION_KEY + drive, SENSOR_KEY + self.drives.sensors[drive]]
+        return np.array(keys[: 2 if len(self.variables.sensor) else 1])
 
     # --- the curves --------------------------------------------------------------------------------------
 

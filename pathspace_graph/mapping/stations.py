@@ -100,17 +100,23 @@ class Stations:
         The terms are those of `factors._kernels:station_rows`.
         """
         cycle, variables, columns = detections.cycle[rows], state.variables, self.columns[station]
-        keys = np.concatenate([measuring_keys(cycle, variables), state.map_keys[columns]], axis=1)
-        terms = kernels.station_rows(
-            detections.points_map(rows, variables),
-            detections.covariance[rows],
-            variables.poses_at(cycle),
-            self.value[station],
-            self.slope[station],
-            state.map_points[columns],
-            detections.measured[rows],
-            detections.twist[rows],
-            variables.sensor,
-            sigma,
-        )
-        return DetectionRows(rows, keys, *terms)
+        measuring = measuring_keys(cycle, variables, state.drives)
+        keys = np.concatenate([measuring, state.map_keys[columns]], axis=1)
+        points = detections.points_map(rows, variables)
+
+        def terms(own: IntArray | slice, sensor: Array) -> tuple[Array, Array, Array]:
+            chosen, cones = rows[own], station[own]
+            return kernels.station_rows(
+                points[own],
+                detections.covariance[chosen],
+                variables.poses_at(cycle[own]),
+                self.value[cones],
+                self.slope[cones],
+                state.map_points[columns[own]],
+                detections.measured[chosen],
+                detections.twist[chosen],
+                sensor,
+                sigma[own],
+            )
+
+        return DetectionRows(rows, keys, *state.drives.by_sensor(terms, cycle, variables.sensor))

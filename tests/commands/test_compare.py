@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -141,3 +142,35 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
     assert main(["compare", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 2
     assert "found neither" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"empty"}
+
+
+# --- two maps --------------------------------------------------------------------------------------------
+
+
+def test_two_maps_are_laid_on_each_other(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The rings have 2 and 6 m more radius than the way; a map lies on itself."""
+    maps, out = tmp_path / "maps", tmp_path / "apart"
+    main(["compare", str(folder / "a"), "--out", str(maps), "--estimators", "rings", "gaps"])
+    capsys.readouterr()
+    assert main(["compare", str(maps / "rings"), str(maps / "rings"), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "mean [m]" in printed and f"written to {out}" in printed
+    found = json.loads((out / "apart.json").read_text())
+    assert found["distances"]["left"]["max"] < 1e-6
+    np.testing.assert_allclose(found["motion"], 0.0, atol=1e-6)
+    assert (out / "apart.png").stat().st_size > 10_000
+    assert main(["compare", str(maps / "rings"), str(maps / "gaps"), "--out", str(out)]) == 0
+    assert json.loads((out / "apart.json").read_text())["distances"]["both"]["max"] > 0.01
+
+
+def test_maps_and_logs_are_not_compared(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = str(folder / "a")
+    assert main(["compare", log, log, "--out", str(tmp_path / "apart")]) == 2
+    assert "map.json: expected a map, found none" in capsys.readouterr().err
+    assert main(["compare", log, log, log, "--out", str(tmp_path / "apart")]) == 2
+    assert "LOG: expected one log, or two maps, found 3 folders" in capsys.readouterr().err
+    assert not (tmp_path / "apart").exists()

@@ -24,8 +24,10 @@ from pathspace_graph.io.map import (
     map_to_json,
     read_map,
 )
+from pathspace_graph.io.moved import moved
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.knots import fit_spline
 
 
 def covariance(size: int, seed: int) -> np.ndarray:
@@ -258,3 +260,27 @@ def test_cones_of_no_boundary_are_read_back() -> None:
     content["points"]["left"] = content["points"].pop("orange")
     with pytest.raises(InputError, match="expected points of orange, big_orange, found 'left'"):
         map_from_json(content)
+
+
+# --- after a motion of the frame -------------------------------------------------------------------------
+
+QUARTER = np.array([1.0, 2.0, 0.5 * np.pi])
+
+
+def test_points_and_covariances_turn_with_the_frame() -> None:
+    """A point that is uncertain along x is so along y after a quarter turn; what is joint stays joint."""
+    points, joint = np.array([[3.0, 0.0], [0.0, 4.0]]), np.diag([4.0, 1.0, 9.0, 1.0])
+    joint[0, 2] = joint[2, 0] = 2.0
+    line = fit_spline(np.column_stack([np.arange(8.0), np.zeros(8)]), 5, False)
+    boundaries = {LEFT: SplineBoundary(line, np.eye(10)), RIGHT: PointBoundary(points, joint)}
+    cones = {ORANGE: PointBoundary(points, joint)}
+    found = moved(Map(False, boundaries, np.eye(14), cones), QUARTER)
+    right = found.boundaries[RIGHT]
+    assert isinstance(right, PointBoundary)
+    for own in (right, found.points[ORANGE]):
+        np.testing.assert_allclose(own.points, [[1.0, 5.0], [-3.0, 2.0]], atol=1e-12)
+        np.testing.assert_allclose(np.diag(own.covariance), [1.0, 4.0, 1.0, 9.0], atol=1e-12)
+        assert own.covariance[1, 3] == 2.0
+    np.testing.assert_allclose(found.splines[LEFT].evaluate(np.array([0.0])), [[1.0, 2.0]], atol=1e-9)
+    np.testing.assert_allclose(found.splines[LEFT].length(), line.length())
+    np.testing.assert_allclose(found.joint_covariance, np.eye(14), atol=1e-12)

@@ -30,8 +30,9 @@ CYCLES = [cycle(LEFT, RIGHT, UNKNOWN), cycle(), cycle(RIGHT), cycle(LEFT, LEFT)]
 
 def assert_equal(one: DetectionColumns, other: DetectionColumns) -> None:
     for column in fields(one):
-        np.testing.assert_array_equal(getattr(one, column.name), getattr(other, column.name))
-        assert getattr(one, column.name).dtype == getattr(other, column.name).dtype
+        mine, others = (np.asarray(getattr(table, column.name)) for table in (one, other))
+        np.testing.assert_array_equal(mine, others)
+        assert mine.dtype == others.dtype
 
 
 @pytest.mark.parametrize("kind", TABLES)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.reference import aligned_distance, gap
+from pathspace_graph.eval.metrics.alignment import aligned_distance
+from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.factors.bspline import clamped_knots
 from pathspace_graph.factors.residuals import greville
 from pathspace_graph.factors.se2 import move_points

@@ -1,0 +1,121 @@
+"""What several drives of a track are worth as one batch: the error of the map by their number."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+from joblib import Parallel, delayed
+
+from pathspace_graph.batch.joint_mapper import join
+from pathspace_graph.batch.mapper import BatchResult
+from pathspace_graph.estimators import DEFAULT_BATCH, make_batch
+from pathspace_graph.factors.se2 import inverse
+from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.moved import moved_run
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+from .experiment.run import OnCell, workers
+from .metrics.alignment import shape_rmse
+from .metrics.consistency import consistency_at_cones, map_nees
+from .metrics.trajectory import position_rms, trajectory_errors
+from .views import Figure, View
+
+CARS: Final[Mapping[str, SimulationSettings]] = {
+    "plain": SimulationSettings(laps=2),
+    "drawn": SimulationSettings(laps=2, draw=True),
+}
+"""Drives of cars with white noise, and of as many other cars, each drawn with errors of its own."""
+COLUMNS: Final = {  # of the table: title, digits, factor
+    "shape": ("rmse of the shape [m]", 3, 1.0),
+    "ratio": ("by half as many", 2, 1.0),
+    "nees": ("NEES", 2, 1.0),
+    "inside": ("within 2σ [%]", 1, 100.0),
+    "ate": ("trajectory error [m]", 3, 1.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointStudy:
+    """Drives of generated tracks, mapped alone, and in groups of 2, 4 and so on."""
+
+    tracks: tuple[int, ...] = (50, 51, 52)  # seeds
+    drives: int = 8  # number of drives of each track, a power of two
+    cars: Mapping[str, SimulationSettings] = field(default_factory=lambda: CARS)
+    jobs: int = 1
+
+    def measure(self, on_cell: OnCell | None = None) -> pd.DataFrame:
+        """Return a row for each map: car, track, number of drives, and the metrics of `COLUMNS`."""
+        cells = [(car, track) for track in self.tracks for car in self.cars]
+        rows = list[dict[str, Any]]()
+        with workers(self.jobs, None):
+            running = Parallel(return_as="generator_unordered")(
+                delayed(self._of_track)(car, track) for car, track in cells
+            )
+            for done, found in enumerate(running, start=1):
+                rows += found
+                if on_cell is not None:
+                    on_cell(done, len(cells))
+        return pd.DataFrame(rows)
+
+    def _of_track(self, car: str, number: int) -> list[dict[str, Any]]:
+        """Return the rows of one track, each drive of which is solved alone once."""
+        track, settings = generate_track(np.random.default_rng(number)), self.cars[car]
+        logs = {str(seed): simulate(track, settings, seed) for seed in range(self.drives)}
+        alone = {name: solve_alone(log) for name, log in logs.items()}
+        names, rows, count = [*logs], list[dict[str, Any]](), 1
+        while count <= self.drives:
+            for begin in range(0, self.drives, count):
+                group = {name: logs[name] for name in names[begin : begin + count]}
+                about = {"car": car, "track": number, "drives": count}
+                rows.append(about | metrics_of_group(group, alone))
+            count *= 2
+        return rows
+
+
+def solve_alone(log: Log) -> BatchResult:
+    """Return the default batch of a log."""
+    result = make_batch(DEFAULT_BATCH, MapperSettings(), log).solve(log)
+    assert isinstance(result, BatchResult)
+    return result
+
+
+def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) -> dict[str, Any]:
+    """Return the metrics of the map of some drives, in the frame of the first, and of their trajectories."""
+    first, mapped = next(iter(logs)), {name: alone[name] for name in logs}
+    own = mapped
+    if len(logs) > 1:
+        joint = join(mapped)
+        first, mapped = next(iter(joint.drives)), joint.drives
+        own = {name: moved_run(drive, inverse(joint.frames[name])) for name, drive in mapped.items()}
+    track, truths = mapped[first].map, {name: _truth(logs[name]) for name in mapped}
+    errors = [trajectory_errors(own[name].trajectory_t, own[name].trajectory, truths[name]) for name in own]
+    return {
+        "shape": shape_rmse(track, truths[first]),
+        "nees": map_nees(track, truths[first]).ratio,
+        "inside": consistency_at_cones(track, truths[first])["inside"],
+        "ate": float(np.mean([position_rms(one) for one in errors])),
+        "mapped": len(own),
+    }
+
+
+def _truth(log: Log) -> Truth:
+    assert log.truth is not None
+    return log.truth
+
+
+def joint_table(frame: pd.DataFrame) -> View:
+    """Return a row for each kind of car and number of drives, over tracks: the maps of one are no sample."""
+    rows = []
+    for car, of_car in frame.groupby("car", sort=False):
+        means = of_car.groupby(["drives", "track"])[["shape", "nees", "inside", "ate"]].mean()
+        for count in sorted(of_car["drives"].unique()):
+            own = means.loc[count]
+            before = means.loc[count // 2]["shape"] if count > 1 else np.nan
+            values = own.assign(ratio=own["shape"] / before)
+            figures = (Figure.of(values[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
+            rows.append((f"{car}, {count} drive{'s' if count > 1 else ''}", tuple(figures)))
+    return ("cars, drives of a track", *(title for title, _, _ in COLUMNS.values())), tuple(rows)

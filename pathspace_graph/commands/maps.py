@@ -1,0 +1,44 @@
+"""`compare` of two maps: one is laid on the other, and how far they are apart is told, written and drawn."""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from pathspace_graph.console import output, say
+from pathspace_graph.eval.figures.map_plot import plot_apart
+from pathspace_graph.eval.figures.style import save_plot
+from pathspace_graph.eval.metrics.alignment import MapsApart, maps_apart
+from pathspace_graph.io.files import atomic_folder, check_target, write_json
+from pathspace_graph.io.map import read_map
+
+APART_FILE: Final = "apart.json"  # by which the folder is recognized
+PICTURE: Final = "apart.png"
+STATISTICS: Final = ("mean", "rms", "p95", "max")
+
+
+def compare_maps(first: Path, second: Path, out: Path) -> None:
+    """Lay the first map on the second, print how far they are apart, and write it with a picture."""
+    check_target(out, APART_FILE)
+    tracks = read_map(first), read_map(second)
+    apart = maps_apart(*tracks)
+    with atomic_folder(out, APART_FILE) as folder:
+        write_json(folder / APART_FILE, {"maps": [str(first), str(second)], **apart.to_json()})
+        save_plot(plot_apart(*tracks, apart), folder / PICTURE)
+    output().print(apart_table(apart))
+    x, y, turn = apart.motion.tolist()
+    where = f"({x:.3f}, {y:.3f}) m, turned by {np.rad2deg(turn):.3f}°"
+    say(f"the frame of {first} is at {where} in that of {second}", f"written to {out}")
+
+
+def apart_table(apart: MapsApart) -> Table:
+    """Return the distances of both boundaries together, and of each."""
+    table = Table()
+    table.add_column("boundary")
+    for name in STATISTICS:
+        table.add_column(Text(f"{name} [m]"), justify="right")  # a plain text would be markup
+    for name, own in apart.statistics().items():
+        table.add_row(name, *(f"{own[key]:.3f}" for key in STATISTICS))
+    return table

@@ -1,0 +1,57 @@
+"""The study of several drives in one map: its metrics in each drive's frame, and its table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pathspace_graph.eval.joint import JointStudy, joint_table, metrics_of_group
+
+from ..batch.joint.several import alone, lap
+
+LOGS = {"first": lap(0), "elsewhere": lap(1, 9.0), "other": lap(0, 0.0, 5)}
+
+
+def test_the_metrics_are_those_of_the_drives_that_are_in_the_map() -> None:
+    results = {name: alone(log) for name, log in LOGS.items()}
+    one = metrics_of_group({"first": LOGS["first"]}, results)
+    both = metrics_of_group(LOGS, results)
+    assert (one["mapped"], both["mapped"]) == (1, 2)
+    assert 0.0 < both["shape"] < one["shape"] < 0.2
+    assert both["ate"] < 0.35 and both["inside"] > 0.7
+
+
+def test_the_table_compares_each_number_with_half_of_it_track_by_track() -> None:
+    """The mean of the ratios of two tracks is not the ratio of the means."""
+    shapes = {(0, 1): (0.2, 0.4), (1, 1): (0.1, 0.1), (0, 2): (0.1, 0.2), (1, 2): (0.08, 0.08)}
+    rest = {"car": "plain", "nees": 1.0, "inside": 0.95, "ate": 0.1}
+    rows = [
+        {**rest, "track": track, "drives": count, "shape": shape}
+        for (track, count), both in shapes.items()
+        for shape in both
+    ]
+    header, table = joint_table(pd.DataFrame(rows))
+    assert header[:3] == ("cars, drives of a track", "rmse of the shape [m]", "by half as many")
+    (_, alone_figures), (label, together) = table
+    assert label == "plain, 2 drives"
+    assert alone_figures[0].value == pytest.approx(0.2) and alone_figures[1].value is None
+    assert together[1].value == pytest.approx(np.mean([0.5, 0.8]))
+    assert together[3].text.startswith("95.0")
+
+
+def test_a_study_has_a_row_for_each_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of four drives there are four maps of one, two of two, and one of all."""
+    found: list[tuple[str, ...]] = []
+
+    def metrics(logs: dict[str, object], results: dict[str, object]) -> dict[str, object]:
+        assert set(logs) <= set(results)
+        found.append(tuple(logs))
+        return {}
+
+    monkeypatch.setattr("pathspace_graph.eval.joint.metrics_of_group", metrics)
+    monkeypatch.setattr("pathspace_graph.eval.joint.solve_alone", lambda log: log)
+    monkeypatch.setattr("pathspace_graph.eval.joint.simulate", lambda track, settings, seed: seed)
+    frame = JointStudy(tracks=(4,), drives=4, cars={"plain": None}).measure()  # type: ignore[dict-item]
+    assert frame["drives"].tolist() == [1, 1, 1, 1, 2, 2, 4]
+    assert found[4:] == [("0", "1"), ("2", "3"), ("0", "1", "2", "3")]
