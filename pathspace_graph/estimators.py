@@ -77,9 +77,13 @@ def check_batch(name: str) -> None:
 def make_online(name: str, settings: MapperSettings, log: Log) -> OnlineEstimator:
     """Return an online estimator for a log, which tells the scale where the settings leave it open."""
     check_online(name)
+    return ONLINE[name](settings_of(settings, log), log.noise)
+
+
+def settings_of(settings: MapperSettings, log: Log) -> MapperSettings:
+    """Return settings with what they leave open and a log tells: the scale, and the kind of the sensor."""
     settings = known_settings(settings)
-    settings = with_kind(replace(settings, scale=chosen_scale(settings, log)), log)
-    return ONLINE[name](settings, log.noise)
+    return with_kind(replace(settings, scale=chosen_scale(settings, log)), log)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log) -> BatchEstimator:

@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
+import numpy as np
 from rich.table import Table
 from rich.text import Text
 from tyro.conf import FlagCreatePairsOff, Positional, arg
@@ -38,6 +39,8 @@ from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 from pathspace_graph.spline.crossing import crossings_told
 
+from .known import MAP_SIGMA, read_known_map
+
 MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or one centre line with a width
 Run = TypeVar("Run", bound=RunResult)
 NOT_TRUSTED: Final = 3  # exit code of a result that is written, but is not the optimum or no map of the drive
@@ -55,6 +58,14 @@ class Online:
     """Name of the online estimator."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
+    on: Path | None = None
+    """Known map on which the vehicle drives: a map's folder, a track file, `skidpad` or `acceleration`."""
+    start: tuple[float, float, float] | None = None
+    """Pose X Y HEADING (m, m, rad) of the known map near which the drive begins; by default anywhere on it."""
+    keep_map: FlagCreatePairsOff[bool] = False
+    """Hold the known map as it is, and only localize."""
+    map_sigma: float = MAP_SIGMA
+    """Standard deviation of the cones of a track file, m."""
     save: Path | None = None
     """File to which the mapper is saved at the end, for `--resume`; only `fixed-lag` can be saved."""
     resume: Path | None = None
@@ -89,7 +100,10 @@ class Online:
         written = [str(path) for path in (self.out, self.save_view, self.animate) if path is not None]
         say(f"written to {', '.join(written)}")
         crossed = crossings_told(crossings_of(result))
-        end_untrusted([f"not a map of the drive: {crossed}"] if crossed else [])
+        wrong = [f"not a map of the drive: {crossed}"] if crossed else []
+        if isinstance(estimator, FixedLagMapper) and self.on is not None and estimator.placed_at is None:
+            wrong.append(f"the vehicle was not found on {self.on}: this is the map of its own road")
+        end_untrusted(wrong)
 
     def _viewing(self) -> Any:
         """Return the module of viewers and films if one is asked for; importing matplotlib is slow."""
@@ -111,6 +125,8 @@ class Online:
 
     def _begin(self, log: Log) -> tuple[Log, OnlineEstimator]:
         """Return a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
+        if self.on is not None:
+            return log, self._begin_on(self.on, log)
         if self.resume is None:
             return log, estimators.make_online(self.estimator, self.settings, log)
         mapper = FixedLagMapper.restore(self.resume)
@@ -120,6 +136,14 @@ class Online:
             expected = f"expected cycles after {times[-1]:g} s, where {self.resume} ends"
             raise InputError(self.log, f"{expected}, found none")
         return replace(log, cycles=cycles), mapper
+
+
+    def _begin_on(self, path: Path, log: Log) -> FixedLagMapper:
+        """Return a mapper on a known map; on an open one the drive begins where the map does."""
+        track, begin = read_known_map(path, self.map_sigma, self.settings)
+        settings = estimators.settings_of(self.settings, log)
+        start = begin if self.start is None else np.array(self.start)
+        return FixedLagMapper.on(track, settings, log.noise, start=start, keep=self.keep_map)
 
 
 @dataclass(frozen=True, kw_only=True)

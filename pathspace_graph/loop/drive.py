@@ -14,15 +14,18 @@ from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.health import Health, HealthMonitor
 from pathspace_graph.mapping.motion import inflate_priors
+from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closing import go_on_from
 from .drive_record import DriveRecord
+from .known_map import KnownMap, lay_on_known
 from .lap_solver import LapSolver, Outcome
 from .revisit import lay_on
 
 REST: Final = 10.0  # distance for which only the road is mapped after a failure (m)
+KNOWN: Final = "the map was known before the drive"  # why a drive on a known map has no batch
 LEARNED: Final = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
 
@@ -43,6 +46,8 @@ class Drive:
         """Return that began the batch which has closed the loop."""
         self.lap_seconds = nan
         """Wall time (s) of the newest batch that the map is of."""
+        self.placed_at: float | None = None
+        """Stamp (s) of the cycle in which the vehicle was found on a known map."""
         self._rests_until = 0.0  # path (m)
 
     def copy(self) -> Self:
@@ -102,6 +107,19 @@ class Drive:
         self.lap_seconds = solved.seconds
         self.record.replaced(np.concatenate([solved.poses[: solved.first_kept], road.poses]))
         road.place_orange(self.record.corrected)
+        return jump
+
+    def lay_on_known(self, road: Road, known: KnownMap, motion: Motion, covariance: Array) -> Array:
+        """Lay an open road on a known map; return the jump (3,) of the newest pose."""
+        earlier = self.record.with_window(road)[: road.smoother.first_cycle]
+        motion.move(earlier)
+        self.solver.give_up(road.next_cycle)
+        jump = lay_on_known(road, known, motion, covariance)
+        self.record.replaced(np.concatenate([earlier, road.poses]))
+        self.record.give_up(KNOWN)
+        self.placed_at = road.smoother.times[-1]
+        road.place_orange(self.record.corrected)
+        self.monitor.restart()
         return jump
 
     def lay_on(self, road: Road, revisit: Revisit) -> Array:

@@ -198,6 +198,10 @@ class State:
         """Replace an open boundary by a periodic one, whose control points are inserted by the smoother."""
         self.boundaries[label] = boundary
 
+    def replace_curves(self, boundaries: Mapping[int, Boundary]) -> None:
+        """Replace all boundaries by others, whose control points are inserted by the smoother."""
+        self.boundaries = dict(sorted(boundaries.items()))
+
     # --- active control points ---------------------------------------------------------------------------
 
     def active(self, label: int) -> IntArray:

@@ -1,0 +1,144 @@
+"""A known map: the prior of the curves, on which an open road is laid once the vehicle's place is found."""
+
+from dataclasses import dataclass, replace
+from typing import Final, Self
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from pathspace_graph.batch.association import locate_poses
+from pathspace_graph.batch.simplification import fit_through
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import rotation
+from pathspace_graph.graph.changes import restart, set_prior
+from pathspace_graph.graph.variables import POINT, control_keys, pose_keys
+from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.registration import Motion
+from pathspace_graph.mapping.road import Road
+from pathspace_graph.mapping.smoother import CurveSmoother
+from pathspace_graph.settings.mapper import MapperSettings, known_settings
+from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.bspline import BSpline, end_change_matrix
+
+from .closing import SIGMA_STEP
+
+KEPT: Final = 1e-3  # standard deviation of the control points of a map that is kept as it is (m)
+FLOOR: Final = 0.01  # standard deviation added to those of any other map (m), which makes it regular
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMap:
+    """Both curves of a map that was there before the drive, and the Gaussian of their control points."""
+
+    splines: dict[int, BSpline]
+    confirmed: dict[int, float]  # parameter up to which each curve is confirmed (m)
+    covariance: Array  # (n, n) of the distinct control points, left first, in m^2
+
+    @classmethod
+    def of(cls, track: Map, keep: bool = False) -> Self:
+        """Return the known map of a map with both curves; `keep` holds it as it is.
+
+        SettingsError is raised for a map without both curves or without covariances.
+        """
+        boundaries = track.curves("a known map")
+        covariance = track.covariance_of(*boundaries)
+        if covariance is None:
+            raise SettingsError("a known map: expected a map with covariances, found one without")
+        changes, splines, confirmed = [], dict[int, BSpline](), dict[int, float]()
+        for label, boundary in sorted(track.boundaries.items()):
+            assert isinstance(boundary, SplineBoundary)
+            splines[label], change = _floating(boundary.spline)
+            changes.append(np.kron(change, np.eye(POINT)))
+            confirmed[label] = min(boundary.confirmed_until, boundary.spline.domain[1])
+        T = block_diag(*changes)
+        floor = FLOOR**2 * np.eye(len(T))
+        joint = KEPT**2 * np.eye(len(T)) if keep else T @ covariance @ T.T + floor
+        return cls(splines, confirmed, joint)
+
+    @property
+    def closed(self) -> bool:
+        return any(spline.periodic for spline in self.splines.values())
+
+    def boundary(self, label: int, settings: MapperSettings, first: int = 0) -> Boundary:
+        """Return a curve as a boundary whose control points have keys from the number `first` on."""
+        spline = self.splines[label]
+        own = replace(settings.spline, degree=spline.degree)
+        boundary = Boundary(spline.knots, spline.periodic, own, settings.gauge, first)
+        boundary.confirmed_end = self.confirmed[label]
+        if not spline.periodic:
+            end = np.array([boundary.confirmed_end])
+            boundary.add_cones(spline.evaluate(end), end)
+        return boundary
+
+    def smoother(self, settings: MapperSettings) -> CurveSmoother:
+        """Return the map alone, without a drive, as a search needs it."""
+        smoother = CurveSmoother(settings)
+        for label, spline in self.splines.items():
+            points = spline.distinct_control_points
+            smoother.map.state.add_boundary(label, self.boundary(label, settings), points)
+        return smoother
+
+
+def map_of_cones(
+    left: Array, right: Array, closed: bool, sigma: float, settings: MapperSettings | None = None
+) -> Map:
+    """Return the map through cones (n, 2) in driving order, known with a standard deviation `sigma` (m)."""
+    settings, boundaries = known_settings(settings), dict[int, SplineBoundary]()
+    for label, cones in zip(BOUNDARIES, (left, right), strict=True):
+        spline = fit_through(cones, closed, settings, settings.batch.dense_share)
+        floating = spline if closed else spline.unclamp()
+        boundaries[label] = SplineBoundary(floating, sigma**2 * np.eye(POINT * floating.size))
+    return Map(closed, boundaries)
+
+
+def _floating(spline: BSpline) -> tuple[BSpline, Array]:
+    """Return a curve with floating ends, and the change of its distinct control points."""
+    if spline.periodic or spline.knots[0] < spline.knots[spline.degree]:
+        return spline, np.eye(spline.size)
+    floating = spline.unclamp()
+    return floating, end_change_matrix(spline.knots, spline.degree, floating.knots)
+
+
+def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array) -> Array:
+    """Replace an open road's curves and prior by a known map's; return the jump (3,) of the newest pose.
+
+    The motion lays the road on the map, and its covariance (3, 3) is that of the newest pose there.
+    """
+    smoother, state = road.smoother, road.smoother.map.state
+    variables = state.variables
+    calibration = smoother.covariance(variables.calibration_keys)
+    smoother.reactivate(with_prior=False)
+    before, removed = state.poses[-1].copy(), state.map_keys
+    road.move(as_pose(motion))
+    curves = {label: _next(state.boundaries, known, label, road.settings) for label in known.splines}
+    state.replace_curves(curves)
+    added = np.concatenate([control_keys(label, b.numbers) for label, b in state.boundaries.items()])
+    points = np.concatenate([spline.distinct_control_points for spline in known.splines.values()])
+    restart(smoother, smoother.first_cycle, removed, added, points)
+    smoother.map.replaced_by({}, {}, {})
+    motion.move(state.poses)
+    locate_poses(state)
+    keys = np.concatenate([variables.calibration_keys, added, pose_keys(smoother.cycles[-1:])])
+    mean = np.concatenate([variables.calibrations, points.ravel(), state.poses[-1]])
+    information = block_diag(*map(np.linalg.inv, (calibration, known.covariance, covariance)))
+    set_prior(smoother, keys, mean, information)
+    smoother.reassociate()
+    for _ in range(road.settings.closing.iterations):
+        smoother.step(SIGMA_STEP)
+    return np.asarray(state.poses[-1] - before)
+
+
+def _next(
+    boundaries: dict[int, Boundary], known: KnownMap, label: int, settings: MapperSettings
+) -> Boundary:
+    """Return a known curve whose control points have other keys than those of the curve before."""
+    before = boundaries.get(label)
+    return known.boundary(label, settings, before.first + before.size if before else 0)
+
+
+def as_pose(motion: Motion) -> Array:
+    """Return a motion as the pose (3,) to which the origin is moved."""
+    turn = motion.vector[2]
+    return np.append(motion.centre + motion.vector[:2] - rotation(turn) @ motion.centre, turn)

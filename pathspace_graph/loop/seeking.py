@@ -1,0 +1,99 @@
+"""A known map: the vehicle's place on it is searched, while a road of its own is mapped."""
+
+from typing import Final, Self
+
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.health import DEGRADED, GOOD, Health
+from pathspace_graph.lengths import joined
+from pathspace_graph.mapping.road import Classified, Road
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .closed import Closed
+from .drive import Drive, Phase, Step
+from .known_loop import evidence_of
+from .known_map import KnownMap
+from .lap_solver import Outcome
+from .open import Open
+from .relocalization import Search
+
+SEEKING: Final = "the vehicle is not found on the known map yet"  # reason of the health until then
+PLACED: Final = "the vehicle is found on the known map"  # notice of the cycle in which it is
+
+
+class Seeking:
+    """An open road of the vehicle's own, and the search for its place on a known map."""
+
+    def __init__(self, settings: MapperSettings, known: KnownMap, start: Array | None = None) -> None:
+        self.known = known
+        self.start = start  # pose (3,) of the known map at which the drive began, if it is known
+        self.own: Phase = Open(settings)
+        self._known = known.smoother(settings)
+        self._search: Search | None = None
+
+    def copy(self) -> Self:
+        """Return a phase that can go on independently."""
+        other = shallow(self)
+        other.own = self.own.copy()
+        other._search = self._search and self._search.copy()
+        return other
+
+    @property
+    def uses_detections(self) -> bool:
+        return self.own.uses_detections
+
+    def judge(
+        self, road: Road, drive: Drive, classified: Classified, reading: Reading
+    ) -> tuple[Phase, Health]:
+        """Judge the road of its own, and remember what is seen."""
+        self.own, health = self.own.judge(road, drive, classified, reading)
+        if self._search is None:
+            self._search = Search(road, self.start)
+        self._search.look(road, classified, reading)
+        return self, Health(DEGRADED, SEEKING) if health.condition == GOOD else health
+
+    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
+        """Lay the road on the known map where its place is found; else go on with it alone."""
+        step = self.own.step(road, drive, reading, spent)
+        if step.jump is not None:
+            self._search = None  # what was seen is no longer where it was
+        self.own = step.phase
+        if road.closed:
+            return step
+        search = None if drive.rests(road) else self._search
+        found = search and search.find(self._known)
+        if search is None or found is None:
+            return Step(self, step.jump, step.notice, step.health)
+        jump = drive.lay_on_known(road, self.known, found.motion, search.widened(found))
+        phase = Closed(road, drive) if self.known.closed else OnOpenMap()
+        return Step(phase, jump, joined([step.notice, PLACED]), Health(DEGRADED, PLACED))
+
+    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
+        """Go on from a batch of the road of its own."""
+        return self.own.take(road, drive, outcome)
+
+
+class OnOpenMap:
+    """A known map that is open: it is localized on and refined, and grows past its end."""
+
+    uses_detections = True
+
+    def copy(self) -> Self:
+        """Return the phase itself, which has no state."""
+        return self
+
+    def judge(
+        self, road: Road, drive: Drive, classified: Classified, reading: Reading
+    ) -> tuple[Phase, Health]:
+        """Judge the estimate by the tested detections."""
+        return self, drive.monitor.update(evidence_of(road.smoother, classified.tested, None, reading))
+
+    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
+        """Remember the pose."""
+        drive.record.estimated(road)
+        return Step(self)
+
+    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
+        """Leave the map as it is."""
+        return Step(self)
