@@ -10,11 +10,14 @@ from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.batch.simplification import fit_through
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.changes import restart, set_prior
 from pathspace_graph.graph.variables import POINT, control_keys, pose_keys
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.constellation import Constellation
+from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
@@ -25,6 +28,7 @@ from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 from .closing import SIGMA_STEP
 
 KEPT: Final = 1e-3  # standard deviation of the control points of a map that is kept as it is (m)
+INSIDE: Final = 1e-6  # least distance of a cone from the end of its curve, which is the seam if closed (m)
 FLOOR: Final = 0.01  # standard deviation added to those of any other map (m), which makes it regular
 
 
@@ -35,6 +39,7 @@ class KnownMap:
     splines: dict[int, BSpline]
     confirmed: dict[int, float]  # parameter up to which each curve is confirmed (m)
     covariance: Array  # (n, n) of the distinct control points, left first, in m^2
+    cones: dict[int, Array]  # (k, 2) cones of each curve: parameters, and sigmas along it (m)
 
     @classmethod
     def of(cls, track: Map, keep: bool = False) -> Self:
@@ -46,16 +51,17 @@ class KnownMap:
         covariance = track.covariance_of(*boundaries)
         if covariance is None:
             raise SettingsError("a known map: expected a map with covariances, found one without")
-        changes, splines, confirmed = [], dict[int, BSpline](), dict[int, float]()
+        changes, splines, confirmed, cones = [], dict[int, BSpline](), dict[int, float](), dict[int, Array]()
         for label, boundary in sorted(track.boundaries.items()):
             assert isinstance(boundary, SplineBoundary)
             splines[label], change = _floating(boundary.spline)
             changes.append(np.kron(change, np.eye(POINT)))
             confirmed[label] = min(boundary.confirmed_until, boundary.spline.domain[1])
+            cones[label] = boundary.cones
         T = block_diag(*changes)
         floor = FLOOR**2 * np.eye(len(T))
         joint = KEPT**2 * np.eye(len(T)) if keep else T @ covariance @ T.T + floor
-        return cls(splines, confirmed, joint)
+        return cls(splines, confirmed, joint, cones)
 
     @property
     def closed(self) -> bool:
@@ -78,7 +84,26 @@ class KnownMap:
         for label, spline in self.splines.items():
             points = spline.distinct_control_points
             smoother.map.state.add_boundary(label, self.boundary(label, settings), points)
+        self.place_cones(smoother.map)
         return smoother
+
+    def place_cones(self, track: CurveMap) -> None:
+        """Give a map whose curves are the known ones their cones."""
+        places = {label: cones[:, 0] for label, cones in self.cones.items() if len(cones)}
+        stations = {label: cones.T for label, cones in self.cones.items()}
+        track.replaced_by({}, places, stations if len(places) == len(stations) else {})
+
+    @property
+    def constellation(self) -> Constellation | None:
+        """Return the cones in the map frame; None where their places are not known."""
+        points, labels, sigmas = [], [], []
+        for label, cones in self.cones.items():
+            points.append(self.splines[label].evaluate(cones[:, 0]))
+            labels.append(np.full(len(cones), label))
+            sigmas.append(cones[:, 1])
+        covariances = np.concatenate(sigmas)[:, None, None] ** 2 * np.eye(POINT)
+        known = Constellation(np.concatenate(points), covariances, np.concatenate(labels))
+        return known if all(map(len, points)) else None
 
 
 def map_of_cones(
@@ -89,7 +114,12 @@ def map_of_cones(
     for label, cones in zip(BOUNDARIES, (left, right), strict=True):
         spline = fit_through(cones, closed, settings, settings.batch.dense_share)
         floating = spline if closed else spline.unclamp()
-        boundaries[label] = SplineBoundary(floating, sigma**2 * np.eye(POINT * floating.size))
+        low, high = floating.domain
+        ends = np.full(len(cones), low), np.full(len(cones), high)
+        feet = foot_points(floating.tables, floating.control_points, cones, *ends, settings.spline.search_step)
+        placed = np.column_stack([np.minimum(feet.u, high - INSIDE), np.full(len(cones), sigma)])
+        covariance = sigma**2 * np.eye(POINT * floating.size)
+        boundaries[label] = SplineBoundary(floating, covariance, high, placed)
     return Map(closed, boundaries)
 
 
@@ -117,7 +147,7 @@ def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array)
     added = np.concatenate([control_keys(label, b.numbers) for label, b in state.boundaries.items()])
     points = np.concatenate([spline.distinct_control_points for spline in known.splines.values()])
     restart(smoother, smoother.first_cycle, removed, added, points)
-    smoother.map.replaced_by({}, {}, {})
+    known.place_cones(smoother.map)
     motion.move(state.poses)
     locate_poses(state)
     keys = np.concatenate([variables.calibration_keys, added, pose_keys(smoother.cycles[-1:])])

@@ -2,11 +2,16 @@
 
 from typing import Final, Self
 
+import numpy as np
+
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, Health
 from pathspace_graph.lengths import joined
+from pathspace_graph.mapping.constellation import LAID_NEWEST, Constellation, Expected, Laid, lay
+from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -16,10 +21,13 @@ from .known_loop import evidence_of
 from .known_map import KnownMap
 from .lap_solver import Outcome
 from .open import Open
-from .relocalization import Search
+from .relocalization import WIDENING, Search
 
 SEEKING: Final = "the vehicle is not found on the known map yet"  # reason of the health until then
 PLACED: Final = "the vehicle is found on the known map"  # notice of the cycle in which it is
+
+NEAR: Final = Expected.within(8.0, 0.3, (2.0, 2.0, 0.1))
+"""How far from the place that the curves tell the one that the cones tell may be."""
 
 
 class Seeking:
@@ -30,6 +38,7 @@ class Seeking:
         self.start = start  # pose (3,) of the known map at which the drive began, if it is known
         self.own: Phase = Open(settings)
         self._known = known.smoother(settings)
+        self._cones = known.constellation
         self._search: Search | None = None
 
     def copy(self) -> Self:
@@ -61,13 +70,45 @@ class Seeking:
         self.own = step.phase
         if road.closed:
             return step
-        search = None if drive.rests(road) else self._search
-        found = search and search.find(self._known)
-        if search is None or found is None:
+        place = None if drive.rests(road) else self._place(road, drive, reading)
+        if place is None:
             return Step(self, step.jump, step.notice, step.health)
-        jump = drive.lay_on_known(road, self.known, found.motion, search.widened(found))
+        jump = drive.lay_on_known(road, self.known, *place)
         phase = Closed(road, drive) if self.known.closed else OnOpenMap()
         return Step(phase, jump, joined([step.notice, PLACED]), Health(DEGRADED, PLACED))
+
+    def _place(self, road: Road, drive: Drive, reading: Reading) -> tuple[Motion, Array] | None:
+        """Return the motion onto the known map, and the covariance (3, 3) of the newest pose there.
+
+        The cones must agree as well where those of the map are known.
+        """
+        search = self._search
+        found = search and search.find(self._known)
+        if search is None or found is None:
+            return None
+        if self.start is not None or self._cones is None:
+            return found.motion, search.widened(found)
+        newest = road.poses[-1:].copy()
+        found.motion.move(newest)
+        laid = self._laid(road, drive, reading, newest[0], self._cones)
+        if laid is None or not laid.is_sure:
+            return None
+        moved = laid.pose - road.poses[-1]
+        covariance = WIDENING**2 * np.linalg.inv(laid.information)
+        return Motion(road.poses[-1, :2].copy(), moved), covariance
+
+    def _laid(
+        self, road: Road, drive: Drive, reading: Reading, pose: Array, known: Constellation
+    ) -> Laid | None:
+        """Lay the newest cones on the known ones, near a pose (3,) of the known map."""
+        record, settings = drive.record, road.settings
+        if record.unsolvable is not None:
+            return None
+        poses = record.with_window(road)
+        first = int(path_lengths(poses).searchsorted(path_lengths(poses)[-1] - LAID_NEWEST))
+        table = record.seen_in(road.smoother.variables.sensor, reading.noise)(np.arange(first, len(poses)))
+        seen = Constellation.of(table, poses, settings.growth).seen_from(poses[-1])
+        return lay(seen, known, pose, NEAR.information, (NEAR.radius, NEAR.turn))
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
         """Go on from a batch of the road of its own."""

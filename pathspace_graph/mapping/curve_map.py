@@ -134,6 +134,12 @@ class CurveMap:
             u, sigma = ({label: own[k] for label, own in stations.items()} for k in (0, 1))
             self.stations = Stations.of(self.state, u, sigma)
 
+    def placed_cones(self, label: int) -> Array:
+        """Return the cones (k, 2) that hold detections along a curve: parameters and sigmas along it (m)."""
+        curves = self.stations.curves if self.stations is not None else ()
+        found = [np.column_stack([curve.u, curve.sigma]) for curve in curves if curve.label == label]
+        return np.concatenate([np.zeros((0, 2)), *found])
+
     def match(self, rows: IntArray, directions: Array) -> None:
         """Match detections (m,), newly in use, with the cones of a closed map.
 
