@@ -8,7 +8,7 @@ import numpy as np
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
-from pathspace_graph.loop.known_map import map_of_cones
+from pathspace_graph.batch.known_map import map_of_cones
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import EVENTS
 from pathspace_graph.sim.track_files import read_track

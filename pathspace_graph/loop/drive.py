@@ -7,6 +7,7 @@ from typing import Final, Protocol, Self
 
 import numpy as np
 
+from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
@@ -18,9 +19,8 @@ from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .closing import go_on_from
+from .closing import go_on_from, lay_on_known
 from .drive_record import DriveRecord
-from .known_map import KnownMap, lay_on_known
 from .lap_solver import LapSolver, Outcome
 from .revisit import lay_on
 

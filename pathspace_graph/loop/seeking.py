@@ -4,6 +4,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import path_lengths
@@ -18,7 +19,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .closed import Closed
 from .drive import Drive, Phase, Step
 from .known_loop import evidence_of
-from .known_map import KnownMap
 from .lap_solver import Outcome
 from .open import Open
 from .relocalization import WIDENING, Search

@@ -8,6 +8,7 @@ from typing import Self
 import gtsam
 import numpy as np
 
+from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
@@ -21,7 +22,6 @@ from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.lengths import POSE_LENGTHS, joined, scaled, times
 from pathspace_graph.loop.drive import Drive, Phase
-from pathspace_graph.loop.known_map import KnownMap
 from pathspace_graph.loop.open import Open
 from pathspace_graph.loop.seeking import Seeking
 from pathspace_graph.mapping.motion import known_noise

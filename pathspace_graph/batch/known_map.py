@@ -1,4 +1,4 @@
-"""A known map: the prior of the curves, on which an open road is laid once the vehicle's place is found."""
+"""A known map: the prior of the curves where a drive begins on a map that was there before it."""
 
 from dataclasses import dataclass, replace
 from typing import Final, Self
@@ -6,28 +6,24 @@ from typing import Final, Self
 import numpy as np
 from scipy.linalg import block_diag
 
-from pathspace_graph.batch.association import locate_poses
-from pathspace_graph.batch.simplification import fit_through
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.footpoint import foot_points
-from pathspace_graph.factors.se2 import rotation
-from pathspace_graph.graph.changes import restart, set_prior
-from pathspace_graph.graph.variables import POINT, control_keys, pose_keys
+from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.constellation import Constellation
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.registration import Motion
-from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.settings.mapper import MapperSettings, known_settings
+from pathspace_graph.settings.mapper import MapperSettings, SplineSettings, known_settings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
-from .closing import SIGMA_STEP
+from .simplification import fit_through
 
 KEPT: Final = 1e-3  # standard deviation of the control points of a map that is kept as it is (m)
+PLACE_ROOM, PLACE_LEAST = 0.02, 4.0  # of an open curve's length, and of its own (m), in which a cone lies
 INSIDE: Final = 1e-6  # least distance of a cone from the end of its curve, which is the seam if closed (m)
 FLOOR: Final = 0.01  # standard deviation added to those of any other map (m), which makes it regular
 
@@ -114,13 +110,23 @@ def map_of_cones(
     for label, cones in zip(BOUNDARIES, (left, right), strict=True):
         spline = fit_through(cones, closed, settings, settings.batch.dense_share)
         floating = spline if closed else spline.unclamp()
-        low, high = floating.domain
-        ends = np.full(len(cones), low), np.full(len(cones), high)
-        feet = foot_points(floating.tables, floating.control_points, cones, *ends, settings.spline.search_step)
-        placed = np.column_stack([np.minimum(feet.u, high - INSIDE), np.full(len(cones), sigma)])
         covariance = sigma**2 * np.eye(POINT * floating.size)
-        boundaries[label] = SplineBoundary(floating, covariance, high, placed)
+        placed = np.column_stack([_places(floating, cones), np.full(len(cones), sigma)])
+        boundaries[label] = SplineBoundary(floating, covariance, floating.domain[1], placed)
     return Map(closed, boundaries)
+
+
+def _places(spline: BSpline, cones: Array) -> Array:
+    """Return the parameters (n,) of cones (n, 2) in driving order on their curve; an open one may cross itself."""
+    low, high = spline.domain
+    begin, end = np.full(len(cones), low), np.full(len(cones), high)
+    if not spline.periodic:
+        driven = path_lengths(cones)
+        at, room = low + (high - low) * driven / driven[-1], PLACE_ROOM * (high - low) + PLACE_LEAST
+        begin, end = np.maximum(begin, at - room), np.minimum(end, at + room)
+    step = SplineSettings.search_step
+    feet = foot_points(spline.tables, spline.control_points, cones, begin, end, step)
+    return np.minimum(feet.u, high - INSIDE)
 
 
 def _floating(spline: BSpline) -> tuple[BSpline, Array]:
@@ -129,46 +135,3 @@ def _floating(spline: BSpline) -> tuple[BSpline, Array]:
         return spline, np.eye(spline.size)
     floating = spline.unclamp()
     return floating, end_change_matrix(spline.knots, spline.degree, floating.knots)
-
-
-def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array) -> Array:
-    """Replace an open road's curves and prior by a known map's; return the jump (3,) of the newest pose.
-
-    The motion lays the road on the map, and its covariance (3, 3) is that of the newest pose there.
-    """
-    smoother, state = road.smoother, road.smoother.map.state
-    variables = state.variables
-    calibration = smoother.covariance(variables.calibration_keys)
-    smoother.reactivate(with_prior=False)
-    before, removed = state.poses[-1].copy(), state.map_keys
-    road.move(as_pose(motion))
-    curves = {label: _next(state.boundaries, known, label, road.settings) for label in known.splines}
-    state.replace_curves(curves)
-    added = np.concatenate([control_keys(label, b.numbers) for label, b in state.boundaries.items()])
-    points = np.concatenate([spline.distinct_control_points for spline in known.splines.values()])
-    restart(smoother, smoother.first_cycle, removed, added, points)
-    known.place_cones(smoother.map)
-    motion.move(state.poses)
-    locate_poses(state)
-    keys = np.concatenate([variables.calibration_keys, added, pose_keys(smoother.cycles[-1:])])
-    mean = np.concatenate([variables.calibrations, points.ravel(), state.poses[-1]])
-    information = block_diag(*map(np.linalg.inv, (calibration, known.covariance, covariance)))
-    set_prior(smoother, keys, mean, information)
-    smoother.reassociate()
-    for _ in range(road.settings.closing.iterations):
-        smoother.step(SIGMA_STEP)
-    return np.asarray(state.poses[-1] - before)
-
-
-def _next(
-    boundaries: dict[int, Boundary], known: KnownMap, label: int, settings: MapperSettings
-) -> Boundary:
-    """Return a known curve whose control points have other keys than those of the curve before."""
-    before = boundaries.get(label)
-    return known.boundary(label, settings, before.first + before.size if before else 0)
-
-
-def as_pose(motion: Motion) -> Array:
-    """Return a motion as the pose (3,) to which the origin is moved."""
-    turn = motion.vector[2]
-    return np.append(motion.centre + motion.vector[:2] - rotation(turn) @ motion.centre, turn)
