@@ -36,6 +36,7 @@ class KnownMap:
     confirmed: dict[int, float]  # parameter up to which each curve is confirmed (m)
     covariance: Array  # (n, n) of the distinct control points, left first, in m^2
     cones: dict[int, Array]  # (k, 2) cones of each curve: parameters, and sigmas along it (m)
+    kept: bool  # whether the map is held as it is
 
     @classmethod
     def of(cls, track: Map, keep: bool = False) -> Self:
@@ -57,7 +58,7 @@ class KnownMap:
         T = block_diag(*changes)
         floor = FLOOR**2 * np.eye(len(T))
         joint = KEPT**2 * np.eye(len(T)) if keep else T @ covariance @ T.T + floor
-        return cls(splines, confirmed, joint, cones)
+        return cls(splines, confirmed, joint, cones, keep)
 
     @property
     def closed(self) -> bool:
@@ -117,7 +118,7 @@ def map_of_cones(
 
 
 def _places(spline: BSpline, cones: Array) -> Array:
-    """Return the parameters (n,) of cones (n, 2) in driving order on their curve; an open one may cross itself."""
+    """Return the parameters (n,) of cones (n, 2), in driving order, on a curve that may cross itself."""
     low, high = spline.domain
     begin, end = np.full(len(cones), low), np.full(len(cones), high)
     if not spline.periodic:

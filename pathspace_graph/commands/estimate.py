@@ -39,7 +39,7 @@ from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 from pathspace_graph.spline.crossing import crossings_told
 
-from .known import MAP_SIGMA, read_known_map
+from .known import MAP_SIGMA, KnownTrack, read_known_map
 
 MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or one centre line with a width
 Run = TypeVar("Run", bound=RunResult)
@@ -61,7 +61,7 @@ class Online:
     on: Path | None = None
     """Known map on which the vehicle drives: a map's folder, a track file, `skidpad` or `acceleration`."""
     start: tuple[float, float, float] | None = None
-    """Pose X Y HEADING (m, m, rad) of the known map near which the drive begins; by default anywhere on it."""
+    """Pose X Y HEADING (m, m, rad) on the known map near which the drive begins; by default anywhere."""
     keep_map: FlagCreatePairsOff[bool] = False
     """Hold the known map as it is, and only localize."""
     map_sigma: float = MAP_SIGMA
@@ -90,10 +90,13 @@ class Online:
             viewing.check_watchers(self)
         log, hints = read_plausible_log(self.log, self.settings.limits)
         tell(hints)
-        log, estimator = self._begin(log)
+        known = self._known()
+        log, estimator = self._begin(log) if known is None else self._begin_on(known, log)
         with nullcontext([]) if viewing is None else viewing.watchers(self, log) as observers:
             result = of_kind(map_online(log, estimator, self.estimator, observers), self.map, self.settings)
-            write_result(self.out, result, summarize(result, log, hints))
+            differ = [] if known is None else known.differences(result, estimator)
+            told = {} if known is None else known.summary(estimator, differ)
+            write_result(self.out, result, summarize(result, log, hints) | told)
         if self.save is not None and isinstance(estimator, FixedLagMapper):
             estimator.save(self.save)
         report(result, log)
@@ -101,7 +104,8 @@ class Online:
         say(f"written to {', '.join(written)}")
         crossed = crossings_told(crossings_of(result))
         wrong = [f"not a map of the drive: {crossed}"] if crossed else []
-        if isinstance(estimator, FixedLagMapper) and self.on is not None and estimator.placed_at is None:
+        say(*(one.line for one in differ))
+        if known is not None and known.found_at(estimator) is None:
             wrong.append(f"the vehicle was not found on {self.on}: this is the map of its own road")
         end_untrusted(wrong)
 
@@ -125,8 +129,6 @@ class Online:
 
     def _begin(self, log: Log) -> tuple[Log, OnlineEstimator]:
         """Return a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
-        if self.on is not None:
-            return log, self._begin_on(self.on, log)
         if self.resume is None:
             return log, estimators.make_online(self.estimator, self.settings, log)
         mapper = FixedLagMapper.restore(self.resume)
@@ -137,13 +139,25 @@ class Online:
             raise InputError(self.log, f"{expected}, found none")
         return replace(log, cycles=cycles), mapper
 
+    def _known(self) -> KnownTrack | None:
+        """Return the known map that is asked for; SettingsError where options contradict each other."""
+        if self.on is None:
+            for option, is_given in (("start", self.start is not None), ("keep-map", self.keep_map)):
+                if is_given:
+                    raise SettingsError(f"--{option}: expected --on MAP as well, found none")
+            return None
+        if self.estimator != DEFAULT_ONLINE:
+            raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {self.estimator}")
+        if self.resume is not None:
+            raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
+        return read_known_map(self.on, self.map_sigma, self.settings)
 
-    def _begin_on(self, path: Path, log: Log) -> FixedLagMapper:
-        """Return a mapper on a known map; on an open one the drive begins where the map does."""
-        track, begin = read_known_map(path, self.map_sigma, self.settings)
+    def _begin_on(self, known: KnownTrack, log: Log) -> tuple[Log, FixedLagMapper]:
+        """Return a mapper on a known map, and the log without its truth, which is in another frame."""
         settings = estimators.settings_of(self.settings, log)
-        start = begin if self.start is None else np.array(self.start)
-        return FixedLagMapper.on(track, settings, log.noise, start=start, keep=self.keep_map)
+        start = known.start if self.start is None else np.array(self.start)
+        mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=self.keep_map)
+        return replace(log, truth=None), mapper
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,9 @@ JOIN_SHARE: Final = 0.5  # share of a short curve past which the seam lies
 OVERLAP_STEP: Final = 1.0  # step at which points of the overlap are placed on the beginning (m)
 OVERLAP_ROOM: Final = 4.0  # room about its expected place in which a point of the overlap is searched (m)
 SEAM_MARGIN: Final = 0.5  # distance from the seam below which a cone is one of the beginning (m)
-FIRST_ROOM: Final = 2.0  # by which the first place beside a pose on an open curve may be farther than another (m)
+FIRST_ROOM: Final = (
+    2.0  # by which the first place beside a pose on an open curve may be farther than another (m)
+)
 FIRST_REACH: Final = 20.0  # about it, in which the poses of the window are located (m along the curve)
 SIGMA_STEP: Final = 10.0  # free motion of a control point in a step while the loop is optimized (m)
 
@@ -247,9 +249,7 @@ def _locate_first(state: State) -> None:
         state.locate(label, np.maximum.accumulate(found.u))
 
 
-def _next(
-    boundaries: dict[int, Boundary], known: KnownMap, label: int, settings: MapperSettings
-) -> Boundary:
+def _next(boundaries: dict[int, Boundary], known: KnownMap, label: int, settings: MapperSettings) -> Boundary:
     """Return a known curve whose control points have other keys than those of the curve before."""
     before = boundaries.get(label)
     return known.boundary(label, settings, before.first + before.size if before else 0)

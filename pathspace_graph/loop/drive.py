@@ -48,6 +48,8 @@ class Drive:
         """Wall time (s) of the newest batch that the map is of."""
         self.placed_at: float | None = None
         """Stamp (s) of the cycle in which the vehicle was found on a known map."""
+        self.keeps_map = False
+        """Whether that map is held as it is."""
         self._rests_until = 0.0  # path (m)
 
     def copy(self) -> Self:
@@ -68,6 +70,11 @@ class Drive:
         contradicted = doubted or measured is None
         is_new = before == self.settings != self.priors and contradicted
         return LEARNED if is_new else ""
+
+    @property
+    def can_repair(self) -> bool:
+        """Return whether a closed map can be repaired: by a batch of the drive, or a known map in place."""
+        return self.record.unsolvable is None or (self.placed_at is not None and not self.keeps_map)
 
     # --- rest after a failure ----------------------------------------------------------------------------
 
@@ -117,7 +124,7 @@ class Drive:
         jump = lay_on_known(road, known, motion, covariance)
         self.record.replaced(np.concatenate([earlier, road.poses]))
         self.record.give_up(KNOWN)
-        self.placed_at = road.smoother.times[-1]
+        self.placed_at, self.keeps_map = road.smoother.times[-1], known.kept
         road.place_orange(self.record.corrected)
         self.monitor.restart()
         return jump

@@ -82,7 +82,7 @@ class Search:
         return other
 
     def look(self, road: Road, classified: Classified, reading: Reading) -> None:
-        """Remember the newest cycle of a road, with its detections as the sensor's calibration corrects them."""
+        """Remember the newest cycle of a road, with its detections as the calibration corrects them."""
         track = road.smoother.map
         corrected = track.detections.corrected(classified.new, track.variables.sensor).copy()
         self.observe(road.poses[-1], replace(reading.detections, points_vehicle=corrected))
@@ -136,7 +136,7 @@ class Search:
         rivals = [place.score for place in places if not place.is_near(best)]
         if rivals and rivals[0] > best.score - MARGIN:
             return None
-        if self.start is not None:
+        if self.start is not None:  # which says what the curves leave free
             return best.found
         return best.found if worst_sigma(best.found.covariance) < SIGMA_MAX else None
 
@@ -167,7 +167,7 @@ class Search:
         return [(motions[i], int(i)) for i in _spread(loop, possible, cost)]
 
     def _at_start(self, loop: Loop, start: Array) -> tuple[Array, int]:
-        """Return the motion (3,) that moves the origin to `start` (3,), and the nearest point of the middle."""
+        """Return the motion (3,) of the origin to `start` (3,), and the nearest point of the middle."""
         newest = self._poses[-1][:2]
         there = move_points(start, newest[None])[0]
         nearest = int(np.hypot(*(loop.middle - there).T).argmin())

@@ -33,6 +33,8 @@ NEAR: Final = Expected.within(8.0, 0.3, (2.0, 2.0, 0.1))
 class Seeking:
     """An open road of the vehicle's own, and the search for its place on a known map."""
 
+    uses_detections = True
+
     def __init__(self, settings: MapperSettings, known: KnownMap, start: Array | None = None) -> None:
         self.known = known
         self.start = start  # pose (3,) of the known map at which the drive began, if it is known
@@ -47,10 +49,6 @@ class Seeking:
         other.own = self.own.copy()
         other._search = self._search and self._search.copy()
         return other
-
-    @property
-    def uses_detections(self) -> bool:
-        return self.own.uses_detections
 
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
@@ -83,7 +81,7 @@ class Seeking:
         The cones must agree as well where those of the map are known.
         """
         search = self._search
-        found = search and search.find(self._known)
+        found = None if search is None else search.find(self._known)
         if search is None or found is None:
             return None
         if self.start is not None or self._cones is None:
@@ -94,7 +92,7 @@ class Seeking:
         if laid is None or not laid.is_sure:
             return None
         moved = laid.pose - road.poses[-1]
-        covariance = WIDENING**2 * np.linalg.inv(laid.information)
+        covariance = np.asarray(WIDENING**2 * np.linalg.inv(laid.information), np.float64)
         return Motion(road.poses[-1, :2].copy(), moved), covariance
 
     def _laid(

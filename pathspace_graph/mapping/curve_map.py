@@ -1,12 +1,13 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
+from collections.abc import Callable
 from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, TOLERANCES
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.residuals import pair_residuals, sigma_across
@@ -139,6 +140,15 @@ class CurveMap:
         curves = self.stations.curves if self.stations is not None else ()
         found = [np.column_stack([curve.u, curve.sigma]) for curve in curves if curve.label == label]
         return np.concatenate([np.zeros((0, 2)), *found])
+
+    def forget_cones(self, label: int, is_gone: Callable[[Array], BoolArray]) -> None:
+        """Forget the cones of a closed curve at whose parameters (k,) others stand now."""
+        placed = {b: self.placed_cones(b) for b in self.state.boundaries}
+        placed[label] = placed[label][~is_gone(placed[label][:, 0])]
+        places = {b: cones[~is_gone(cones)] if b == label else cones for b, cones in self.cones.items()}
+        are_placed = all(map(len, placed.values()))
+        stations = {b: cones.T for b, cones in placed.items()} if are_placed else {}
+        self.replaced_by(self.scatter, places, stations)
 
     def match(self, rows: IntArray, directions: Array) -> None:
         """Match detections (m,), newly in use, with the cones of a closed map.

@@ -34,7 +34,7 @@ class Growth:
         self.settings = settings
         self.tentative = {label: TentativeTracks(settings) for label in BOUNDARIES}  # unexplained cones
         self.known: Mapping[int, float] = {}
-        """Lengths of curves that were known before the drive: they grow only where the vehicle is at their ends."""
+        """Ends of curves that were known before the drive (m): they grow where the vehicle is there."""
         self._full: frozenset[int] = frozenset()  # boundaries that have stopped growing
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
 

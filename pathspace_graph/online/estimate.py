@@ -143,7 +143,7 @@ class MapperEstimate:
 
     @property
     def placed_at(self) -> float | None:
-        """Return the stamp (s) at which the vehicle was found on its known map; None before, and without one."""
+        """Return the stamp (s) at which the vehicle was found on its known map, if it was."""
         return self.drive.placed_at
 
     @property
