@@ -5,6 +5,7 @@ which is laid rigidly beside each place of the loop, and the best places are ref
 one is clearly better than all others, twice in a row, the window starts anew there.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
@@ -58,6 +59,9 @@ class Place:
         return bool(np.hypot(*apart) < APART)
 
 
+Choice = Callable[[list[Place] | None], RefinedMotion | None]
+
+
 class Search:
     """What a lost vehicle has seen, and the search for its place on a closed map."""
 
@@ -95,11 +99,15 @@ class Search:
         old = int(driven.searchsorted(driven[-1] - SEARCH_MEMORY))
         del self._poses[:old], self._seen[:old]
 
-    def find(self, smoother: CurveSmoother) -> RefinedMotion | None:
-        """Return the motion onto the only place that agrees, once it was found several times in a row."""
+    def find(self, smoother: CurveSmoother, choose: Choice | None = None) -> RefinedMotion | None:
+        """Return the motion onto the only place that agrees, once it was found several times in a row.
+
+        Of the places, the best first, `choose` returns the one that agrees, by default by their scores.
+        """
         if not self._seen or self._seen[-1].t - self._tried < SEARCH_INTERVAL:
             return None
-        best, last, newest = self._best(smoother), self._last, self._poses[-1][None, :2]
+        best = (choose or self._by_score)(self._places(smoother))
+        last, newest = self._last, self._poses[-1][None, :2]
         self._tried, self._last = self._seen[-1].t, None if best is None else best.motion
         if best is None:
             return None
@@ -118,8 +126,8 @@ class Search:
         """Return whether no place of the map agrees with what was seen, several times in a row."""
         return self._missed >= CONFIRMATIONS
 
-    def _best(self, smoother: CurveSmoother) -> RefinedMotion | None:
-        """Return the motion onto the place that is clearly better than all others, if there is one."""
+    def _places(self, smoother: CurveSmoother) -> list[Place] | None:
+        """Return the likeliest places, the best first; None where too little was seen."""
         seen = self._sightings()
         if len(seen.rows) < MIN_DETECTIONS:
             return None
@@ -128,7 +136,12 @@ class Search:
         centre = self._poses[-1][:2]
         starts = [(Motion(centre, vector), i) for vector, i in self._starts(loop, seen)]
         places = [self._refined(state, loop, seen, start, i) for start, i in starts]
-        places.sort(key=lambda place: -place.score)
+        return sorted(places, key=lambda place: -place.score)
+
+    def _by_score(self, places: list[Place] | None) -> RefinedMotion | None:
+        """Return the motion onto the place that is clearly better than all others, if there is one."""
+        if places is None:
+            return None
         if not places or places[0].score < MIN_SCORE:
             self._missed += 1
             return None

@@ -1,5 +1,6 @@
 """A known map: the vehicle's place on it is searched, while a road of its own is mapped."""
 
+from functools import partial
 from typing import Final, Self
 
 import numpy as np
@@ -11,8 +12,8 @@ from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, Health
 from pathspace_graph.lengths import joined
-from pathspace_graph.mapping.constellation import LAID_NEWEST, Constellation, Expected, Laid, lay
-from pathspace_graph.mapping.registration import Motion
+from pathspace_graph.mapping.constellation import LAID_NEWEST, Constellation, Expected, lay
+from pathspace_graph.mapping.registration import Motion, RefinedMotion
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -21,11 +22,14 @@ from .drive import Drive, Phase, Step
 from .known_loop import evidence_of
 from .lap_solver import Outcome
 from .open import Open
-from .relocalization import WIDENING, Search
+from .relocalization import Place, Search
 
 SEEKING: Final = "the vehicle is not found on the known map yet"  # reason of the health until then
 PLACED: Final = "the vehicle is found on the known map"  # notice of the cycle in which it is
 
+PLACES: Final = 4  # places by the curves on which the cones are laid
+ANYWHERE_CONES: Final = 12
+"""Least number of cones that tell a place anywhere on a map, twice as many as where odometry has it about."""
 NEAR: Final = Expected.within(8.0, 0.3, (2.0, 2.0, 0.1))
 """How far from the place that the curves tell the one that the cones tell may be."""
 
@@ -80,33 +84,34 @@ class Seeking:
 
         The cones must agree as well where those of the map are known.
         """
-        search = self._search
-        found = None if search is None else search.find(self._known)
-        if search is None or found is None:
+        search, by_cones = self._search, None
+        if search is None:
             return None
-        if self.start is not None or self._cones is None:
-            return found.motion, search.widened(found)
-        newest = road.poses[-1:].copy()
-        found.motion.move(newest)
-        laid = self._laid(road, drive, reading, newest[0], self._cones)
-        if laid is None or not laid.is_sure:
-            return None
-        moved = laid.pose - road.poses[-1]
-        covariance = np.asarray(WIDENING**2 * np.linalg.inv(laid.information), np.float64)
-        return Motion(road.poses[-1, :2].copy(), moved), covariance
+        if self.start is None and self._cones is not None:
+            by_cones = partial(self._by_cones, road, drive, reading, self._cones)
+        found = search.find(self._known, by_cones)
+        return None if found is None else (found.motion, search.widened(found))
 
-    def _laid(
-        self, road: Road, drive: Drive, reading: Reading, pose: Array, known: Constellation
-    ) -> Laid | None:
-        """Lay the newest cones on the known ones, near a pose (3,) of the known map."""
-        record, settings = drive.record, road.settings
-        if record.unsolvable is not None:
+    def _by_cones(
+        self, road: Road, drive: Drive, reading: Reading, known: Constellation, places: list[Place] | None
+    ) -> RefinedMotion | None:
+        """Return the motion onto the first of the best places at which the newest cones lie on known ones."""
+        record, newest = drive.record, road.poses[-1]
+        if not places or record.unsolvable is not None:
             return None
         poses = record.with_window(road)
         first = int(path_lengths(poses).searchsorted(path_lengths(poses)[-1] - LAID_NEWEST))
         table = record.seen_in(road.smoother.variables.sensor, reading.noise)(np.arange(first, len(poses)))
-        seen = Constellation.of(table, poses, settings.growth).seen_from(poses[-1])
-        return lay(seen, known, pose, NEAR.information, (NEAR.radius, NEAR.turn))
+        seen = Constellation.of(table, poses, road.settings.growth).seen_from(newest)
+        for place in places[:PLACES]:
+            pose = newest[None].copy()
+            place.found.motion.move(pose)
+            laid = lay(seen, known, pose[0], NEAR.information, (NEAR.radius, NEAR.turn))
+            if laid is not None and laid.is_sure and laid.count >= ANYWHERE_CONES:
+                motion = Motion(newest[:2].copy(), laid.pose - newest)
+                covariance = np.asarray(np.linalg.inv(laid.information), np.float64)
+                return RefinedMotion(motion, place.found.matches, covariance)
+        return None
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
         """Go on from a batch of the road of its own."""
