@@ -85,10 +85,10 @@ class KnownMap:
         return smoother
 
     def place_cones(self, track: CurveMap) -> None:
-        """Give a map whose curves are the known ones their cones."""
+        """Give a map whose curves are the known ones their cones; open ones need weak priors as they grow."""
         places = {label: cones[:, 0] for label, cones in self.cones.items() if len(cones)}
         stations = {label: cones.T for label, cones in self.cones.items()}
-        track.replaced_by({}, places, stations if len(places) == len(stations) else {})
+        track.replaced_by({}, places, stations if len(places) == len(stations) else {}, self.closed)
 
     @property
     def constellation(self) -> Constellation | None:

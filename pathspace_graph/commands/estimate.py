@@ -85,12 +85,12 @@ class Online:
         estimators.check_online(self.estimator)
         check_target(self.out, MAP_FILE)
         self._check_snapshots()
+        known = self._known()
         viewing = self._viewing()
         if viewing is not None:
             viewing.check_watchers(self)
         log, hints = read_plausible_log(self.log, self.settings.limits)
         tell(hints)
-        known = self._known()
         log, estimator = self._begin(log) if known is None else self._begin_on(known, log)
         with nullcontext([]) if viewing is None else viewing.watchers(self, log) as observers:
             result = of_kind(map_online(log, estimator, self.estimator, observers), self.map, self.settings)
@@ -150,6 +150,8 @@ class Online:
             raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {self.estimator}")
         if self.resume is not None:
             raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
+        if not 0.0 < self.map_sigma < np.inf:
+            raise SettingsError(f"--map-sigma: expected a positive number, found {self.map_sigma:g}")
         return read_known_map(self.on, self.map_sigma, self.settings)
 
     def _begin_on(self, known: KnownTrack, log: Log) -> tuple[Log, FixedLagMapper]:

@@ -35,6 +35,9 @@ JOIN_SHARE: Final = 0.5  # share of a short curve past which the seam lies
 OVERLAP_STEP: Final = 1.0  # step at which points of the overlap are placed on the beginning (m)
 OVERLAP_ROOM: Final = 4.0  # room about its expected place in which a point of the overlap is searched (m)
 SEAM_MARGIN: Final = 0.5  # distance from the seam below which a cone is one of the beginning (m)
+SIGMAS_CALIBRATIONS: Final = (0.05, 0.02, 0.03, 0.1, 0.05, 0.05, 0.2)
+"""Standard deviations of the calibrations where a known map is met: speeds and rates, then the sensor's yaw
+(rad), offset (m), latency (s), and scale and bias (m) of ranges. A map tells them all, its size as well."""
 FIRST_ROOM: Final = (
     2.0  # by which the first place beside a pose on an open curve may be farther than another (m)
 )
@@ -209,7 +212,7 @@ def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array)
     """
     smoother, state = road.smoother, road.smoother.map.state
     variables = state.variables
-    calibration = smoother.covariance(variables.calibration_keys)
+    sigmas = np.array(SIGMAS_CALIBRATIONS)[: len(variables.calibrations)]
     smoother.reactivate(with_prior=False)
     before, removed = state.poses[-1].copy(), state.map_keys
     road.move(as_pose(motion))
@@ -226,7 +229,8 @@ def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array)
         _locate_first(state)
     keys = np.concatenate([variables.calibration_keys, added, pose_keys(smoother.cycles[-1:])])
     mean = np.concatenate([variables.calibrations, points.ravel(), state.poses[-1]])
-    information = block_diag(*map(np.linalg.inv, (calibration, known.covariance, covariance)))
+    known_of = np.diag(sigmas**2), known.covariance, covariance
+    information = block_diag(*map(np.linalg.inv, known_of))
     set_prior(smoother, keys, mean, information)
     smoother.reassociate()
     for _ in range(road.settings.closing.iterations):

@@ -174,15 +174,16 @@ class MapRepair:
         """
         stretches, self._stretches = self._stretches, []
         smoother.refresh()
-        for stretch in stretches:
-            replace_stretch(smoother, stretch)
+        replaced = [stretch for stretch in stretches if replace_stretch(smoother, stretch)]
+        self.contradictions.clear()
+        if not replaced:
+            return ""
         smoother.reassociate()
         for _ in range(smoother.map.settings.closing.iterations):
             smoother.step(SIGMA_STEP)
         self._wait_until = 0.0
-        self.contradictions.clear()
-        names = [NAMES[label] for label in BOUNDARIES if any(one.label == label for one in stretches)]
-        count = sum(len(stretch.cones) for stretch in stretches)
+        names = [NAMES[label] for label in BOUNDARIES if any(one.label == label for one in replaced)]
+        count = sum(len(stretch.cones) for stretch in replaced)
         return f"{REPAIRED}: it is led through {count} other cones on the {' and on the '.join(names)}"
 
     def end(self, marginal: LapMarginal | None) -> str:
@@ -203,36 +204,40 @@ class MapRepair:
         return f"{REPAIRED}: {sum(explained)} more cones on the {' and on the '.join(names)} lie on it"
 
 
-def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> None:
-    """Lead a closed curve through the cones of a stretch, on its own knots.
+def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bool:
+    """Lead a closed curve through the cones of a stretch, on its own knots; return whether it can be.
 
     The control points there have a wide prior about their new places, and the cones there no stations.
     """
-    state, label = smoother.map.state, stretch.label
+    state, label, cones = smoother.map.state, stretch.label, stretch.cones
     boundary, points = state.boundaries[label], state.control_points(label)
-    u = boundary.find_anywhere(points, stretch.cones).u
-    around = np.angle(np.exp(2j * np.pi * u / boundary.length).mean()) * boundary.length / (2.0 * np.pi)
+    u = boundary.find_anywhere(points, cones).u
+    middle = np.angle(np.exp(2j * np.pi * u / boundary.length).mean()) * boundary.length / (2.0 * np.pi)
+    within = _beyond(u, middle, boundary.length)
+    low, high = within.min() - ROW, within.max() + ROW
 
-    def beyond(at: Array) -> Array:
-        """Return parameters by their distances from the middle of the stretch."""
-        half = 0.5 * boundary.length
-        return np.asarray(np.mod(at - around + half, boundary.length) - half)
+    def is_there(at: Array) -> BoolArray:
+        beyond = _beyond(at, middle, boundary.length)
+        return np.asarray((beyond > low) & (beyond < high))
 
-    low, high = beyond(u).min() - ROW, beyond(u).max() + ROW
-    moved = np.flatnonzero((beyond(boundary.abscissae) > low) & (beyond(boundary.abscissae) < high))
-    every = np.arange(boundary.tables.low, boundary.tables.high, 1.0)
-    held = every[(beyond(every) <= low) | (beyond(every) >= high)]
-    at = np.concatenate([u, held])
-    targets = np.concatenate([stretch.cones, boundary.evaluate(points, held)])
-    basis = np.zeros((len(at), boundary.size))
-    (values,), span = boundary.tables.evaluate(at)
-    np.put_along_axis(basis, boundary.columns(span), values, axis=1)
-    off = targets - boundary.evaluate(points, at)
-    bend = np.diff(np.eye(len(moved)), 2, axis=0) * BEND
-    matrix = np.concatenate([basis[:, moved], bend])
-    change = np.linalg.lstsq(matrix, np.concatenate([off, np.zeros((len(bend), 2))]), rcond=None)[0]
+    moved, every = np.flatnonzero(is_there(boundary.abscissae)), np.arange(*boundary.ends, SAMPLE)
+    held = every[~is_there(every)]
+    at, targets = np.append(u, held), np.concatenate([cones, boundary.evaluate(points, held)])
+    basis = boundary.basis(at)[:, moved]
+    bend = BEND * np.diff(np.eye(len(moved)), 2, axis=0)
+    off = np.concatenate([targets - boundary.evaluate(points, at), np.zeros((len(bend), 2))])
+    change = np.linalg.lstsq(np.concatenate([basis, bend]), off, rcond=None)[0]
+    left = np.hypot(*(off[: len(u)] - basis[: len(u)] @ change).T)
+    if np.count_nonzero(left < REPAIR_BESIDE) < EXPLAINED * len(u):
+        return False
     place_again(smoother, state.keys(label)[moved], points[moved] + change, REPLACED)
-    smoother.map.forget_cones(label, lambda at: (beyond(at) > low) & (beyond(at) < high))
+    smoother.map.forget_cones(label, is_there)
+    return True
+
+
+def _beyond(u: Array, middle: float, length: float) -> Array:
+    """Return how far parameters of a closed curve are beyond one of them (m)."""
+    return np.asarray(np.mod(u - middle + 0.5 * length, length) - 0.5 * length)
 
 
 def carried(points: Array, before: Array, after: Array) -> Array:

@@ -95,7 +95,7 @@ class Seeking:
     def _by_cones(
         self, road: Road, drive: Drive, reading: Reading, known: Constellation, places: list[Place] | None
     ) -> RefinedMotion | None:
-        """Return the motion onto the first of the best places at which the newest cones lie on known ones."""
+        """Return the motion onto the only one of the best places where the newest cones lie on known ones."""
         record, newest = drive.record, road.poses[-1]
         if not places or record.unsolvable is not None:
             return None
@@ -103,15 +103,19 @@ class Seeking:
         first = int(path_lengths(poses).searchsorted(path_lengths(poses)[-1] - LAID_NEWEST))
         table = record.seen_in(road.smoother.variables.sensor, reading.noise)(np.arange(first, len(poses)))
         seen = Constellation.of(table, poses, road.settings.growth).seen_from(newest)
-        for place in places[:PLACES]:
+        chosen, agree = list[Place](), list[RefinedMotion]()
+        for place in places:
+            if len(chosen) == PLACES or any(place.is_near(other) for other in chosen):
+                continue
+            chosen.append(place)
             pose = newest[None].copy()
             place.found.motion.move(pose)
             laid = lay(seen, known, pose[0], NEAR.information, (NEAR.radius, NEAR.turn))
             if laid is not None and laid.is_sure and laid.count >= ANYWHERE_CONES:
                 motion = Motion(newest[:2].copy(), laid.pose - newest)
                 covariance = np.asarray(np.linalg.inv(laid.information), np.float64)
-                return RefinedMotion(motion, place.found.matches, covariance)
-        return None
+                agree.append(RefinedMotion(motion, place.found.matches, covariance))
+        return agree[0] if len(agree) == 1 else None
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
         """Go on from a batch of the road of its own."""

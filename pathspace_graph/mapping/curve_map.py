@@ -123,16 +123,29 @@ class CurveMap:
         self.state.drop_oldest_pose_u()
 
     def replaced_by(
-        self, scatter: dict[int, Array], cones: dict[int, Array], stations: dict[int, Array]
+        self,
+        scatter: dict[int, Array],
+        cones: dict[int, Array],
+        stations: dict[int, Array],
+        held_by_prior: bool = True,
     ) -> None:
         """Note that curves and prior are a batch's, with the scatter and the places of cones by label.
 
         Stations (2, k) are parameters of cones and their standard deviations along the curves (m), if any.
         """
-        self.held_by_prior, self.scatter, self.cones = True, scatter, cones
+        self.held_by_prior, self.scatter, self.cones = held_by_prior, scatter, cones
         self.stations = None
         if stations:
-            u, sigma = ({label: own[k] for label, own in stations.items()} for k in (0, 1))
+            u = {curve.label: curve.u for curve in self.stations.curves}
+            sigma = {curve.label: curve.sigma for curve in self.stations.curves}
+            self.stations = Stations.of(self.state, u, sigma)
+
+    def lay_stations_out(self) -> None:
+        """Lay the stations out anew, since control points are in other rows once an open curve has grown."""
+        if self.stations is not None:
+            u, sigma = (
+                {curve.label: getattr(curve, k) for curve in self.stations.curves} for k in ("u", "sigma")
+            )
             self.stations = Stations.of(self.state, u, sigma)
 
     def placed_cones(self, label: int) -> Array:

@@ -143,7 +143,7 @@ def test_the_map_is_the_prior_and_what_is_seen_refines_it() -> None:
     keys = np.concatenate([mapper.control_keys(label) for label in (LEFT, RIGHT)])
     after = mapper.marginal_covariance(keys.tolist())
     assert np.sqrt(np.diag(after)).max() < 1.01 * np.hypot(SIGMA, FLOOR)
-    assert np.median(np.sqrt(np.diag(after))) < 0.8 * SIGMA
+    assert np.median(np.sqrt(np.diag(after))) < 0.9 * SIGMA
 
 
 def test_a_map_that_is_kept_stays_as_it_is() -> None:
