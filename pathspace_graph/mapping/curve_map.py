@@ -142,11 +142,11 @@ class CurveMap:
 
     def lay_stations_out(self) -> None:
         """Lay the stations out anew, since control points are in other rows once an open curve has grown."""
-        if self.stations is not None:
-            u, sigma = (
-                {curve.label: getattr(curve, k) for curve in self.stations.curves} for k in ("u", "sigma")
-            )
-            self.stations = Stations.of(self.state, u, sigma)
+        if self.stations is None:
+            return
+        u = {curve.label: curve.u for curve in self.stations.curves}
+        sigma = {curve.label: curve.sigma for curve in self.stations.curves}
+        self.stations = Stations.of(self.state, u, sigma)
 
     def placed_cones(self, label: int) -> Array:
         """Return the cones (k, 2) that hold detections along a curve: parameters and sigmas along it (m)."""
