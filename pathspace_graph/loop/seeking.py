@@ -30,6 +30,8 @@ PLACED: Final = "the vehicle is found on the known map"  # notice of the cycle i
 PLACES: Final = 4  # places by the curves on which the cones are laid
 ANYWHERE_CONES: Final = 12
 """Least number of cones that tell a place anywhere on a map, twice as many as where odometry has it about."""
+ANYWHERE_PATH: Final = 20.0
+"""Least length of the path driven (m): two roads of one width and spacing may be alike for a bend."""
 NEAR: Final = Expected.within(8.0, 0.3, (2.0, 2.0, 0.1))
 """How far from the place that the curves tell the one that the cones tell may be."""
 
@@ -97,7 +99,7 @@ class Seeking:
     ) -> RefinedMotion | None:
         """Return the motion onto the only one of the best places where the newest cones lie on known ones."""
         record, newest = drive.record, road.poses[-1]
-        if not places or record.unsolvable is not None:
+        if not places or record.unsolvable is not None or road.path.length < ANYWHERE_PATH:
             return None
         poses = record.with_window(road)
         first = int(path_lengths(poses).searchsorted(path_lengths(poses)[-1] - LAID_NEWEST))

@@ -136,8 +136,7 @@ class CurveMap:
         self.held_by_prior, self.scatter, self.cones = held_by_prior, scatter, cones
         self.stations = None
         if stations:
-            u = {curve.label: curve.u for curve in self.stations.curves}
-            sigma = {curve.label: curve.sigma for curve in self.stations.curves}
+            u, sigma = ({label: own[k] for label, own in stations.items()} for k in (0, 1))
             self.stations = Stations.of(self.state, u, sigma)
 
     def lay_stations_out(self) -> None:
