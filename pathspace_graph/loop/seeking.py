@@ -11,6 +11,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, Health
+from pathspace_graph.io.map import Map
 from pathspace_graph.lengths import joined
 from pathspace_graph.mapping.constellation import LAID_NEWEST, Constellation, Expected, lay
 from pathspace_graph.mapping.registration import Motion, RefinedMotion
@@ -41,8 +42,10 @@ class Seeking:
 
     uses_detections = True
 
-    def __init__(self, settings: MapperSettings, known: KnownMap, start: Array | None = None) -> None:
-        self.known = known
+    def __init__(
+        self, settings: MapperSettings, track: Map, start: Array | None = None, keep: bool = False
+    ) -> None:
+        self.known = known = KnownMap.of(track, keep)
         self.start = start  # pose (3,) of the known map at which the drive began, if it is known
         self.own: Phase = Open(settings)
         self._known = known.smoother(settings)

@@ -33,8 +33,7 @@ class Growth:
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
         self.tentative = {label: TentativeTracks(settings) for label in BOUNDARIES}  # unexplained cones
-        self.known: Mapping[int, float] = {}
-        """Ends of curves that were known before the drive (m): they grow where the vehicle is there."""
+        self._known: Mapping[int, float] = {}  # ends of curves that were known before the drive (m)
         self._full: frozenset[int] = frozenset()  # boundaries that have stopped growing
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
 
@@ -69,6 +68,10 @@ class Growth:
         stopped = sorted(self._full - full)
         return frozenset(grown), joined(_stopped(smoother.map, label) for label in stopped)
 
+    def wait_for(self, ends: Mapping[int, float]) -> None:
+        """Let known curves grow only once the vehicle is at their ends (m), by label."""
+        self._known = ends
+
     def move(self, motion: Array) -> None:
         for tracks in self.tentative.values():
             tracks.move(motion)
@@ -79,7 +82,7 @@ class Growth:
 
     def _waits(self, state: State, label: int) -> bool:
         """Return whether the vehicle is far from the end of a known curve."""
-        at_end = self.known.get(label, -np.inf) - self.settings.reach
+        at_end = self._known.get(label, -np.inf) - self.settings.reach
         return bool(state.pose_u[label][-1] < at_end)
 
     def _begin(self, track: CurveMap, label: int, path_ahead: PathAhead) -> None:
@@ -197,7 +200,7 @@ class Growth:
 
     def _is_full(self, track: CurveMap, label: int, path_ahead: PathAhead) -> bool:
         boundary = track.state.boundaries[label]
-        longest = self.known.get(label, 0.0) + LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
+        longest = self._known.get(label, 0.0) + LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
         is_full = boundary.size >= self.settings.max_size or boundary.confirmed_end >= longest
         if is_full:
             self._full |= {label}

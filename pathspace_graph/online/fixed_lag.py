@@ -8,7 +8,6 @@ from typing import Self
 import gtsam
 import numpy as np
 
-from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
@@ -92,9 +91,10 @@ class FixedLagMapper(MapperEstimate):
         SettingsError is raised for a map without both curves or without covariances.
         """
         mapper = cls(settings, odometry_sigma)
-        known = KnownMap.of(scaled(track, 1.0 / mapper.scale), keep)
-        pose = None if start is None else times(np.array(start, float), POSE_LENGTHS, 1.0 / mapper.scale)
-        mapper.phase = Seeking(mapper.settings, known, pose)
+        known, pose = scaled(track, 1.0 / mapper.scale), None
+        if start is not None:
+            pose = times(np.array(start, float), POSE_LENGTHS, 1.0 / mapper.scale)
+        mapper.phase = Seeking(mapper.settings, known, pose, keep)
         return mapper
 
     def update(
