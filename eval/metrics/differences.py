@@ -6,9 +6,10 @@ from typing import ClassVar, Final
 import numpy as np
 from scipy.spatial import KDTree
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import NAMES
-from pathspace_graph.spline.boundary import sampled
+from pathspace_graph.spline.bspline import BSpline
 
 DIFFERENT: Final = 0.5  # distance of both curves from which on they differ (m): more than a refinement
 STEP: Final = 0.5  # step at which a curve is compared (m)
@@ -36,14 +37,19 @@ class MapDifference:
         return f"the {self.boundary} boundary is {off} on {self.length:.0f} m, {place}"
 
 
+def _spaced(spline: BSpline, step: float) -> Array:
+    """Return points (n, 2) along a curve, about this step (m) apart."""
+    return spline.evaluate(np.linspace(*spline.domain, int(spline.length() / step) + 2))
+
+
 def differences(known: Map, found: Map) -> list[MapDifference]:
     """Return the stretches of a found map that lie beside those of the known one, at scale 1."""
     stretches = list[MapDifference]()
     for label, spline in found.splines.items():
         if label not in known.splines:
             continue
-        points = sampled(spline, STEP)
-        away = np.asarray(KDTree(sampled(known.splines[label], 0.1 * STEP)).query(points)[0])
+        points = _spaced(spline, STEP)
+        away = np.asarray(KDTree(_spaced(known.splines[label], 0.1 * STEP)).query(points)[0])
         differs = away > DIFFERENT
         begins = np.flatnonzero(differs & ~np.append(False, differs[:-1]))
         for begin in begins.tolist():

@@ -11,7 +11,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.graph.variables import POINT
-from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.io.map import NO_CONES, Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.constellation import Constellation
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -39,9 +39,10 @@ class KnownMap:
     kept: bool  # whether the map is held as it is
 
     @classmethod
-    def of(cls, track: Map, keep: bool = False) -> Self:
+    def of(cls, track: Map, keep: bool = False, lines: tuple[int, ...] = ()) -> Self:
         """Return the known map of a map with both curves; `keep` holds it as it is.
 
+        The cones of boundaries of which the sensor sees `lines` tell nothing.
         SettingsError is raised for a map without both curves or without covariances.
         """
         boundaries = track.curves("a known map")
@@ -54,7 +55,7 @@ class KnownMap:
             splines[label], change = _floating(boundary.spline)
             changes.append(np.kron(change, np.eye(POINT)))
             confirmed[label] = min(boundary.confirmed_until, boundary.spline.domain[1])
-            cones[label] = boundary.cones
+            cones[label] = NO_CONES if label in lines else boundary.cones
         T = block_diag(*changes)
         floor = FLOOR**2 * np.eye(len(T))
         joint = KEPT**2 * np.eye(len(T)) if keep else T @ covariance @ T.T + floor

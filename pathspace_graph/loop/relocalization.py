@@ -106,7 +106,7 @@ class Search:
         """
         if not self._seen or self._seen[-1].t - self._tried < SEARCH_INTERVAL:
             return None
-        best = (choose or self._by_score)(self._places(smoother))
+        best = (choose or self.by_score)(self._places(smoother))
         last, newest = self._last, self._poses[-1][None, :2]
         self._tried, self._last = self._seen[-1].t, None if best is None else best.motion
         if best is None:
@@ -138,7 +138,7 @@ class Search:
         places = [self._refined(state, loop, seen, start, i) for start, i in starts]
         return sorted(places, key=lambda place: -place.score)
 
-    def _by_score(self, places: list[Place] | None) -> RefinedMotion | None:
+    def by_score(self, places: list[Place] | None) -> RefinedMotion | None:
         """Return the motion onto the place that is clearly better than all others, if there is one."""
         if places is None:
             return None

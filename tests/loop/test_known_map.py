@@ -23,7 +23,7 @@ from pathspace_graph.loop.closed import Closed
 from pathspace_graph.loop.map_repair import REPAIRED
 from pathspace_graph.loop.open import Open
 from pathspace_graph.loop.seeking import PLACED, SEEKING, OnOpenMap, Seeking
-from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.online.fixed_lag import FixedLagMapper, _Before
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import acceleration, skidpad, to_map_frame
@@ -214,6 +214,19 @@ def test_a_saved_mapper_goes_on_to_the_same_map(tmp_path: Path) -> None:
             np.testing.assert_array_equal(mapper.control_points(label), restored.control_points(label))
         np.testing.assert_array_equal(mapper.poses, restored.poses)
     assert phases == [Seeking, Seeking, Closed]
+
+
+def test_a_failed_cycle_is_taken_back_whole() -> None:
+    """A mapper that is given back what it was before each cycle ends with the bits of one that is not."""
+    log = laps_log(pear_track())
+    ways = [FixedLagMapper.on(pear_map(), None, ODOMETRY_SIGMA) for _ in range(2)]
+    for cycle in islice(split_odometry(log), 90):
+        ways[1]._go_back(_Before.of(ways[1]))
+        for mapper in ways:
+            mapper.update(*cycle, strict=True)
+    assert [type(mapper.phase) for mapper in ways] == [Closed, Closed]
+    np.testing.assert_array_equal(ways[0].poses, ways[1].poses)
+    np.testing.assert_array_equal(ways[0].control_points(LEFT), ways[1].control_points(LEFT))
 
 
 def test_a_failed_search_leaves_the_road_alone() -> None:
