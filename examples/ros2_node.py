@@ -9,6 +9,7 @@ docs/ros2.md has the topics, frames and QoS.
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from pathspace_graph.convert.settings import Frames
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import write_json
 from pathspace_graph.io.log import SIGMA_ODOMETRY
-from pathspace_graph.io.map import MAP_FILE, map_to_json
+from pathspace_graph.io.map import MAP_FILE, map_to_json, read_map
 from pathspace_graph.run import CycleResult
 
 Array = NDArray[np.float64]
@@ -42,8 +43,13 @@ LINE_STRIP = 4
 class Bridge:
     """Hands ROS messages to a mapper, which no message can stop."""
 
-    def __init__(self, mounting: tuple[float, float, float] = (0.0, 0.0, 0.0), wait: float = 0.0) -> None:
-        self.mapper = FixedLagMapper(odometry_sigma=np.array(SIGMA_ODOMETRY))
+    def __init__(
+        self, mounting: tuple[float, float, float] = (0.0, 0.0, 0.0), wait: float = 0.0, known: str = ""
+    ) -> None:
+        """Begin a map, or on a `known` one, that of a folder."""
+        sigma = np.array(SIGMA_ODOMETRY)
+        on = partial(FixedLagMapper.on, read_map(known)) if known else FixedLagMapper
+        self.mapper: FixedLagMapper = on(odometry_sigma=sigma)
         self.stream = MessageStream(Frames(mounting), wait)
 
     def update(self, message: Any, received: float) -> CycleResult | None:
@@ -101,13 +107,13 @@ def main() -> None:
     from rclpy.executors import ExternalShutdownException
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import PointCloud2
-    from std_msgs.msg import Header
+    from std_msgs.msg import Header, String
     from visualization_msgs.msg import Marker, MarkerArray
 
     rclpy.init()
     node = rclpy.create_node("pathspace_graph")
     mounting, wait = node.declare_parameter("mounting", [0.0] * 3), node.declare_parameter("wait", 0.0)
-    bridge = Bridge(tuple(mounting.value), wait.value)
+    bridge = Bridge(tuple(mounting.value), wait.value, node.declare_parameter("map", "").value)
     kind = MarkerArray if node.declare_parameter("markers", False).value else PointCloud2
     to_map, to_ahead = (node.create_publisher(MarkerArray, f"~/{name}", 1) for name in ("map", "ahead"))
     to_path, path = node.create_publisher(PathMessage, "~/path", 1), PathMessage()
@@ -137,6 +143,7 @@ def main() -> None:
     deep, short = (QoSProfile(depth=n, reliability=ReliabilityPolicy.BEST_EFFORT) for n in (100, 10))
     node.create_subscription(Odometry, "odometry", take_odometry, deep)
     node.create_subscription(kind, "detections", take_detections, short)
+    node.create_subscription(String, "~/save", lambda message: bridge.save(Path(message.data)), 1)
     try:
         with suppress(KeyboardInterrupt, ExternalShutdownException), threadpool_limits(limits=1):
             rclpy.spin(node)

@@ -147,10 +147,15 @@ def check_batch(name: str) -> None:
 def make_online(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> OnlineEstimator:
     """Return an online estimator for a log, which tells the scale where the settings leave it open."""
     check_online(name)
-    settings = known_settings(settings)
-    settings = with_kind(replace(settings, scale=chosen_scale(settings, log)), log)
-    made: OnlineEstimator = _make(ONLINE[name], settings, log.noise, parameters or parameters_of(name))
+    own = parameters or parameters_of(name)
+    made: OnlineEstimator = _make(ONLINE[name], settings_of(settings, log), log.noise, own)
     return made
+
+
+def settings_of(settings: MapperSettings, log: Log) -> MapperSettings:
+    """Return settings with what they leave open and a log tells: the scale, and the kind of the sensor."""
+    settings = known_settings(settings)
+    return with_kind(replace(settings, scale=chosen_scale(settings, log)), log)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> BatchEstimator:

@@ -34,6 +34,13 @@ class Track:
         return curves.fit_centre_line(self.left, self.right, self.closed, self.start[:2])
 
     @property
+    def rows(self) -> tuple[FloatArray, FloatArray]:
+        """The cones of the left and of the right boundary as they are passed, those of each round anew."""
+        if self.closed or self.path is None:
+            return self.left, self.right
+        return _passed(self.left, self.path), _passed(self.right, self.path)
+
+    @property
     def cones(self) -> FloatArray:
         return np.vstack([self.left, self.right, self.other])
 
@@ -41,6 +48,21 @@ class Track:
     def cone_labels(self) -> IntArray:
         other = np.full(len(self.other), UNKNOWN) if self.other_labels is None else self.other_labels
         return np.concatenate([np.repeat([LEFT, RIGHT], [len(self.left), len(self.right)]), other])
+
+
+def _passed(cones: FloatArray, path: FloatArray) -> FloatArray:
+    """Return the cones (n, 2) beside a path (k, 2), in the order in which it passes them, some repeatedly."""
+    apart = np.linalg.norm(cones[:, None] - path, axis=2)
+    beside = apart < BESIDE * np.median(apart.min(axis=1))
+    passes = list[tuple[int, int]]()
+    for cone, near in enumerate(beside):
+        begins = np.flatnonzero(near & ~np.append(False, near[:-1]))
+        ends = np.flatnonzero(near & ~np.append(near[1:], False)) + 1
+        passes += [
+            (b + int(apart[cone, b:e].argmin()), cone)
+            for b, e in zip(begins.tolist(), ends.tolist(), strict=True)
+        ]
+    return cones[[cone for _, cone in sorted(passes)]]
 
 
 def to_map_frame(track: Track) -> Track:
@@ -54,6 +76,7 @@ def to_map_frame(track: Track) -> Track:
     return replace(track, **moved, start=np.zeros(3))
 
 
+BESIDE: Final = 2.0  # distance of a cone from a path that passes it, at most, by the median of the nearest
 LANE: Final = 3.0  # width of the road in both events (m)
 CIRCLES: Final = 18.25  # distance of the centres of the skidpad's circles (m)
 INNER: Final = 15.25 / 2  # radius of the circle of inner cones (m)

@@ -55,6 +55,7 @@ def plot_map(
     trajectory: Array | None = None,
     smoothed: Array | None = None,
     health: Sequence[str] = (),
+    differences: Sequence[tuple[float, float]] = (),
     band_scale: float = 1.0,
     title: str | None = None,
 ) -> Picture:
@@ -63,6 +64,7 @@ def plot_map(
     `log` adds the true cones and the true path where it has truth; trajectory (n, 3) or (n, 2), map frame.
     It is drawn in another colour where the `health` of its n cycles is not good. Beside a `smoothed` one
     (n, 3) it is drawn thin, as the poses that were estimated at their time.
+    The `differences` are places that are not where a known map has them, each marked by a cross.
     The legend says so where a `band_scale` other than 1 draws the band wider than it is.
     """
     if not band_scale > 0.0:
@@ -75,6 +77,9 @@ def plot_map(
             draw_boundary(axes, boundary, label, WHOLE_TRACK, band_scale)
         for label, cones in sorted(track.points.items()):
             draw_orange(axes, cones.points, label, WHOLE_TRACK)
+        if len(differences):
+            places = np.array(differences)
+            style.draw_points(axes, places, "x", PURPLE, "not as the known map", markersize=5.0, zorder=4.6)
         if log is not None and log.truth is not None:
             draw_truth(axes, log.truth, WHOLE_TRACK)
         if smoothed is not None and trajectory is not None and len(smoothed):

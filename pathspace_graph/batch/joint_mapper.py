@@ -179,7 +179,7 @@ class _Joint:
         few = simplified(state, system.detections, settings)
         joint = few.change @ joint @ few.change.T
         watch.lap("simplify")
-        track = replace(map_of(few, joint), points=self._orange())
+        track = replace(map_of(few, joint, settings), points=self._orange())
         drives, frames = dict[str, BatchResult](), dict[str, Array]()
         for d, (one, part) in enumerate(zip(self.placed, system.drives.parts(len(state.poses)), strict=True)):
             poses, seconds = state.poses[part], sum(watch.laps.values()) / len(self.placed)

@@ -173,7 +173,7 @@ class BatchMapper:
         return BatchResult(
             estimator=NAME,
             settings=settings_dict(given),
-            map=replace(map_of(few, joint), points=_orange(judged, at.state)),
+            map=replace(map_of(few, joint, settings), points=_orange(judged, at.state)),
             scatter=few.scatter,
             trajectory_t=judged.chain.stamps,
             trajectory=at.state.poses.copy(),
@@ -295,14 +295,17 @@ def vehicle_of(state: State, known: FactoredSystem, settings: MapperSettings, dr
     return VehicleState.split(pose, calibrations, covariance)
 
 
-def map_of(few: Simplified, joint: Array) -> Map:
-    """Return the curves with their covariance, to which the scatter of the cones is added."""
+def map_of(few: Simplified, joint: Array, settings: MapperSettings) -> Map:
+    """Return the curves with their covariance, to which the scatter of the cones is added, and the cones."""
     state, boundaries = few.state, {}
+    has_cones = state.closed and not settings.lines
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
         sigma = np.repeat(few.scatter.of_control_points(label, boundary), 2)
         covariance = joint[block, block] + np.diag(sigma**2)
-        boundaries[label] = SplineBoundary(state.spline(label), covariance)
+        u = few.scatter.places[label] if has_cones else np.zeros(0)
+        cones = np.column_stack([u, np.full(len(u), settings.spline.sigma_shape)])
+        boundaries[label] = SplineBoundary(state.spline(label), covariance, cones=cones)
     return Map(state.closed, boundaries, joint_covariance(joint, boundaries))
 
 

@@ -43,6 +43,8 @@ from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings
 from pathspace_graph.spline.crossing import crossings_told
 
+from .known import MAP_SIGMA, KnownTrack, read_known_map
+
 MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or one centre line with a width
 Run = TypeVar("Run", bound=RunResult)
 NOT_TRUSTED: Final = 3  # exit code of a result that is written, but is not the optimum or no map of the drive
@@ -60,6 +62,14 @@ class Online:
     """Name of the online estimator."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
+    on: Path | None = None
+    """Known map on which the vehicle drives: a map's folder, a track file, `skidpad` or `acceleration`."""
+    start: tuple[float, float, float] | None = None
+    """Pose X Y HEADING (m, m, rad) on the known map near which the drive begins; by default anywhere."""
+    keep_map: FlagCreatePairsOff[bool] = False
+    """Hold the known map as it is, and only localize."""
+    map_sigma: float = MAP_SIGMA
+    """Standard deviation of the cones of a track file, m."""
     save: Path | None = None
     """File to which the mapper is saved at the end, for `--resume`; only `fixed-lag` can be saved."""
     resume: Path | None = None
@@ -79,22 +89,29 @@ class Online:
         estimators.check_online(self.estimator)
         check_target(self.out, MAP_FILE)
         self._check_snapshots()
+        known = self._known()
         viewing = self._viewing()
         if viewing is not None:
             viewing.check_watchers(self)
         log, hints = read_plausible_log(self.log, self.settings.limits)
         tell(hints)
-        log, estimator = self._begin(log)
+        log, estimator = self._begin(log) if known is None else self._begin_on(known, log)
         with nullcontext([]) if viewing is None else viewing.watchers(self, log) as observers:
             result = of_kind(map_online(log, estimator, self.estimator, observers), self.map, self.settings)
-            write_result(self.out, result, summarize(result, log, hints))
+            differ = [] if known is None else known.differences(result, estimator)
+            told = {} if known is None else known.summary(estimator, differ)
+            write_result(self.out, result, summarize(result, log, hints) | told)
         if self.save is not None and isinstance(estimator, FixedLagMapper):
             estimator.save(self.save)
         report(result, log)
         written = [str(path) for path in (self.out, self.save_view, self.animate) if path is not None]
         say(f"written to {', '.join(written)}")
         crossed = crossings_told(crossings_of(result))
-        end_untrusted([f"not a map of the drive: {crossed}"] if crossed else [])
+        wrong = [f"not a map of the drive: {crossed}"] if crossed else []
+        say(*(one.line for one in differ))
+        if known is not None and known.found_at(estimator) is None:
+            wrong.append(f"the vehicle was not found on {self.on}: this is the map of its own road")
+        end_untrusted(wrong)
 
     def _viewing(self) -> Any:
         """Return the module of viewers and films if one is asked for; importing matplotlib is slow."""
@@ -125,6 +142,28 @@ class Online:
             expected = f"expected cycles after {times[-1]:g} s, where {self.resume} ends"
             raise InputError(self.log, f"{expected}, found none")
         return replace(log, cycles=cycles), mapper
+
+    def _known(self) -> KnownTrack | None:
+        """Return the known map that is asked for; SettingsError where options contradict each other."""
+        if self.on is None:
+            for option, is_given in (("start", self.start is not None), ("keep-map", self.keep_map)):
+                if is_given:
+                    raise SettingsError(f"--{option}: expected --on MAP as well, found none")
+            return None
+        if self.estimator != DEFAULT_ONLINE:
+            raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {self.estimator}")
+        if self.resume is not None:
+            raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
+        if not 0.0 < self.map_sigma < np.inf:
+            raise SettingsError(f"--map-sigma: expected a positive number, found {self.map_sigma:g}")
+        return read_known_map(self.on, self.map_sigma, self.settings)
+
+    def _begin_on(self, known: KnownTrack, log: Log) -> tuple[Log, FixedLagMapper]:
+        """Return a mapper on a known map, and the log without its truth, which is in another frame."""
+        settings = estimators.settings_of(self.settings, log)
+        start = known.start if self.start is None else np.array(self.start)
+        mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=self.keep_map)
+        return replace(log, truth=None), mapper
 
 
 @dataclass(frozen=True, kw_only=True)

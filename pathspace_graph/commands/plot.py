@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from tyro.conf import Positional
@@ -16,7 +16,10 @@ from pathspace_graph.io.files import check_file_target
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
+from pathspace_graph.io.parsing import read_json
 from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
+
+SUMMARY_FILE: Final = "summary.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +49,14 @@ class Plot:
         cycles = read_cycles(self.map) if (self.map / CYCLES_FILE).exists() else {}
         look: dict[str, Any] = {"band_scale": self.band_scale, "title": self.title}
         look |= {"trajectory": trajectory, "smoothed": smoothed, "health": [*cycles.get("health", [])]}
+        look["differences"] = _differences(self.map / SUMMARY_FILE)
         save_plot(plot_map(track, log=log, **look), self.out)
+
+
+def _differences(file: Path) -> list[tuple[float, float]]:
+    """Return the places (m) at which a map differs from the one that was known, by its summary."""
+    summary = read_json(file, "a summary") if file.exists() else {}
+    return [(one["x"], one["y"]) for one in summary.get("differences", [])]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -97,6 +97,19 @@ def merge_points(smoother: Smoother, removed: IntArray, kept: IntArray) -> None:
     smoother.window.clear()
 
 
+def place_again(smoother: Smoother, keys: IntArray, points: Array, sigma: float) -> None:
+    """Move map points (k,) of a closed map to `points` (k, 2), and forget what was known of them.
+
+    They have a prior with a standard deviation sigma (m) about their new places.
+    """
+    smoother.remove_information(keys)
+    variables = smoother.variables
+    variables.values[variables.layout.entries(keys)] = points.ravel()
+    root = np.eye(points.size) / sigma
+    smoother.prior = graph_of(smoother.prior, absolute_factor(keys, root, variables))
+    smoother.window.clear()
+
+
 # --- another prior ---------------------------------------------------------------------------------------
 
 

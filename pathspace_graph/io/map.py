@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
 NO_COVARIANCE: Final[Array] = np.zeros((0, 0))  # none was asked for; it can't be written
+NO_CONES: Final[Array] = np.zeros((0, 2))  # none is known by its place
 _SYMMETRY_TOLERANCE = 1e-9  # largest |P - P^T| over max|P| of a covariance that is symmetric to rounding
 _NEGATIVE_TOLERANCE = 1e-9  # most negative eigenvalue over the largest one of P >= 0, to rounding
 
@@ -34,7 +35,7 @@ _NEGATIVE_TOLERANCE = 1e-9  # most negative eigenvalue over the largest one of P
 class SplineBoundary(Brief):
     """A boundary as a B-spline."""
 
-    LENGTHS: ClassVar = {"spline": 0, "covariance": 2, "confirmed_until": 1}
+    LENGTHS: ClassVar = {"spline": 0, "covariance": 2, "confirmed_until": 1, "cones": 1}
 
     spline: BSpline
     """Curve in the map frame, in the direction of travel."""
@@ -42,6 +43,8 @@ class SplineBoundary(Brief):
     """Joint covariance (2m, 2m) in m^2 of the distinct control points, in the order x0, y0, x1 and so on."""
     confirmed_until: float = math.inf
     """Parameter up to which the curve is confirmed; beyond, it is tentative, and may be taken back."""
+    cones: Array = field(default_factory=NO_CONES.copy)
+    """Cones (k, 2) on the curve whose places are known: parameters, and standard deviations along it (m)."""
 
     @property
     def size(self) -> int:
@@ -203,12 +206,14 @@ def _boundary_to_json(boundary: MapBoundary) -> dict[str, Any]:
     if isinstance(boundary, PointBoundary):
         return {"points": boundary.points.tolist(), **shared}
     spline = boundary.spline
+    cones = {"cones": boundary.cones.tolist()} if len(boundary.cones) else {}
     return {
         "degree": int(spline.degree),
         "periodic": bool(spline.periodic),
         "knots": spline.knots.tolist(),
         "control_points": spline.control_points.tolist(),
         "confirmed_until": float(min(boundary.confirmed_until, spline.domain[1])),
+        **cones,
         **shared,
     }
 
@@ -241,7 +246,16 @@ def _boundary(entry: _Object) -> MapBoundary:
     until = entry.number("confirmed_until") if "confirmed_until" in entry.entries else high
     if not low <= until <= high:
         raise entry.error("confirmed_until", f"expected a number from {low:g} to {high:g}, found {until:g}")
-    return SplineBoundary(spline, covariance, until)
+    return SplineBoundary(spline, covariance, until, _cones(entry, low, high))
+
+
+def _cones(entry: _Object, low: float, high: float) -> Array:
+    if "cones" not in entry.entries:
+        return NO_CONES
+    cones = entry.array("cones", columns=2)
+    if not ((cones >= [low, 0.0]) & (cones[:, :1] <= high)).all():
+        raise entry.error("cones", f"expected parameters from {low:g} to {high:g} and sigmas from 0 on")
+    return cones
 
 
 def _points(top: _Object) -> dict[int, PointBoundary]:

@@ -50,7 +50,7 @@ class Closed:
         health = drive.monitor.update(evidence_of(smoother, classified.tested, known, reading))
         if health.condition == GOOD and self._boundaries_cross:
             health = Health(DEGRADED, "the two boundaries of the map cross")
-        if is_whole and drive.record.unsolvable is None:
+        if is_whole and drive.can_repair:
             loop = self.known_loop.of(smoother)
             self.map_repair.contradictions.observe(smoother.map, loop, classified.new, reading.detections.t)
         if health.condition != LOST or not is_whole or drive.solver.is_busy:
@@ -69,8 +69,7 @@ class Closed:
             outcome = drive.outcome(road, spent)
             return Step(self) if outcome is None else self.take(road, drive, outcome)
         self._hold_gauge(road)
-        self._repair(road, drive, reading)
-        return Step(self)
+        return Step(self, notice=self._repair(road, drive, reading))
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
         """Go on from a repaired map that explains the contradictions, and is no worse otherwise."""
@@ -83,13 +82,21 @@ class Closed:
         self._settled = road.path.length
         return Step(self, jump, notice)
 
-    def _repair(self, road: Road, drive: Drive, reading: Reading) -> None:
-        """Send the drive to a batch where cones contradict the map."""
-        if not road.has_both_boundaries or drive.record.unsolvable is not None:
-            return
+    def _repair(self, road: Road, drive: Drive, reading: Reading) -> str:
+        """Send the drive to a batch where cones contradict the map; a known map is repaired at once.
+
+        Return the notice of that.
+        """
         t, driven = reading.detections.t, road.path.length
-        if self.map_repair.is_due(self.known_loop, road.smoother, t, driven):
+        if not road.has_both_boundaries or not drive.can_repair:
+            return ""
+        if not self.map_repair.is_due(self.known_loop, road.smoother, t, driven):
+            return ""
+        if drive.record.unsolvable is None:
             drive.begin_batch(road, reading, self.map_repair.begin(road.smoother, drive.record.poses))
+            return ""
+        self.known_loop = KnownLoop()
+        return self.map_repair.in_place(road.smoother)
 
     def _hold_gauge(self, road: Road) -> None:
         """Hold the gauge of the map after enough laps, unless factors of the user's may tell it."""

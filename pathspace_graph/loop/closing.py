@@ -1,5 +1,7 @@
 """Loop closing and simplification (paper: Simplification), and the marginal and gauge of the closed map.
 
+An open road is laid on a known map in the same way: the map is its prior from then on.
+
 `mapping.registration.register` finds the correspondences between the newest detections and the beginning of
 the curves. `apply_correspondences` moves the window there and associates the detections with the oldest
 control points, `graph.changes:solve_loop` solves the whole loop, and `simplify` makes the curves periodic.
@@ -11,16 +13,19 @@ from typing import Final
 import numpy as np
 from scipy.linalg import block_diag
 
-from pathspace_graph.batch.association import locate_poses
+from pathspace_graph.batch.association import POSE_STEP, headings, locate_poses
+from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, left_of, relative
+from pathspace_graph.factors.se2 import compose, left_of, relative, rotation
 from pathspace_graph.graph.changes import hold_motion, replace_points, restart, set_prior
 from pathspace_graph.graph.variables import control_keys, pose_keys
-from pathspace_graph.mapping.registration import BEGINNING, RefinedMotion
+from pathspace_graph.mapping.registration import BEGINNING, Motion, RefinedMotion
+from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
+from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import Knots, MapperSettings
-from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import curvature_weighted_breaks, refit, thin
 
@@ -30,6 +35,13 @@ JOIN_SHARE: Final = 0.5  # share of a short curve past which the seam lies
 OVERLAP_STEP: Final = 1.0  # step at which points of the overlap are placed on the beginning (m)
 OVERLAP_ROOM: Final = 4.0  # room about its expected place in which a point of the overlap is searched (m)
 SEAM_MARGIN: Final = 0.5  # distance from the seam below which a cone is one of the beginning (m)
+SIGMAS_CALIBRATIONS: Final = (0.05, 0.02, 0.03, 0.1, 0.05, 0.05, 0.2)
+"""Standard deviations of the calibrations where a known map is met: speeds and rates, then the sensor's yaw
+(rad), offset (m), latency (s), and scale and bias (m) of ranges. A map tells them all, its size as well."""
+FIRST_ROOM: Final = (
+    2.0  # by which the first place beside a pose on an open curve may be farther than another (m)
+)
+FIRST_REACH: Final = 20.0  # about it, in which the poses of the window are located (m along the curve)
 SIGMA_STEP: Final = 10.0  # free motion of a control point in a step while the loop is optimized (m)
 
 
@@ -188,6 +200,72 @@ def _move_poses(poses: Array, solved: Array) -> None:
     for pose in poses[len(solved) :]:
         pose[:] = compose(solved[-1], relative(last, pose))
     poses[: len(solved)] = solved
+
+
+# --- a known map ----------------------------------------------------------------------------------------
+
+
+def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array) -> Array:
+    """Replace an open road's curves and prior by a known map's; return the jump (3,) of the newest pose.
+
+    The motion lays the road on the map, and its covariance (3, 3) is that of the newest pose there.
+    """
+    smoother, state = road.smoother, road.smoother.map.state
+    variables = state.variables
+    sigmas = np.array(SIGMAS_CALIBRATIONS)[: len(variables.calibrations)]
+    smoother.reactivate(with_prior=False)
+    before, removed = state.poses[-1].copy(), state.map_keys
+    road.move(as_pose(motion))
+    road.growth.wait_for({} if known.closed else known.confirmed)
+    curves = {label: _next(state.boundaries, known, label, road.settings) for label in known.splines}
+    state.replace_curves(curves)
+    added = np.concatenate([control_keys(label, b.numbers) for label, b in state.boundaries.items()])
+    points = np.concatenate([spline.distinct_control_points for spline in known.splines.values()])
+    restart(smoother, smoother.first_cycle, removed, added, points)
+    known.place_cones(smoother.map)
+    motion.move(state.poses)
+    locate_poses(state)
+    if not known.closed:
+        _locate_first(state)
+    keys = np.concatenate([variables.calibration_keys, added, pose_keys(smoother.cycles[-1:])])
+    mean = np.concatenate([variables.calibrations, points.ravel(), state.poses[-1]])
+    known_of = np.diag(sigmas**2), known.covariance, covariance
+    information = block_diag(*map(np.linalg.inv, known_of))
+    set_prior(smoother, keys, mean, information)
+    smoother.reassociate()
+    for _ in range(road.settings.closing.iterations):
+        smoother.step(SIGMA_STEP)
+    return np.asarray(state.poses[-1] - before)
+
+
+def _locate_first(state: State) -> None:
+    """Set `pose_u` on open curves to the first places beside the poses: curves may lead there again."""
+    newest = state.poses[-1]
+    for label, boundary in state.boundaries.items():
+        points = state.control_points(label)
+        u = np.arange(boundary.tables.low, boundary.tables.high, POSE_STEP)
+        position, tangent = (boundary.evaluate(points, u, order) for order in (0, 1))
+        along = tangent @ headings(newest[None])[0] > SAME_DIRECTION * np.hypot(*tangent.T)
+        away = np.where(along, np.hypot(*(position - newest[:2]).T), np.inf)
+        first = float(u[int((away < away.min() + FIRST_ROOM).argmax())])
+        low = np.full(len(state.poses), max(first - FIRST_REACH, boundary.tables.low))
+        found = boundary.find(points, state.poses[:, :2], low, low + 2.0 * FIRST_REACH)
+        state.locate(label, np.maximum.accumulate(found.u))
+
+
+def _next(boundaries: dict[int, Boundary], known: KnownMap, label: int, settings: MapperSettings) -> Boundary:
+    """Return a known curve whose control points have other keys than those of the curve before."""
+    before = boundaries.get(label)
+    return known.boundary(label, settings, before.first + before.size if before else 0)
+
+
+def as_pose(motion: Motion) -> Array:
+    """Return a motion as the pose (3,) to which the origin is moved."""
+    turn = motion.vector[2]
+    return np.append(motion.centre + motion.vector[:2] - rotation(turn) @ motion.centre, turn)
+
+
+# --- the gauge -------------------------------------------------------------------------------------------
 
 
 def hold_gauge(smoother: CurveSmoother) -> None:

@@ -7,6 +7,7 @@ from typing import Final, Protocol, Self
 
 import numpy as np
 
+from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
@@ -14,15 +15,17 @@ from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.health import Health, HealthMonitor
 from pathspace_graph.mapping.motion import inflate_priors
+from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .closing import go_on_from
+from .closing import go_on_from, lay_on_known
 from .drive_record import DriveRecord
 from .lap_solver import LapSolver, Outcome
 from .revisit import lay_on
 
 REST: Final = 10.0  # distance for which only the road is mapped after a failure (m)
+KNOWN: Final = "the map was known before the drive"  # why a drive on a known map has no batch
 LEARNED: Final = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
 
@@ -43,6 +46,10 @@ class Drive:
         """Return that began the batch which has closed the loop."""
         self.lap_seconds = nan
         """Wall time (s) of the newest batch that the map is of."""
+        self.placed_at: float | None = None
+        """Stamp (s) of the cycle in which the vehicle was found on a known map."""
+        self.keeps_map = False
+        """Whether that map is held as it is."""
         self._rests_until = 0.0  # path (m)
 
     def copy(self) -> Self:
@@ -63,6 +70,11 @@ class Drive:
         contradicted = doubted or measured is None
         is_new = before == self.settings != self.priors and contradicted
         return LEARNED if is_new else ""
+
+    @property
+    def can_repair(self) -> bool:
+        """Return whether a closed map can be repaired: by a batch of the drive, or a known map in place."""
+        return self.record.unsolvable is None or (self.placed_at is not None and not self.keeps_map)
 
     # --- rest after a failure ----------------------------------------------------------------------------
 
@@ -102,6 +114,19 @@ class Drive:
         self.lap_seconds = solved.seconds
         self.record.replaced(np.concatenate([solved.poses[: solved.first_kept], road.poses]))
         road.place_orange(self.record.corrected)
+        return jump
+
+    def lay_on_known(self, road: Road, known: KnownMap, motion: Motion, covariance: Array) -> Array:
+        """Lay an open road on a known map; return the jump (3,) of the newest pose."""
+        earlier = self.record.with_window(road)[: road.smoother.first_cycle]
+        motion.move(earlier)
+        self.solver.give_up(road.next_cycle)
+        jump = lay_on_known(road, known, motion, covariance)
+        self.record.replaced(np.concatenate([earlier, road.poses]))
+        self.record.give_up(KNOWN)
+        self.placed_at, self.keeps_map = road.smoother.times[-1], known.kept
+        road.place_orange(self.record.corrected)
+        self.monitor.restart()
         return jump
 
     def lay_on(self, road: Road, revisit: Revisit) -> Array:

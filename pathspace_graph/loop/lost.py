@@ -45,9 +45,7 @@ class Lost:
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
     ) -> tuple[Phase, Health]:
         """Remember what is seen; the health is that of the last attempt."""
-        track, detections = road.smoother.map, reading.detections
-        corrected = track.detections.corrected(classified.new, track.variables.sensor).copy()
-        self.search.observe(road.poses[-1], replace(detections, points_vehicle=corrected))
+        self.search.look(road, classified, reading)
         return self, self._health
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
@@ -57,7 +55,7 @@ class Lost:
             self.new_road = None
             return Step(self)
         sees_road = self._map_new_road(road, drive, reading)
-        found = self.search.find(road)
+        found = self.search.find(road.smoother)
         if found is None:
             return self._go_on(self.search.is_off_map and sees_road)
         first_cycle = max(self.search.first_cycle, road.smoother.first_cycle)

@@ -17,6 +17,7 @@ from pathspace_graph.batch.simplification import fit_through
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
+from pathspace_graph.graph.changes import place_again
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import along_and_across
@@ -28,6 +29,7 @@ from pathspace_graph.settings.online import GrowthSettings
 from pathspace_graph.spline.boundary import sampled
 from pathspace_graph.spline.bspline import BSpline
 
+from .closing import SIGMA_STEP
 from .known_loop import KnownLoop, Loop
 
 REPAIRED: Final = "the map was repaired"  # beginning of the notice of the cycle in which it was
@@ -41,6 +43,8 @@ SETTLE: Final = 1.5  # time without detections of its cones after which the vehi
 MOST: Final = 20  # number of contradictions passed after which enough of a stretch is seen, whatever the time
 REPAIR_INTERVAL: Final = 1.0  # time after which contradictions are looked for again (s)
 REPAIRS: Final = 8  # largest number of attempts to repair a map
+REPLACED: Final = 0.5  # standard deviation of control points that are placed anew on a known map (m)
+BEND: Final = 0.1  # weight of the second difference of their moves
 EXPLAINED: Final = 0.5  # least share of the contradictions that a repaired map explains, or the old one stays
 
 
@@ -162,6 +166,26 @@ class MapRepair:
         splines = {label: led_through(track, label, self._stretches, poses) for label in state.boundaries}
         return ClosedMap(splines, poses, state.variables.calibrations.copy())
 
+    def in_place(self, smoother: CurveSmoother) -> str:
+        """Lead the curves of a known map through the cones that contradict it, and return the notice.
+
+        What was known of the control points there is forgotten. No batch of the drive can replace the map,
+        since it has not seen all of it.
+        """
+        stretches, self._stretches = self._stretches, []
+        smoother.refresh()
+        replaced = [stretch for stretch in stretches if replace_stretch(smoother, stretch)]
+        self.contradictions.clear()
+        if not replaced:
+            return ""
+        smoother.reassociate()
+        for _ in range(smoother.map.settings.closing.iterations):
+            smoother.step(SIGMA_STEP)
+        self._wait_until = 0.0
+        names = [NAMES[label] for label in BOUNDARIES if any(one.label == label for one in replaced)]
+        count = sum(len(stretch.cones) for stretch in replaced)
+        return f"{REPAIRED}: it is led through {count} other cones on the {' and on the '.join(names)}"
+
     def end(self, marginal: LapMarginal | None) -> str:
         """End an attempt; return the notice of a map that explains the contradictions, or an empty one."""
         stretches, self._stretches = self._stretches, []
@@ -178,6 +202,42 @@ class MapRepair:
         self.contradictions.clear()
         names = [NAMES[label] for label in BOUNDARIES if explained[label]]
         return f"{REPAIRED}: {sum(explained)} more cones on the {' and on the '.join(names)} lie on it"
+
+
+def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bool:
+    """Lead a closed curve through the cones of a stretch, on its own knots; return whether it can be.
+
+    The control points there have a wide prior about their new places, and the cones there no stations.
+    """
+    state, label, cones = smoother.map.state, stretch.label, stretch.cones
+    boundary, points = state.boundaries[label], state.control_points(label)
+    u = boundary.find_anywhere(points, cones).u
+    middle = np.angle(np.exp(2j * np.pi * u / boundary.length).mean()) * boundary.length / (2.0 * np.pi)
+    within = _beyond(u, middle, boundary.length)
+    low, high = within.min() - ROW, within.max() + ROW
+
+    def is_there(at: Array) -> BoolArray:
+        beyond = _beyond(at, middle, boundary.length)
+        return np.asarray((beyond > low) & (beyond < high))
+
+    moved, every = np.flatnonzero(is_there(boundary.abscissae)), np.arange(*boundary.ends, SAMPLE)
+    held = every[~is_there(every)]
+    at, targets = np.append(u, held), np.concatenate([cones, boundary.evaluate(points, held)])
+    basis = boundary.basis(at)[:, moved]
+    bend = BEND * np.diff(np.eye(len(moved)), 2, axis=0)
+    off = np.concatenate([targets - boundary.evaluate(points, at), np.zeros((len(bend), 2))])
+    change = np.linalg.lstsq(np.concatenate([basis, bend]), off, rcond=None)[0]
+    left = np.hypot(*(off[: len(u)] - basis[: len(u)] @ change).T)
+    if np.count_nonzero(left < REPAIR_BESIDE) < EXPLAINED * len(u):
+        return False
+    place_again(smoother, state.keys(label)[moved], points[moved] + change, REPLACED)
+    smoother.map.forget_cones(label, is_there)
+    return True
+
+
+def _beyond(u: Array, middle: float, length: float) -> Array:
+    """Return how far parameters of a closed curve are beyond one of them (m)."""
+    return np.asarray(np.mod(u - middle + 0.5 * length, length) - 0.5 * length)
 
 
 def carried(points: Array, before: Array, after: Array) -> Array:

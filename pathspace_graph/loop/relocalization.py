@@ -5,7 +5,8 @@ which is laid rigidly beside each place of the loop, and the best places are ref
 one is clearly better than all others, twice in a row, the window starts anew there.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
@@ -13,12 +14,13 @@ import numpy as np
 from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.se2 import path_lengths, to_map, wrap_angle
+from pathspace_graph.factors.se2 import move_points, path_lengths, to_map, wrap_angle
+from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.changes import forget_poses
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.registration import Motion, RefinedMotion, Registration, Sightings, worst_sigma
-from pathspace_graph.mapping.road import Road
+from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 
@@ -35,6 +37,7 @@ REACH: Final = 3.0  # distance from its curve that any farther detection counts 
 SEARCH_STARTS: Final = 12  # largest number of places that are refined
 APART: Final = 4.0  # distance below which two places are one (m)
 SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)  # of the pose about a place, before it is refined (m, m, rad)
+SIGMAS_START: Final = (1.0, 1.0, 0.2)  # of the pose at which a drive is said to begin (m, m, rad)
 SIGMA_FIT: Final = 0.3  # a detection at a distance d from its curve scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)
 MIN_SCORE: Final = 0.6  # least score of the place that is accepted; the true one has about 0.85
 MARGIN: Final = 0.1  # least lead of its score over that of every other place
@@ -56,11 +59,17 @@ class Place:
         return bool(np.hypot(*apart) < APART)
 
 
+Choice = Callable[[list[Place] | None], RefinedMotion | None]
+
+
 class Search:
     """What a lost vehicle has seen, and the search for its place on a closed map."""
 
-    def __init__(self, road: Road) -> None:
-        self.settings = road.settings
+    def __init__(self, road: Road, start: Array | None = None) -> None:
+        """Begin at the newest cycle; the origin of the road's frame may be known to be at `start` (3,)."""
+        self.settings, self.start = road.settings, start
+        sigmas = SIGMAS_PLACE if start is None else SIGMAS_START
+        self._information = np.diag(np.array(sigmas) ** -2)  # about a place, before it is refined
         self.first_cycle = road.next_cycle  # cycle from which on detections are remembered
         self._poses: list[Array] = []
         self._seen: list[Detections] = []
@@ -76,6 +85,12 @@ class Search:
         other._seen = self._seen.copy()
         return other
 
+    def look(self, road: Road, classified: Classified, reading: Reading) -> None:
+        """Remember the newest cycle of a road, with its detections as the calibration corrects them."""
+        track = road.smoother.map
+        corrected = track.detections.corrected(classified.new, track.variables.sensor).copy()
+        self.observe(road.poses[-1], replace(reading.detections, points_vehicle=corrected))
+
     def observe(self, pose: Array, detections: Detections) -> None:
         """Remember a cycle: its pose (3,) by odometry, and its detections."""
         self._poses.append(pose.copy())
@@ -84,11 +99,15 @@ class Search:
         old = int(driven.searchsorted(driven[-1] - SEARCH_MEMORY))
         del self._poses[:old], self._seen[:old]
 
-    def find(self, road: Road) -> RefinedMotion | None:
-        """Return the motion onto the only place that agrees, once it was found several times in a row."""
+    def find(self, smoother: CurveSmoother, choose: Choice | None = None) -> RefinedMotion | None:
+        """Return the motion onto the only place that agrees, once it was found several times in a row.
+
+        Of the places, the best first, `choose` returns the one that agrees, by default by their scores.
+        """
         if not self._seen or self._seen[-1].t - self._tried < SEARCH_INTERVAL:
             return None
-        best, last, newest = self._best(road), self._last, self._poses[-1][None, :2]
+        best = (choose or self.by_score)(self._places(smoother))
+        last, newest = self._last, self._poses[-1][None, :2]
         self._tried, self._last = self._seen[-1].t, None if best is None else best.motion
         if best is None:
             return None
@@ -97,22 +116,32 @@ class Search:
         self._agreed = self._agreed + 1 if agrees else 1
         return best if self._agreed >= CONFIRMATIONS else None
 
+    def widened(self, found: RefinedMotion) -> Array:
+        """Return the covariance (3, 3) of a place, whose detections are used once more in the window."""
+        seen = np.linalg.inv(found.covariance) - self._information
+        return np.asarray(np.linalg.inv(seen / WIDENING**2 + self._information), np.float64)
+
     @property
     def is_off_map(self) -> bool:
         """Return whether no place of the map agrees with what was seen, several times in a row."""
         return self._missed >= CONFIRMATIONS
 
-    def _best(self, road: Road) -> RefinedMotion | None:
-        """Return the motion onto the place that is clearly better than all others, if there is one."""
+    def _places(self, smoother: CurveSmoother) -> list[Place] | None:
+        """Return the likeliest places, the best first; None where too little was seen."""
         seen = self._sightings()
         if len(seen.rows) < MIN_DETECTIONS:
             return None
-        road.smoother.refresh()  # the map goes on to relax from the detections that were taken out of use
-        state, loop = road.smoother.map.state, lay_out_loop(road.smoother.map)
+        smoother.refresh()  # the map goes on to relax from the detections that were taken out of use
+        state, loop = smoother.map.state, lay_out_loop(smoother.map)
         centre = self._poses[-1][:2]
         starts = [(Motion(centre, vector), i) for vector, i in self._starts(loop, seen)]
         places = [self._refined(state, loop, seen, start, i) for start, i in starts]
-        places.sort(key=lambda place: -place.score)
+        return sorted(places, key=lambda place: -place.score)
+
+    def by_score(self, places: list[Place] | None) -> RefinedMotion | None:
+        """Return the motion onto the place that is clearly better than all others, if there is one."""
+        if places is None:
+            return None
         if not places or places[0].score < MIN_SCORE:
             self._missed += 1
             return None
@@ -120,6 +149,8 @@ class Search:
         rivals = [place.score for place in places if not place.is_near(best)]
         if rivals and rivals[0] > best.score - MARGIN:
             return None
+        if self.start is not None:  # which says what the curves leave free
+            return best.found
         return best.found if worst_sigma(best.found.covariance) < SIGMA_MAX else None
 
     def _sightings(self) -> Sightings:
@@ -135,6 +166,8 @@ class Search:
 
     def _starts(self, loop: Loop, seen: Sightings) -> list[tuple[Array, int]]:
         """Return motions (3,) onto the likeliest places, each with the index of its point of the middle."""
+        if self.start is not None:
+            return [self._at_start(loop, self.start)]
         motions, misfit = self._beside(loop)
         possible = np.flatnonzero(misfit < MISFIT)
         if len(possible) == 0:
@@ -145,6 +178,13 @@ class Search:
         points = np.stack([moved.real, moved.imag], axis=2)
         cost = np.square(loop.distances(seen.labels, points, REACH)).mean(axis=1)
         return [(motions[i], int(i)) for i in _spread(loop, possible, cost)]
+
+    def _at_start(self, loop: Loop, start: Array) -> tuple[Array, int]:
+        """Return the motion (3,) of the origin to `start` (3,), and the nearest point of the middle."""
+        newest = self._poses[-1][:2]
+        there = move_points(start, newest[None])[0]
+        nearest = int(np.hypot(*(loop.middle - there).T).argmin())
+        return np.append(there - newest, start[2]), nearest
 
     def _beside(self, loop: Loop) -> tuple[Array, Array]:
         """Return motions (n, 3) that fit the path to the middle before its points, and rms misfits (n,)."""
@@ -172,8 +212,10 @@ class Search:
             high = float(u[i]) + gate.view_ahead + gate.station_room
             whole = high - low >= tables.high - tables.low
             stretches[label] = (tables.low, tables.high) if whole else (low, high)
+            if not state.boundaries[label].periodic:
+                stretches[label] = max(low, tables.low), min(high, tables.high)
         registration = Registration(state, seen, stretches, self.settings.closing)
-        found = registration.refine(start, start.vector, np.diag(np.array(SIGMAS_PLACE) ** -2))
+        found = registration.refine(start, start.vector, self._information)
         distance = loop.distances(seen.labels, found.motion.apply(seen.points), REACH)
         return Place(float(np.exp(-0.5 * (distance / SIGMA_FIT) ** 2).mean()), found)
 

@@ -1,12 +1,13 @@
 """The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
 
+from collections.abc import Callable
 from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.residuals import pair_residuals, sigma_across
 from pathspace_graph.graph.rows import Rows, stacked_rows
@@ -120,17 +121,44 @@ class CurveMap:
         self.state.drop_oldest_pose_u()
 
     def replaced_by(
-        self, scatter: dict[int, Array], cones: dict[int, Array], stations: dict[int, Array]
+        self,
+        scatter: dict[int, Array],
+        cones: dict[int, Array],
+        stations: dict[int, Array],
+        held_by_prior: bool = True,
     ) -> None:
         """Note that curves and prior are a batch's, with the scatter and the places of cones by label.
 
         Stations (2, k) are parameters of cones and their standard deviations along the curves (m), if any.
         """
-        self.held_by_prior, self.scatter, self.cones = True, scatter, cones
+        self.held_by_prior, self.scatter, self.cones = held_by_prior, scatter, cones
         self.stations = None
         if stations:
             u, sigma = ({label: own[k] for label, own in stations.items()} for k in (0, 1))
             self.stations = Stations.of(self.state, u, sigma)
+
+    def lay_stations_out(self) -> None:
+        """Lay the stations out anew, since control points are in other rows once an open curve has grown."""
+        if self.stations is None:
+            return
+        u = {curve.label: curve.u for curve in self.stations.curves}
+        sigma = {curve.label: curve.sigma for curve in self.stations.curves}
+        self.stations = Stations.of(self.state, u, sigma)
+
+    def placed_cones(self, label: int) -> Array:
+        """Return the cones (k, 2) that hold detections along a curve: parameters and sigmas along it (m)."""
+        curves = self.stations.curves if self.stations is not None else ()
+        found = [np.column_stack([curve.u, curve.sigma]) for curve in curves if curve.label == label]
+        return np.concatenate([np.zeros((0, 2)), *found])
+
+    def forget_cones(self, label: int, is_gone: Callable[[Array], BoolArray]) -> None:
+        """Forget the cones of a closed curve at whose parameters (k,) others stand now."""
+        placed = {b: self.placed_cones(b) for b in self.state.boundaries}
+        placed[label] = placed[label][~is_gone(placed[label][:, 0])]
+        places = {b: cones[~is_gone(cones)] if b == label else cones for b, cones in self.cones.items()}
+        are_placed = all(map(len, placed.values()))
+        stations = {b: cones.T for b, cones in placed.items()} if are_placed else {}
+        self.replaced_by(self.scatter, places, stations)
 
     def match(self, rows: IntArray, directions: Array) -> None:
         """Match detections (m,), newly in use, with the cones of a closed map.

@@ -1,5 +1,6 @@
 """Growth of the open curves through confirmed tentative tracks ahead of their ends (paper: Expansion)."""
 
+from collections.abc import Mapping
 from statistics import median
 from typing import Final, Self
 
@@ -32,6 +33,7 @@ class Growth:
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
         self.tentative = {label: TentativeTracks(settings) for label in BOUNDARIES}  # unexplained cones
+        self._known: Mapping[int, float] = {}  # ends of curves that were known before the drive (m)
         self._full: frozenset[int] = frozenset()  # boundaries that have stopped growing
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
 
@@ -57,12 +59,18 @@ class Growth:
         for label in BOUNDARIES:
             if label not in smoother.map.state.boundaries:
                 self._begin(smoother.map, label, path_ahead)
+            elif self._waits(smoother.map.state, label):
+                continue
             elif not self._is_full(smoother.map, label, path_ahead) and self._grow(
                 smoother, label, path_ahead
             ):
                 grown.add(label)
         stopped = sorted(self._full - full)
         return frozenset(grown), joined(_stopped(smoother.map, label) for label in stopped)
+
+    def wait_for(self, ends: Mapping[int, float]) -> None:
+        """Let known curves grow only once the vehicle is at their ends (m), by label."""
+        self._known = ends
 
     def move(self, motion: Array) -> None:
         for tracks in self.tentative.values():
@@ -71,6 +79,11 @@ class Growth:
     def clear(self) -> None:
         for tracks in self.tentative.values():
             tracks.clear()
+
+    def _waits(self, state: State, label: int) -> bool:
+        """Return whether the vehicle is far from the end of a known curve."""
+        at_end = self._known.get(label, -np.inf) - self.settings.reach
+        return bool(state.pose_u[label][-1] < at_end)
 
     def _begin(self, track: CurveMap, label: int, path_ahead: PathAhead) -> None:
         """Begin a curve through the first candidates, if there are at least two."""
@@ -187,7 +200,7 @@ class Growth:
 
     def _is_full(self, track: CurveMap, label: int, path_ahead: PathAhead) -> bool:
         boundary = track.state.boundaries[label]
-        longest = LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
+        longest = self._known.get(label, 0.0) + LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
         is_full = boundary.size >= self.settings.max_size or boundary.confirmed_end >= longest
         if is_full:
             self._full |= {label}

@@ -104,6 +104,8 @@ class Road:
         if not self.closed:
             path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
             self.grown, notice = self.growth.expand(self.smoother, path_ahead)
+            if self.grown:
+                self.smoother.map.lay_stations_out()
         self.smoother.deactivate_distant()
         return notice
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import is_
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -61,6 +61,10 @@ class Curves:
         first = _first_active(self.boundaries, self.active)
         bases = [_tail(boundary, start) for boundary, start in zip(self.boundaries, first, strict=True)]
         return kernels.Curves(bases, (np.cumsum([0, *sizes[:-1]]) + first).tolist(), sizes)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is compiled, which is made again."""
+        return {name: value for name, value in vars(self).items() if name != "searched"}
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
         """Return whether these are the curves of boundaries with active control points, by default all."""
@@ -223,6 +227,10 @@ class State:
     def close(self, label: int, boundary: Boundary) -> None:
         """Replace an open boundary by a periodic one, whose control points are inserted by the smoother."""
         self.boundaries[label] = boundary
+
+    def replace_curves(self, boundaries: Mapping[int, Boundary]) -> None:
+        """Replace all boundaries by others, whose control points are inserted by the smoother."""
+        self.boundaries = dict(sorted(boundaries.items()))
 
     # --- active control points ---------------------------------------------------------------------------
 

@@ -24,18 +24,18 @@ SIGMA_POSE: Final = 0.2  # standard deviation of the vehicle along a curve when 
 
 @dataclass(frozen=True, eq=False)
 class CurveStations:
-    """The stations of one closed curve, ascending."""
+    """The stations of one curve, ascending."""
 
     label: int  # of the boundary
     first: int  # number of the first among those of all curves
     u: Array  # parameters (k,) of the cones in m, within one length
     sigma: Array  # standard deviations (k,) of the cones along the curve, given the curve (m)
     apart: Array  # distances (k,) of each to the nearer one of its neighbours (m)
-    length: float  # length of the curve (m)
+    length: float  # length of the curve (m); infinity of an open one
 
     @classmethod
     def of(cls, label: int, first: int, u: Array, sigma: Array, ends: tuple[float, float]) -> Self:
-        """Place cones at parameters (k,), at least one, of a closed curve between two ends."""
+        """Place cones at parameters (k,), at least one, of a curve; an open one ends at infinity."""
         low, length = ends[0], ends[1] - ends[0]
         u = low + np.mod(u - low, length)
         order = np.argsort(u)
@@ -44,9 +44,14 @@ class CurveStations:
 
     def nearest(self, u: Array) -> tuple[IntArray, Array]:
         """Return the nearest station to each parameter, of any shape, and how far beyond it that is (m)."""
-        after = self.u.searchsorted(self.u[0] + np.mod(u - self.u[0], self.length))
-        both = np.stack([after - 1, after]) % len(self.u)
-        beyond = np.mod(u - self.u[both] + 0.5 * self.length, self.length) - 0.5 * self.length
+        if self.length == np.inf:
+            after = self.u.searchsorted(u).clip(1, len(self.u) - 1)
+            both = np.stack([after - 1, after])
+            beyond = u - self.u[both]
+        else:
+            after = self.u.searchsorted(self.u[0] + np.mod(u - self.u[0], self.length))
+            both = np.stack([after - 1, after]) % len(self.u)
+            beyond = np.mod(u - self.u[both] + 0.5 * self.length, self.length) - 0.5 * self.length
         second = np.abs(beyond[1]) < np.abs(beyond[0])
         return np.where(second, both[1], both[0]), np.where(second, beyond[1], beyond[0])
 
@@ -77,10 +82,10 @@ class Stations:
 
     @classmethod
     def of(cls, state: State, u: Mapping[int, Array], sigma: Mapping[int, Array]) -> Self:
-        """Place cones at parameters (k,) of closed curves, at least one on each; by label, as the sigmas."""
+        """Place cones at parameters (k,) of curves, at least one on each; by label, as the sigmas."""
         curves, columns, values, before, count = list[CurveStations](), [], [], 0, 0
         for label, boundary in state.boundaries.items():
-            ends = boundary.tables.low, boundary.tables.high
+            ends = boundary.tables.low, boundary.tables.high if boundary.periodic else np.inf
             own = CurveStations.of(label, count, u[label], sigma[label], ends)
             value, span = boundary.tables.evaluate(own.u, 1)
             curves.append(own)

@@ -142,6 +142,11 @@ class MapperEstimate:
         return self.road.closed
 
     @property
+    def placed_at(self) -> float | None:
+        """Return the stamp (s) at which the vehicle was found on its known map, if it was."""
+        return self.drive.placed_at
+
+    @property
     def corrected_poses(self) -> Array:
         """Return the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
         return self.drive.record.corrected

@@ -16,11 +16,13 @@ from pathspace_graph.front_end.gate import Admitted
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.health import Health
 from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.lengths import joined, scaled
+from pathspace_graph.lengths import POSE_LENGTHS, joined, scaled, times
 from pathspace_graph.loop.drive import Drive, Phase
 from pathspace_graph.loop.open import Open
+from pathspace_graph.loop.seeking import Seeking
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.run import CycleResult, Stopwatch
@@ -73,6 +75,30 @@ class FixedLagMapper(MapperEstimate):
         self._unused: Odometry | None = None  # twists of a cycle that was left out
         if self.settings.open_lap.prior == "window":
             self.drive.record.give_up("no batch of the lap was asked for")
+
+    @classmethod
+    def on(
+        cls,
+        track: Map,
+        settings: MapperSettings | None = None,
+        odometry_sigma: Array | KnownNoise | None = None,
+        *,
+        start: Array | None = None,
+        keep: bool = False,
+    ) -> Self:
+        """Return a mapper on a known map, in whose frame all results are once the vehicle is found on it.
+
+        Until then it maps a road of its own. A vehicle may be anywhere on a closed map; it begins near
+        `start` (3,) in m, m and rad, map frame, if that is given. On an open map it must be.
+        The map is refined by what is seen, or held as it is to `keep` it.
+        SettingsError is raised for a map without both curves or without covariances.
+        """
+        mapper = cls(settings, odometry_sigma)
+        known, pose = scaled(track, 1.0 / mapper.scale), None
+        if start is not None:
+            pose = times(np.array(start, float), POSE_LENGTHS, 1.0 / mapper.scale)
+        mapper.phase = Seeking(mapper.settings, known, pose, keep)
+        return mapper
 
     def update(
         self,

@@ -173,6 +173,18 @@ class Boundary:
         values, span = self.tables.evaluate(np.asarray(u, float), derivative)
         return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Return the parameters at which the domain begins and ends (m)."""
+        return self.tables.low, self.tables.high
+
+    def basis(self, u: Array) -> Array:
+        """Return the weights (k, m) of the distinct control points at parameters (k,)."""
+        (values,), span = self.tables.evaluate(u)
+        weights = np.zeros((len(u), self.size))
+        np.put_along_axis(weights, self.columns(span), values, axis=1)
+        return weights
+
     def closed(self, knots: Array) -> "Boundary":
         """Return the boundary on periodic knots: all of it is confirmed, and its keys are new."""
         boundary = Boundary(knots, True, self.settings, self.gauge, self.first + self.size)

@@ -86,7 +86,7 @@ class Node:
         return SimpleNamespace(publish=publish)
 
     def create_subscription(
-        self, msg_type: type, topic: str, callback: Callable[[Any], None], qos_profile: QoSProfile
+        self, msg_type: type, topic: str, callback: Callable[[Any], None], qos_profile: Any
     ) -> None:
         self.subscribed[topic] = msg_type, callback, qos_profile
 
@@ -113,7 +113,7 @@ def install(patch: pytest.MonkeyPatch, spin: Callable[[Node], None], now: int, *
         "geometry_msgs.msg": ("Point", "PoseStamped"),
         "nav_msgs.msg": ("Odometry", "Path"),
         "sensor_msgs.msg": ("PointCloud2",),
-        "std_msgs.msg": ("Header",),
+        "std_msgs.msg": ("Header", "String"),
         "visualization_msgs.msg": ("Marker", "MarkerArray"),
     }.items():
         package = name.partition(".")[0]

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pathspace_graph.io.files import write_json
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.map import read_map
+from pathspace_graph.io.map import map_to_json, read_map
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.loop.seeking import Seeking
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
+from ..scenes.maps import ring_map
 from ..scenes.paths import ROOT
 from .bags import EPOCH, Messages
 from .ros2 import Node, ReliabilityPolicy, install, message_class
@@ -66,6 +69,13 @@ def test_a_bad_message_never_stops_the_mapper(node: ModuleType, log: Log, tmp_pa
     assert read_map(tmp_path / "map").boundaries.keys() == {LEFT, RIGHT}
 
 
+def test_a_known_map_is_driven_on(node: ModuleType, tmp_path: Path) -> None:
+    folder = tmp_path / "map"
+    folder.mkdir()
+    write_json(folder / "map.json", map_to_json(ring_map()))
+    assert isinstance(node.Bridge(known=str(folder)).mapper.phase, Seeking)
+
+
 def test_markers_and_poses_are_filled_in(node: ModuleType) -> None:
     points, point = np.array([[1.0, 2.0], [3.0, 4.0]]), message_class("geometry_msgs/Point")
     marker = node.fill_line(message_class("visualization_msgs/Marker")(), points, LEFT, point)
@@ -87,16 +97,18 @@ def test_the_node_publishes_and_saves_when_it_is_stopped(
 
     def spin(running: Node) -> None:
         nodes.append(running)
-        (odometry, take_odometry, deep), (cloud, take_cloud, _) = running.subscribed.values()
+        (odometry, take_odometry, deep), (cloud, take_cloud, _), (text, save, _) = running.subscribed.values()
         assert (odometry.__name__, cloud.__name__) == ("Odometry", "PointCloud2")
         assert deep.reliability == ReliabilityPolicy.BEST_EFFORT  # which every publisher fits
         feed(log, take_odometry, take_cloud)
+        save(text(data="saved"))
         raise KeyboardInterrupt
 
     install(monkeypatch, spin, EPOCH * 10**9)
     monkeypatch.chdir(tmp_path)
     node.main()
     assert read_map(tmp_path / "map").boundaries.keys() == {LEFT, RIGHT}
+    assert read_map(tmp_path / "saved").boundaries.keys() == {LEFT, RIGHT}
     published = nodes[0].published
     assert {name: len(messages) for name, messages in published.items()} == dict.fromkeys(
         ("~/map", "~/ahead", "~/path"), CYCLES
@@ -112,4 +124,4 @@ def test_the_node_publishes_and_saves_when_it_is_stopped(
 def test_the_example_is_short_and_says_how_to_run_it() -> None:
     text = (ROOT / "examples" / "ros2_node.py").read_text()
     assert "python examples/ros2_node.py" in text
-    assert text.count("\n") < 150
+    assert text.count("\n") < 160

@@ -74,6 +74,24 @@ def test_a_curve_is_confirmed_up_to_a_parameter_of_its_domain(until: Any) -> Non
         map_from_json(content)
 
 
+def test_the_places_of_cones_are_written_and_older_maps_have_none() -> None:
+    track, cones = spline_map(), np.array([[3.0, 0.02], [17.5, 0.1]])
+    right = replace(track.boundaries[RIGHT], cones=cones)
+    content = json.loads(json.dumps(map_to_json(Map(False, {**track.boundaries, RIGHT: right}))))
+    again = map_from_json(content).boundaries
+    np.testing.assert_array_equal(again[RIGHT].cones, cones)
+    assert again[LEFT].cones.shape == (0, 2)
+    assert "cones" not in content["boundaries"]["left"]
+
+
+@pytest.mark.parametrize("cones", [[[50.1, 0.1]], [[-0.1, 0.1]], [[3.0, -0.1]], [[3.0]], "many", None])
+def test_cones_lie_on_their_curve(cones: Any) -> None:
+    content = map_to_json(spline_map())
+    content["boundaries"]["right"]["cones"] = cones
+    with pytest.raises(InputError, match=r"right\.cones"):
+        map_from_json(content)
+
+
 def test_scipy_evaluates_the_written_map_the_same() -> None:
     track = spline_map()
     written = json.loads(json.dumps(map_to_json(track)))

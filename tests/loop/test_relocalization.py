@@ -188,7 +188,7 @@ def test_the_motion_that_took_the_vehicle_away_is_undone() -> None:
     search._tried = -np.inf
     for pose, cycle in zip(true_poses(log)[150:190], log.cycles[150:190], strict=True):
         search.observe(compose(away, pose), cycle)
-        found = search.find(mapper.road) or found
+        found = search.find(mapper.road.smoother) or found
     assert found is not None
     truth = true_poses(log)[[170, 189]]
     moved = move_points(away, truth[:, :2])
@@ -214,7 +214,7 @@ def test_no_place_is_found_with_too_few_detections() -> None:
     search = Search(mapper.road)
     search._tried = -np.inf
     search.observe(true_poses(log)[150], log.cycles[150])
-    assert search.find(mapper.road) is None
+    assert search.find(mapper.road.smoother) is None
 
 
 def test_the_remembered_path_has_a_bound() -> None:

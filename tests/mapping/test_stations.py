@@ -29,6 +29,13 @@ def test_the_nearest_station_across_the_seam(u: float, station: int, beyond: flo
     assert (found[0], distance[0]) == (station, pytest.approx(beyond))
 
 
+@pytest.mark.parametrize(("u", "station", "beyond"), [(2.0, 0, -8.0), (29.0, 1, -1.0), (140.0, 2, 50.0)])
+def test_an_open_curve_has_no_seam(u: float, station: int, beyond: float) -> None:
+    places = np.array([10.0, 30.0, 90.0])
+    found, distance = CurveStations.of(LEFT, 0, places, np.zeros(3), (0.0, np.inf)).nearest(np.array([u]))
+    assert (found[0], distance[0]) == (station, pytest.approx(beyond))
+
+
 def test_distances_to_neighbours_go_around() -> None:
     np.testing.assert_allclose(stations(10.0, 30.0, 90.0).apart, [20.0, 20.0, 20.0])
     np.testing.assert_allclose(stations(10.0, 12.0, 99.0).apart, [2.0, 2.0, 11.0])

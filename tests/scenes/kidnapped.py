@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.se2 import left_of, to_map
+from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points, to_map
 from pathspace_graph.io.log import Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.sim.track import Track, to_map_frame
@@ -116,3 +116,20 @@ def _stations(points: Array) -> Array:
 
 def _away(points: Array, line: Array) -> Array:
     return np.asarray(np.hypot(*(points[:, None] - line).transpose(2, 0, 1)).min(axis=1))
+
+
+def begun_later(log: Log, t: float) -> tuple[Log, Array]:
+    """Cuts off a log before a stamp t (s); returns the rest in the frame of its first pose, and that pose."""
+    truth, first = log.truth, int(log.odometry.t.searchsorted(t))
+    assert truth is not None
+    begin, kept = truth.poses[int(truth.pose_t.searchsorted(t))], truth.pose_t >= t
+    back = inverse(begin)
+    poses = np.array([compose(back, pose) for pose in truth.poses[kept]])
+    cones = move_points(back, truth.cones)
+    rest = replace(
+        log,
+        odometry=Odometry(log.odometry.t[first:], log.odometry.twist[first:]),
+        cycles=tuple(cycle for cycle in log.cycles if cycle.t >= t),
+        truth=Truth(truth.pose_t[kept], poses, cones, truth.cone_labels),
+    )
+    return rest, begin

@@ -30,6 +30,17 @@ def test_a_skidpad_is_driven_twice_to_the_right_and_twice_to_the_left() -> None:
     assert line.clearance.min() > 1.2
 
 
+def test_the_rows_of_a_skidpad_are_those_that_are_passed_each_round_anew() -> None:
+    """Right of the first circle are its inner cones, twice around; then the other circle's outer ones."""
+    left, right = skidpad().rows
+    below, above = np.array([0.0, -18.25 / 2]), np.array([0.0, 18.25 / 2])
+    assert np.isclose(np.hypot(*(right - below).T), 15.25 / 2).sum() >= 2 * 16
+    assert np.isclose(np.hypot(*(left - above).T), 15.25 / 2).sum() >= 2 * 16
+    for row in (left, right):
+        assert np.hypot(*np.diff(row, axis=0).T).max() < 6.0  # no jump from circle to circle
+    np.testing.assert_array_equal(acceleration().rows[0], acceleration().left)
+
+
 def test_an_acceleration_is_straight_and_leaves_room_to_brake() -> None:
     track = acceleration()
     assert track.centre_line.length == pytest.approx(150.0)

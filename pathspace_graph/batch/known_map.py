@@ -1,0 +1,139 @@
+"""A known map: the prior of the curves where a drive begins on a map that was there before it."""
+
+from dataclasses import dataclass, replace
+from typing import Final, Self
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.footpoint import foot_points
+from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.graph.variables import POINT
+from pathspace_graph.io.map import NO_CONES, Map, SplineBoundary
+from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.constellation import Constellation
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.smoother import CurveSmoother
+from pathspace_graph.settings.mapper import MapperSettings, SplineSettings, known_settings
+from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.bspline import BSpline, end_change_matrix
+
+from .simplification import fit_through
+
+KEPT: Final = 1e-3  # standard deviation of the control points of a map that is kept as it is (m)
+PLACE_ROOM, PLACE_LEAST = 0.02, 4.0  # of an open curve's length, and of its own (m), in which a cone lies
+INSIDE: Final = 1e-6  # least distance of a cone from the end of its curve, which is the seam if closed (m)
+FLOOR: Final = 0.01  # standard deviation added to those of any other map (m), which makes it regular
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMap:
+    """Both curves of a map that was there before the drive, and the Gaussian of their control points."""
+
+    splines: dict[int, BSpline]
+    confirmed: dict[int, float]  # parameter up to which each curve is confirmed (m)
+    covariance: Array  # (n, n) of the distinct control points, left first, in m^2
+    cones: dict[int, Array]  # (k, 2) cones of each curve: parameters, and sigmas along it (m)
+    kept: bool  # whether the map is held as it is
+
+    @classmethod
+    def of(cls, track: Map, keep: bool = False, lines: tuple[int, ...] = ()) -> Self:
+        """Return the known map of a map with both curves; `keep` holds it as it is.
+
+        The cones of boundaries of which the sensor sees `lines` tell nothing.
+        SettingsError is raised for a map without both curves or without covariances.
+        """
+        boundaries = track.curves("a known map")
+        covariance = track.covariance_of(*boundaries)
+        if covariance is None:
+            raise SettingsError("a known map: expected a map with covariances, found one without")
+        changes, splines, confirmed, cones = [], dict[int, BSpline](), dict[int, float](), dict[int, Array]()
+        for label, boundary in sorted(track.boundaries.items()):
+            assert isinstance(boundary, SplineBoundary)
+            splines[label], change = _floating(boundary.spline)
+            changes.append(np.kron(change, np.eye(POINT)))
+            confirmed[label] = min(boundary.confirmed_until, boundary.spline.domain[1])
+            cones[label] = NO_CONES if label in lines else boundary.cones
+        T = block_diag(*changes)
+        floor = FLOOR**2 * np.eye(len(T))
+        joint = KEPT**2 * np.eye(len(T)) if keep else T @ covariance @ T.T + floor
+        return cls(splines, confirmed, joint, cones, keep)
+
+    @property
+    def closed(self) -> bool:
+        return any(spline.periodic for spline in self.splines.values())
+
+    def boundary(self, label: int, settings: MapperSettings, first: int = 0) -> Boundary:
+        """Return a curve as a boundary whose control points have keys from the number `first` on."""
+        spline = self.splines[label]
+        own = replace(settings.spline, degree=spline.degree)
+        boundary = Boundary(spline.knots, spline.periodic, own, settings.gauge, first)
+        boundary.confirmed_end = self.confirmed[label]
+        if not spline.periodic:
+            end = np.array([boundary.confirmed_end])
+            boundary.add_cones(spline.evaluate(end), end)
+        return boundary
+
+    def smoother(self, settings: MapperSettings) -> CurveSmoother:
+        """Return the map alone, without a drive, as a search needs it."""
+        smoother = CurveSmoother(settings)
+        for label, spline in self.splines.items():
+            points = spline.distinct_control_points
+            smoother.map.state.add_boundary(label, self.boundary(label, settings), points)
+        self.place_cones(smoother.map)
+        return smoother
+
+    def place_cones(self, track: CurveMap) -> None:
+        """Give a map whose curves are the known ones their cones; open ones need weak priors as they grow."""
+        places = {label: cones[:, 0] for label, cones in self.cones.items() if len(cones)}
+        stations = {label: cones.T for label, cones in self.cones.items()}
+        track.replaced_by({}, places, stations if len(places) == len(stations) else {}, self.closed)
+
+    @property
+    def constellation(self) -> Constellation | None:
+        """Return the cones in the map frame; None where their places are not known."""
+        points, labels, sigmas = [], [], []
+        for label, cones in self.cones.items():
+            points.append(self.splines[label].evaluate(cones[:, 0]))
+            labels.append(np.full(len(cones), label))
+            sigmas.append(cones[:, 1])
+        covariances = np.concatenate(sigmas)[:, None, None] ** 2 * np.eye(POINT)
+        known = Constellation(np.concatenate(points), covariances, np.concatenate(labels))
+        return known if all(map(len, points)) else None
+
+
+def map_of_cones(
+    left: Array, right: Array, closed: bool, sigma: float, settings: MapperSettings | None = None
+) -> Map:
+    """Return the map through cones (n, 2) in driving order, known with a standard deviation `sigma` (m)."""
+    settings, boundaries = known_settings(settings), dict[int, SplineBoundary]()
+    for label, cones in zip(BOUNDARIES, (left, right), strict=True):
+        spline = fit_through(cones, closed, settings, settings.batch.dense_share)
+        floating = spline if closed else spline.unclamp()
+        covariance = sigma**2 * np.eye(POINT * floating.size)
+        placed = np.column_stack([_places(floating, cones), np.full(len(cones), sigma)])
+        boundaries[label] = SplineBoundary(floating, covariance, floating.domain[1], placed)
+    return Map(closed, boundaries)
+
+
+def _places(spline: BSpline, cones: Array) -> Array:
+    """Return the parameters (n,) of cones (n, 2), in driving order, on a curve that may cross itself."""
+    low, high = spline.domain
+    begin, end = np.full(len(cones), low), np.full(len(cones), high)
+    if not spline.periodic:
+        driven = path_lengths(cones)
+        at, room = low + (high - low) * driven / driven[-1], PLACE_ROOM * (high - low) + PLACE_LEAST
+        begin, end = np.maximum(begin, at - room), np.minimum(end, at + room)
+    step = SplineSettings.search_step
+    feet = foot_points(spline.tables, spline.control_points, cones, begin, end, step)
+    return np.minimum(feet.u, high - INSIDE)
+
+
+def _floating(spline: BSpline) -> tuple[BSpline, Array]:
+    """Return a curve with floating ends, and the change of its distinct control points."""
+    if spline.periodic or spline.knots[0] < spline.knots[spline.degree]:
+        return spline, np.eye(spline.size)
+    floating = spline.unclamp()
+    return floating, end_change_matrix(spline.knots, spline.degree, floating.knots)

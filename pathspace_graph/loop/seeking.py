@@ -1,0 +1,165 @@
+"""A known map: the vehicle's place on it is searched, while a road of its own is mapped."""
+
+from functools import partial
+from typing import Final, Self
+
+import numpy as np
+
+from pathspace_graph.batch.known_map import KnownMap
+from pathspace_graph.copies import shallow
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.health import DEGRADED, GOOD, Health
+from pathspace_graph.io.map import Map
+from pathspace_graph.lengths import joined
+from pathspace_graph.mapping.constellation import LAID_NEWEST, Constellation, Expected, lay
+from pathspace_graph.mapping.registration import Motion, RefinedMotion
+from pathspace_graph.mapping.road import Classified, Road
+from pathspace_graph.settings.mapper import MapperSettings
+
+from .closed import Closed
+from .drive import Drive, Phase, Step
+from .known_loop import evidence_of
+from .lap_solver import Outcome
+from .open import Open
+from .relocalization import Place, Search
+
+SEEKING: Final = "the vehicle is not found on the known map yet"  # reason of the health until then
+PLACED: Final = "the vehicle is found on the known map"  # notice of the cycle in which it is
+
+PLACES: Final = 4  # places by the curves on which the cones are laid
+ANYWHERE_CONES: Final = 12
+"""Least number of cones that tell a place anywhere on a map, twice as many as where odometry has it about."""
+ANYWHERE_PATH: Final = 20.0
+"""Least length of the path driven (m): two roads of one width and spacing may be alike for a bend."""
+CURVES_PATH, CURVES_SCORE = 50.0, 0.75
+"""Least length of the path driven (m) and score of a place by the curves alone. Then no place on the map of
+another track had more than 0.71, and those on the right map had 0.66 to 0.89."""
+NEAR: Final = Expected.within(8.0, 0.3, (2.0, 2.0, 0.1))
+"""How far from the place that the curves tell the one that the cones tell may be."""
+
+
+class Seeking:
+    """An open road of the vehicle's own, and the search for its place on a known map."""
+
+    uses_detections = True
+
+    def __init__(
+        self, settings: MapperSettings, track: Map, start: Array | None = None, keep: bool = False
+    ) -> None:
+        self.known = known = KnownMap.of(track, keep, settings.lines)
+        self.start = start  # pose (3,) of the known map at which the drive began, if it is known
+        self.own: Phase = Open(settings)
+        self._known = known.smoother(settings)
+        self._cones = known.constellation
+        self._search: Search | None = None
+
+    def copy(self) -> Self:
+        """Return a phase that can go on independently."""
+        other = shallow(self)
+        other.own = self.own.copy()
+        other._search = self._search and self._search.copy()
+        return other
+
+    def judge(
+        self, road: Road, drive: Drive, classified: Classified, reading: Reading
+    ) -> tuple[Phase, Health]:
+        """Judge the road of its own, and remember what is seen."""
+        self.own, health = self.own.judge(road, drive, classified, reading)
+        if self._search is None:
+            self._search = Search(road, self.start)
+        self._search.look(road, classified, reading)
+        return self, Health(DEGRADED, SEEKING) if health.condition == GOOD else health
+
+    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
+        """Lay the road on the known map where its place is found; else go on with it alone."""
+        step = self.own.step(road, drive, reading, spent)
+        if step.jump is not None:
+            self._search = None  # what was seen is no longer where it was
+        self.own = step.phase
+        if road.closed:
+            return step
+        place = None if drive.rests(road) else self._place(road, drive, reading)
+        if place is None:
+            return Step(self, step.jump, step.notice, step.health)
+        jump = drive.lay_on_known(road, self.known, *place)
+        phase = Closed(road, drive) if self.known.closed else OnOpenMap()
+        return Step(phase, jump, joined([step.notice, PLACED]), Health(DEGRADED, PLACED))
+
+    def _place(self, road: Road, drive: Drive, reading: Reading) -> tuple[Motion, Array] | None:
+        """Return the motion onto the known map, and the covariance (3, 3) of the newest pose there.
+
+        The cones must agree as well where those of the map are known.
+        """
+        search = self._search
+        if search is None:
+            return None
+        if self.start is not None:
+            choose = search.by_score
+        elif self._cones is not None:
+            choose = partial(self._by_cones, road, drive, reading, self._cones)
+        else:
+            choose = partial(self._by_curves, road, search)
+        found = search.find(self._known, choose)
+        return None if found is None else (found.motion, search.widened(found))
+
+    def _by_curves(self, road: Road, search: Search, places: list[Place] | None) -> RefinedMotion | None:
+        """Return the motion onto the place of a map without cones: it takes a long road that fits well."""
+        if not places or road.path.length < CURVES_PATH or places[0].score < CURVES_SCORE:
+            return None
+        return search.by_score(places)
+
+    def _by_cones(
+        self, road: Road, drive: Drive, reading: Reading, known: Constellation, places: list[Place] | None
+    ) -> RefinedMotion | None:
+        """Return the motion onto the only one of the best places where the newest cones lie on known ones."""
+        record, newest = drive.record, road.poses[-1]
+        if not places or record.unsolvable is not None or road.path.length < ANYWHERE_PATH:
+            return None
+        poses = record.with_window(road)
+        first = int(path_lengths(poses).searchsorted(path_lengths(poses)[-1] - LAID_NEWEST))
+        table = record.seen_in(road.smoother.variables.sensor, reading.noise)(np.arange(first, len(poses)))
+        seen = Constellation.of(table, poses, road.settings.growth).seen_from(newest)
+        chosen, agree = list[Place](), list[RefinedMotion]()
+        for place in places:
+            if len(chosen) == PLACES or any(place.is_near(other) for other in chosen):
+                continue
+            chosen.append(place)
+            pose = newest[None].copy()
+            place.found.motion.move(pose)
+            laid = lay(seen, known, pose[0], NEAR.information, (NEAR.radius, NEAR.turn))
+            if laid is not None and laid.is_sure and laid.count >= ANYWHERE_CONES:
+                motion = Motion(newest[:2].copy(), laid.pose - newest)
+                covariance = np.asarray(np.linalg.inv(laid.information), np.float64)
+                agree.append(RefinedMotion(motion, place.found.matches, covariance))
+        return agree[0] if len(agree) == 1 else None
+
+    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
+        """Go on from a batch of the road of its own."""
+        return self.own.take(road, drive, outcome)
+
+
+class OnOpenMap:
+    """A known map that is open: it is localized on and refined, and grows past its end."""
+
+    uses_detections = True
+
+    def copy(self) -> Self:
+        """Return the phase itself, which has no state."""
+        return self
+
+    def judge(
+        self, road: Road, drive: Drive, classified: Classified, reading: Reading
+    ) -> tuple[Phase, Health]:
+        """Judge the estimate by the tested detections."""
+        return self, drive.monitor.update(evidence_of(road.smoother, classified.tested, None, reading))
+
+    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
+        """Remember the pose."""
+        drive.record.estimated(road)
+        return Step(self)
+
+    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
+        """Leave the map as it is."""
+        return Step(self)

@@ -1,0 +1,144 @@
+"""`online --on`: what is written and said of a known map, and which options go together."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.commands.known import read_known_map
+from pathspace_graph.errors import InputError
+from pathspace_graph.io.log import write_log
+from pathspace_graph.io.map import read_map
+from pathspace_graph.io.results import read_trajectory
+from pathspace_graph.labels import LEFT
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track import acceleration, skidpad
+
+from ..scenes.kidnapped import begun_later, laps_log, pear_track
+from ..scenes.paths import ROOT
+
+TRACKS = ROOT.parent / "shared" / "tracks"
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a log of two laps, its map, a log that begins later, and one of another track."""
+    folder = tmp_path_factory.mktemp("drives")
+    laps = laps_log(pear_track(), laps=2)
+    later, _ = begun_later(laps, 8.0)
+    other = laps_log(pear_track(skew=0.4), laps=1)
+    for name, log in (("laps", laps), ("later", later), ("other", other)):
+        write_log(log, folder / name)
+    assert main(["online", str(folder / "laps"), "--out", str(folder / "map")]) == 0
+    return folder
+
+
+def summary(folder: Path) -> dict[str, object]:
+    content: dict[str, object] = json.loads((folder / "summary.json").read_text())
+    return content
+
+
+def test_a_later_drive_is_written_in_the_frame_of_the_known_map(drives: Path, tmp_path: Path) -> None:
+    _, begin = begun_later(laps_log(pear_track(), laps=2), 8.0)
+    arguments = ["online", str(drives / "later"), "--on", str(drives / "map"), "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    written = summary(tmp_path / "out")
+    known = written["known_map"]
+    assert isinstance(known, dict)
+    assert 8.0 < known["found_at"] < 16.0
+    assert written["differences"] == []
+    assert "laps" not in written  # the truth of the log is in another frame
+    assert read_map(tmp_path / "out").closed
+    smoothed = read_trajectory(tmp_path / "out" / "smoothed.tum")[1]
+    assert np.hypot(*(smoothed[0] - begin)[:2]) < 0.4
+    assert abs(np.sin(smoothed[0, 2] - begin[2])) < 0.05
+
+
+def test_the_cones_of_a_closed_map_are_written_with_it(drives: Path) -> None:
+    track = pear_track()
+    left = read_map(drives / "map").boundaries[LEFT]
+    assert 0.9 * len(track.left) < len(left.cones) <= len(track.left)  # type: ignore[union-attr]
+    assert (left.cones[:, 1] < 0.2).all()  # type: ignore[union-attr]
+
+
+def test_on_another_track_the_map_of_its_own_road_is_written(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit, match="3"):
+        main(["online", str(drives / "other"), "--on", str(drives / "map"), "--out", str(out)])
+    line = f"the vehicle was not found on {drives / 'map'}: this is the map of its own road"
+    assert line in capsys.readouterr().err
+    assert summary(out)["known_map"] == {"map": str(drives / "map"), "found_at": None}
+    assert (out / "map.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--start", "0", "0", "0"], "--start: expected --on MAP as well, found none"),
+        (["--keep-map"], "--keep-map: expected --on MAP as well, found none"),
+        (["--on", "MAP", "--estimator", "ckf"], "--on: expected --estimator fixed-lag, found ckf"),
+        (
+            ["--on", "MAP", "--resume", "FILE"],
+            "--on: expected no --resume, since a saved mapper has its own map",
+        ),
+        (["--on", "nowhere"], "nowhere: expected a map's folder, a track file, skidpad or acceleration"),
+        (["--on", "MAP", "--start", "1", "2"], "--start: expected 3 numbers"),
+        (["--on", "MAP", "--map-sigma", "0"], "--map-sigma: expected a positive number, found 0"),
+    ],
+)
+def test_options_that_contradict_each_other_are_refused_in_a_line(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str
+) -> None:
+    options = [str(drives / "map") if word == "MAP" else word for word in options]
+    assert main(["online", str(drives / "laps"), "--out", str(tmp_path / "out"), *options]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert expected in lines[0]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("event", [skidpad, acceleration])
+def test_the_events_of_the_rules_are_known_by_name(event: object) -> None:
+    track = event()  # type: ignore[operator]
+    known = read_known_map(Path(track.name), 0.1, MapperSettings())
+    assert not known.map.closed
+    np.testing.assert_array_equal(known.start, track.start)
+    for label, row in enumerate(track.rows):
+        boundary = known.map.boundaries[label]
+        on_curve = boundary.spline.evaluate(boundary.cones[:, 0])  # type: ignore[union-attr]
+        assert np.hypot(*(on_curve - row).T).max() < 0.2
+        assert (np.diff(boundary.cones[:, 0]) > 0.0).all()  # type: ignore[union-attr]
+
+
+@pytest.mark.skipif(not TRACKS.exists(), reason="the track files are beside the repository")
+def test_a_track_file_is_a_known_map() -> None:
+    file = sorted(TRACKS.rglob("*.csv"))[0]
+    known = read_known_map(file, 0.15, MapperSettings())
+    assert known.map.closed
+    assert known.start is None
+    left = known.map.boundaries[LEFT]
+    np.testing.assert_allclose(np.diag(left.covariance), 0.15**2)
+
+
+def test_a_file_that_is_no_track_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(InputError, match="expected a track file of a known kind"):
+        read_known_map(tmp_path / "notes.txt", 0.15, MapperSettings())
+
+
+def test_a_drive_of_the_acceleration_needs_no_start(tmp_path: Path) -> None:
+    write_log(simulate(acceleration(), SimulationSettings(), seed=3), tmp_path / "log")
+    assert (
+        main(["online", str(tmp_path / "log"), "--on", "acceleration", "--out", str(tmp_path / "out")]) == 0
+    )
+    assert summary(tmp_path / "out")["known_map"] == {
+        "map": "acceleration",
+        "found_at": pytest.approx(1.5, abs=1.5),
+    }
