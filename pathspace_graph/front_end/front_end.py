@@ -18,11 +18,11 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
-from .lines import merged, of_line
+from .line_matching import merged, of_line
 from .log_odometry import LogOdometry, chained
-from .measurement import measure
+from .measurement import odometry_of
 from .motion import MotionCheck
-from .noise import NoiseLearner
+from .noise import NoiseLearner, measure
 from .sides import SideJudge
 from .sightings import SeenCycle, TwistRecord
 
@@ -58,7 +58,7 @@ class FrontEnd:
 
     def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
         """Begin with the noise known at scale 1; cycles come in metres of a scene of the scale."""
-        self.noise = NoiseLearner(noise, settings.noise)
+        self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.kind == "line")
         self.gate = Gate(settings.limits, scale)
         self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
         self._settings = settings
@@ -99,7 +99,7 @@ class FrontEnd:
         if may_doubt and check.errors.contradict(calibration):
             self._sensor_doubted = True
             settings = replace(settings, calibration=check.errors.found(calibration))
-        fresh = noise.observe(odometry, cones.where(~of_line(labels, settings)), motion, check.pose)
+        fresh = noise.observe(odometry, measurable(cones, settings), motion, check.pose)
         if fresh:
             check.set_noise(noise.twist_sigma)
         if fresh or not self._begun:
@@ -144,6 +144,13 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
     return JudgedLog(chain, cycles, orange, settings, front_end.noise_used)
 
 
+def measurable(detections: Detections, settings: MapperSettings) -> Detections:
+    """Return the detections that noise is measured on: the cones, or points of lines where all are."""
+    if settings.kind == "line":
+        return detections
+    return detections.where(~of_line(detections.labels, settings))
+
+
 def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
     """Return whether the nearest cones are orange: the vehicle comes to a track, or is at a gate."""
     if of_orange.sum() < NEAREST:
@@ -159,9 +166,10 @@ def is_orange(detections: Detections) -> BoolArray:
 def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoise | None:
     """Return the noise of a whole log and the constant errors of its sensor, by its readings alone.
 
-    Points of lines, of which the settings say, tell neither.
+    The settings say which detections are points of lines.
     """
-    return measure(*seen_cycles(log, settings), None)
+    settings = settings or MapperSettings()
+    return measure(*seen_cycles(log, settings), of_lines=settings.kind == "line")
 
 
 def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
@@ -170,14 +178,15 @@ def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[
     readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
     for odometry, _ in readings:
         twists.add(odometry)
-    white = measure([], twists, None)
+    white = odometry_of(twists, None)
     sigma = log.odometry_sigma if white is None else white.twist_sigma
     check, sides = MotionCheck(sigma, settings.motion), SideJudge(settings.sides)
     for odometry, detections in readings:
         of_orange = is_orange(detections)
         cones, in_lane = detections.where(~of_orange), is_in_orange_lane(detections, of_orange)
-        motion = check.update(odometry, cones, may_doubt=None)
+        cones = merged(cones, of_line(cones.labels, settings))
+        is_line = of_line(cones.labels, settings)
+        motion = check.update(odometry, cones, may_doubt=None, is_line=is_line)
         labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
-        labelled = labelled.where(~of_line(labelled.labels, settings))
-        cycles.append(SeenCycle(labelled, check.pose, motion.odometry.twist))
+        cycles.append(SeenCycle(measurable(labelled, settings), check.pose, motion.odometry.twist))
     return cycles, twists

@@ -32,9 +32,6 @@ KIND_CONES: Final = 0.32  # median distance over half the gap up to which they a
 LINE: Final = 0.4  # from which on they are points of a line; between, it cannot be told
 ON_LINE: Final = 2.2  # median distance (sigmas) across the line up to which points are on it, not garbled
 LEAST_SIGMA: Final = 1e-3  # least standard deviation of that distance (m)
-SIGMA_RANGES: Final = 0.05  # of the scale of ranges that nothing measures: cameras' are off by as much
-STATED_CYCLES: Final = 200  # first cycles whose stated noise is looked at
-FAR: Final = 0.75  # quantile of the ranges from which on a detection is far
 _OF_LINES: Final[dict[tuple[int, ...], Kind]] = {
     (): "cones",
     (LEFT,): "line-left",
@@ -160,29 +157,7 @@ def kind_of(log: Log) -> Kind | None:
 def with_kind(settings: MapperSettings, log: Log) -> MapperSettings:
     """Return settings with the kind of a log's sensor where they leave it open.
 
-    Lines have no stations. Nothing measures their ranges, so where the odometry sets the size of the map, it
-    holds it from the beginning, and the scale of the ranges is free.
+    Lines have no stations.
     """
     settings = replace(settings, kind=settings.kind or log.sensor.kind or kind_of(log))
-    if not settings.lines:
-        return settings
-    sensor, odometry = settings.calibration, settings.odometry
-    if sensor.sensor and trusts_odometry(settings, log):
-        free = max(sensor.sigma_range_scale, SIGMA_RANGES)
-        sensor, odometry = replace(sensor, sigma_range_scale=free), replace(odometry, hold_scale=True)
-    return replace(settings, stations=False, calibration=sensor, odometry=odometry)
-
-
-def trusts_odometry(settings: MapperSettings, log: Log) -> bool:
-    """Return whether the odometry sets the size of the map, by default where its scale is better known.
-
-    That of ranges is known as well as a range is, by what the log states of the farthest detections.
-    """
-    trust, seen = settings.calibration.trust, log.cycles[:STATED_CYCLES]
-    ranges = np.concatenate([np.zeros(0), *(np.hypot(*one.points_vehicle.T) for one in seen)])
-    if trust is not None or len(ranges) == 0 or not log.detections_stated:
-        return trust != "ranges"
-    covariances = np.concatenate([one.covariances for one in seen])
-    far = ranges >= np.quantile(ranges, FAR)
-    shares = np.sqrt(np.linalg.eigvalsh(covariances[far])[:, 0]) / ranges[far]
-    return bool(np.median(shares) > settings.odometry.sigma_scale)
+    return replace(settings, stations=False) if settings.lines else settings
