@@ -18,6 +18,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
+from .kind import KindJudge
 from .line_matching import merged, of_line
 from .log_odometry import LogOdometry, chained
 from .measurement import odometry_of
@@ -35,6 +36,9 @@ COLOURLESS: Final = {  # notices that most colours are unknown from now on, or n
     True: "most detections have no colour: the way driven tells their sides",
     False: "most detections have a colour again",
 }
+OF_LINES: Final = (
+    "the detections are points of a line, mapped as cones: begin again with `kind` of the settings as {!r}"
+)
 NEAREST: Final = 2  # number of nearest cones that are orange where the vehicle drives between orange cones
 
 
@@ -64,12 +68,14 @@ class FrontEnd:
         self._settings = settings
         self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
+        self._kind = None if settings.kind else KindJudge()  # until the kind is known
 
     def copy(self) -> Self:
         """Return a copy that goes on independently, and shares what nothing changes."""
         other = shallow(self)
         other.noise, other.gate = self.noise.copy(), self.gate.copy()
         other._motion, other._sides = self._motion.copy(), self._sides.copy()
+        other._kind = self._kind and self._kind.copy()
         return other
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
@@ -91,6 +97,7 @@ class FrontEnd:
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
         cones = replace(cones, labels=labels)
+        notices += self._found_kind(odometry, cones)
         stated = cones, orange
         judged, orange = noise.for_map(cones), noise.for_map(orange)
         # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
@@ -107,6 +114,16 @@ class FrontEnd:
         measured = None if settings is self._settings else settings
         seen, notice = check.seen_again, "; ".join(notices)
         return Reading(motion, judged, seen, orange, stated, noise, self._sensor_doubted, measured, notice)
+
+    def _found_kind(self, odometry: Odometry, cones: Detections) -> list[str]:
+        """Return a notice where detections that are taken for cones turn out to be of a line."""
+        if self._kind is None:
+            return []
+        self._kind.see(odometry, cones)
+        if not self._kind.is_final:
+            return []
+        kind, self._kind = self._kind.kind, None
+        return [] if kind in (None, "cones") else [OF_LINES.format(kind)]
 
     @property
     def noise_used(self) -> RunNoise:

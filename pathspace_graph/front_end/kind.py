@@ -5,11 +5,13 @@ their noise. Points of a line find a neighbour: at distances that are spread eve
 points, whatever the gap.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose, move_points, relative
@@ -48,6 +50,13 @@ class SideKind:
         self._away: list[float] = []  # distances from the partners, over half the gap
         self._across: list[float] = []  # distances from the line through the partners (sigmas)
         self._past: list[tuple[float, Array, Array]] = []  # stamp, pose (3,) and points (k, 2) of cycles
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other._gaps, other._away, other._across = self._gaps[:], self._away[:], self._across[:]
+        other._past = self._past[:]
+        return other
 
     def see(self, t: float, pose: Array, points: Array, sigmas: Array) -> None:
         """Compare points (k, 2) of a cycle with those of an earlier one.
@@ -111,14 +120,23 @@ class KindJudge:
     """Judge of both sides of the road."""
 
     def __init__(self) -> None:
-        self._sides = {label: SideKind() for label in BOUNDARIES}
+        self._sides: Mapping[int, SideKind] = {label: SideKind() for label in BOUNDARIES}
         self._pose: Array = np.zeros(3)
+        self._lasted, self._begun = 0.0, np.nan  # time since the first cycle, and its stamp (s)
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other._sides = {label: side.copy() for label, side in self._sides.items()}
+        return other
 
     def see(self, odometry: Odometry, detections: Detections) -> None:
         """See a cycle and the twists since the one before."""
         if len(odometry.t):
             held = np.diff(np.append(odometry.t, detections.t))
             self._pose = compose(self._pose, integrate_twists(held, odometry.twist, np.zeros(3)).delta)
+        self._begun = detections.t if np.isnan(self._begun) else self._begun
+        self._lasted = detections.t - self._begun
         side = side_of(detections)
         for label, judge in self._sides.items():
             if not judge.is_final:
@@ -130,7 +148,7 @@ class KindJudge:
 
     @property
     def is_final(self) -> bool:
-        return all(judge.is_final for judge in self._sides.values())
+        return self._lasted > PATIENCE or all(judge.is_final for judge in self._sides.values())
 
     @property
     def kind(self) -> Kind | None:
@@ -149,7 +167,7 @@ def kind_of(log: Log) -> Kind | None:
     judge = KindJudge()
     for odometry, detections in split_odometry(log):
         judge.see(odometry, detections)
-        if judge.is_final or detections.t > log.cycles[0].t + PATIENCE:
+        if judge.is_final:
             break
     return judge.kind
 

@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pathspace_graph.front_end.front_end import OF_LINES, FrontEnd
 from pathspace_graph.front_end.kind import KindJudge, kind_of, with_kind
 from pathspace_graph.io.log import Detections, Odometry, SensorInfo
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ...scenes.lines import line_drive
@@ -92,3 +94,13 @@ def test_a_setting_comes_before_the_log_and_the_log_before_its_readings() -> Non
         "by the log": ("cones", (), True),
         "by a setting": ("line-left", (LEFT,), False),
     }
+
+
+def test_a_live_mapper_tells_once_that_it_takes_lines_for_cones() -> None:
+    log = line_drive(1, 1.0)
+    notices = {}
+    for kind in (None, "line"):
+        front_end = FrontEnd(MapperSettings(kind=kind), log.noise)
+        readings = [front_end.update(*cycle).notice for cycle in list(split_odometry(log))[:160]]
+        notices[kind] = [notice for notice in readings if notice]
+    assert notices == {None: [OF_LINES.format("line")], "line": []}
