@@ -45,7 +45,7 @@ class NoiseLearner:
         self.measured = known.measured  # what was measured so far, or by an earlier look at the whole drive
         self._cycles: tuple[SeenCycle, ...] = ()  # the newest ones
         self._twists = TwistRecord()
-        self._measure = LineMeasurement.of if of_lines else Measurement.of
+        self._of_lines = of_lines
         self._measurement: Measurement | LineMeasurement | None = None
         self._driven, self._due = 0.0, FIRST
         self._t: float | None = None
@@ -85,7 +85,7 @@ class NoiseLearner:
         self._t = detections.t
         if self._measurement is None and self._driven >= self._due:
             self._due = AGAIN * self._driven
-            self._measurement = self._measure(self._cycles, self._twists, self.measured)
+            self._measurement = begun(self._cycles, self._twists, self.measured, of_lines=self._of_lines)
         found = None if self._measurement is None else self._measurement.advance()
         if found is None:
             return False
@@ -186,11 +186,18 @@ def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
     return "measured" if known else "assumed"
 
 
+def begun(
+    cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None, *, of_lines: bool
+) -> Measurement | LineMeasurement | None:
+    """Begin to measure the noise of cones or of lines; None where not even the odometry's can be told."""
+    return (LineMeasurement if of_lines else Measurement).of(cycles, twists, known)
+
+
 def measure(
     cycles: Sequence[SeenCycle], twists: TwistRecord, *, of_lines: bool = False
 ) -> MeasuredNoise | None:
     """Return the noise that the readings show, of cones or of lines; None where none can be told."""
-    measurement = (LineMeasurement if of_lines else Measurement).of(cycles, twists, None)
+    measurement = begun(cycles, twists, None, of_lines=of_lines)
     if measurement is None:
         return None
     while (found := measurement.advance()) is None:
