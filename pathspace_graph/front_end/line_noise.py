@@ -38,7 +38,7 @@ from .measurement import (
 from .sightings import FOLLOW_RANGE, MAX_AGE, MIN_SPEED_SHARE, SeenCycle, Sightings, TwistRecord, by_bias
 
 CELL: Final = 2.0  # side of the cells (m) inside of which a line is a parabola
-MOST_POINTS: Final = 6000  # points that are measured on, which bounds the time of a round
+MOST_POINTS: Final = 4000  # points that are measured on, which bounds the time of a round
 FEWEST: Final = 8  # points of a line in a cell
 SHAPE: Final = np.array([0.0, 0.25, 10.0])
 """Inverse variances of a weak prior of the parabola `q0 + q1 s + q2 s^2`: sigmas of 2 and of 0.3/m."""
