@@ -18,11 +18,12 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
-from .lines import merged, of_line
+from .kind import KindJudge
+from .line_matching import merged, of_line
 from .log_odometry import LogOdometry, chained
-from .measurement import measure
+from .measurement import odometry_of
 from .motion import MotionCheck
-from .noise import NoiseLearner
+from .noise import NoiseLearner, measure
 from .sides import SideJudge
 from .sightings import SeenCycle, TwistRecord
 
@@ -35,6 +36,9 @@ COLOURLESS: Final = {  # notices that most colours are unknown from now on, or n
     True: "most detections have no colour: the way driven tells their sides",
     False: "most detections have a colour again",
 }
+OF_LINES: Final = (
+    "the detections are points of a line, mapped as cones: begin again with `kind` of the settings as {!r}"
+)
 NEAREST: Final = 2  # number of nearest cones that are orange where the vehicle drives between orange cones
 
 
@@ -58,18 +62,20 @@ class FrontEnd:
 
     def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
         """Begin with the noise known at scale 1; cycles come in metres of a scene of the scale."""
-        self.noise = NoiseLearner(noise, settings.noise)
+        self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.kind == "line")
         self.gate = Gate(settings.limits, scale)
         self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
         self._settings = settings
         self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
+        self._kind = None if settings.kind else KindJudge()  # until the kind is known
 
     def copy(self) -> Self:
         """Return a copy that goes on independently, and shares what nothing changes."""
         other = shallow(self)
         other.noise, other.gate = self.noise.copy(), self.gate.copy()
         other._motion, other._sides = self._motion.copy(), self._sides.copy()
+        other._kind = self._kind and self._kind.copy()
         return other
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
@@ -91,6 +97,7 @@ class FrontEnd:
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
         cones = replace(cones, labels=labels)
+        notices += self._found_kind(odometry, cones)
         stated = cones, orange
         judged, orange = noise.for_map(cones), noise.for_map(orange)
         # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
@@ -99,7 +106,7 @@ class FrontEnd:
         if may_doubt and check.errors.contradict(calibration):
             self._sensor_doubted = True
             settings = replace(settings, calibration=check.errors.found(calibration))
-        fresh = noise.observe(odometry, cones.where(~of_line(labels, settings)), motion, check.pose)
+        fresh = noise.observe(odometry, measurable(cones, settings), motion, check.pose)
         if fresh:
             check.set_noise(noise.twist_sigma)
         if fresh or not self._begun:
@@ -107,6 +114,16 @@ class FrontEnd:
         measured = None if settings is self._settings else settings
         seen, notice = check.seen_again, "; ".join(notices)
         return Reading(motion, judged, seen, orange, stated, noise, self._sensor_doubted, measured, notice)
+
+    def _found_kind(self, odometry: Odometry, cones: Detections) -> list[str]:
+        """Return a notice where detections that are taken for cones turn out to be of a line."""
+        if self._kind is None:
+            return []
+        self._kind.see(odometry, cones)
+        if not self._kind.is_final:
+            return []
+        kind, self._kind = self._kind.kind, None
+        return [] if kind in (None, "cones") else [OF_LINES.format(kind)]
 
     @property
     def noise_used(self) -> RunNoise:
@@ -144,6 +161,13 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
     return JudgedLog(chain, cycles, orange, settings, front_end.noise_used)
 
 
+def measurable(detections: Detections, settings: MapperSettings) -> Detections:
+    """Return the detections that noise is measured on: the cones, or points of lines where all are."""
+    if settings.kind == "line":
+        return detections
+    return detections.where(~of_line(detections.labels, settings))
+
+
 def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
     """Return whether the nearest cones are orange: the vehicle comes to a track, or is at a gate."""
     if of_orange.sum() < NEAREST:
@@ -159,9 +183,10 @@ def is_orange(detections: Detections) -> BoolArray:
 def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoise | None:
     """Return the noise of a whole log and the constant errors of its sensor, by its readings alone.
 
-    Points of lines, of which the settings say, tell neither.
+    The settings say which detections are points of lines.
     """
-    return measure(*seen_cycles(log, settings), None)
+    settings = settings or MapperSettings()
+    return measure(*seen_cycles(log, settings), of_lines=settings.kind == "line")
 
 
 def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
@@ -170,14 +195,15 @@ def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[
     readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
     for odometry, _ in readings:
         twists.add(odometry)
-    white = measure([], twists, None)
+    white = odometry_of(twists, None)
     sigma = log.odometry_sigma if white is None else white.twist_sigma
     check, sides = MotionCheck(sigma, settings.motion), SideJudge(settings.sides)
     for odometry, detections in readings:
         of_orange = is_orange(detections)
         cones, in_lane = detections.where(~of_orange), is_in_orange_lane(detections, of_orange)
-        motion = check.update(odometry, cones, may_doubt=None)
+        cones = merged(cones, of_line(cones.labels, settings))
+        is_line = of_line(cones.labels, settings)
+        motion = check.update(odometry, cones, may_doubt=None, is_line=is_line)
         labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
-        labelled = labelled.where(~of_line(labelled.labels, settings))
-        cycles.append(SeenCycle(labelled, check.pose, motion.odometry.twist))
+        cycles.append(SeenCycle(measurable(labelled, settings), check.pose, motion.odometry.twist))
     return cycles, twists

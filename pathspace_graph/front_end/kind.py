@@ -5,11 +5,13 @@ their noise. Points of a line find a neighbour: at distances that are spread eve
 points, whatever the gap.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose, move_points, relative
@@ -32,9 +34,6 @@ KIND_CONES: Final = 0.32  # median distance over half the gap up to which they a
 LINE: Final = 0.4  # from which on they are points of a line; between, it cannot be told
 ON_LINE: Final = 2.2  # median distance (sigmas) across the line up to which points are on it, not garbled
 LEAST_SIGMA: Final = 1e-3  # least standard deviation of that distance (m)
-SIGMA_RANGES: Final = 0.05  # of the scale of ranges that nothing measures: cameras' are off by as much
-STATED_CYCLES: Final = 200  # first cycles whose stated noise is looked at
-FAR: Final = 0.75  # quantile of the ranges from which on a detection is far
 _OF_LINES: Final[dict[tuple[int, ...], Kind]] = {
     (): "cones",
     (LEFT,): "line-left",
@@ -51,6 +50,13 @@ class SideKind:
         self._away: list[float] = []  # distances from the partners, over half the gap
         self._across: list[float] = []  # distances from the line through the partners (sigmas)
         self._past: list[tuple[float, Array, Array]] = []  # stamp, pose (3,) and points (k, 2) of cycles
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other._gaps, other._away, other._across = self._gaps[:], self._away[:], self._across[:]
+        other._past = self._past[:]
+        return other
 
     def see(self, t: float, pose: Array, points: Array, sigmas: Array) -> None:
         """Compare points (k, 2) of a cycle with those of an earlier one.
@@ -114,14 +120,23 @@ class KindJudge:
     """Judge of both sides of the road."""
 
     def __init__(self) -> None:
-        self._sides = {label: SideKind() for label in BOUNDARIES}
+        self._sides: Mapping[int, SideKind] = {label: SideKind() for label in BOUNDARIES}
         self._pose: Array = np.zeros(3)
+        self._lasted, self._begun = 0.0, np.nan  # time since the first cycle, and its stamp (s)
+
+    def copy(self) -> Self:
+        """Return a copy that goes on independently."""
+        other = shallow(self)
+        other._sides = {label: side.copy() for label, side in self._sides.items()}
+        return other
 
     def see(self, odometry: Odometry, detections: Detections) -> None:
         """See a cycle and the twists since the one before."""
         if len(odometry.t):
             held = np.diff(np.append(odometry.t, detections.t))
             self._pose = compose(self._pose, integrate_twists(held, odometry.twist, np.zeros(3)).delta)
+        self._begun = detections.t if np.isnan(self._begun) else self._begun
+        self._lasted = detections.t - self._begun
         side = side_of(detections)
         for label, judge in self._sides.items():
             if not judge.is_final:
@@ -133,7 +148,7 @@ class KindJudge:
 
     @property
     def is_final(self) -> bool:
-        return all(judge.is_final for judge in self._sides.values())
+        return self._lasted > PATIENCE or all(judge.is_final for judge in self._sides.values())
 
     @property
     def kind(self) -> Kind | None:
@@ -152,7 +167,7 @@ def kind_of(log: Log) -> Kind | None:
     judge = KindJudge()
     for odometry, detections in split_odometry(log):
         judge.see(odometry, detections)
-        if judge.is_final or detections.t > log.cycles[0].t + PATIENCE:
+        if judge.is_final:
             break
     return judge.kind
 
@@ -160,29 +175,7 @@ def kind_of(log: Log) -> Kind | None:
 def with_kind(settings: MapperSettings, log: Log) -> MapperSettings:
     """Return settings with the kind of a log's sensor where they leave it open.
 
-    Lines have no stations. Nothing measures their ranges, so where the odometry sets the size of the map, it
-    holds it from the beginning, and the scale of the ranges is free.
+    Lines have no stations.
     """
     settings = replace(settings, kind=settings.kind or log.sensor.kind or kind_of(log))
-    if not settings.lines:
-        return settings
-    sensor, odometry = settings.calibration, settings.odometry
-    if sensor.sensor and trusts_odometry(settings, log):
-        free = max(sensor.sigma_range_scale, SIGMA_RANGES)
-        sensor, odometry = replace(sensor, sigma_range_scale=free), replace(odometry, hold_scale=True)
-    return replace(settings, stations=False, calibration=sensor, odometry=odometry)
-
-
-def trusts_odometry(settings: MapperSettings, log: Log) -> bool:
-    """Return whether the odometry sets the size of the map, by default where its scale is better known.
-
-    That of ranges is known as well as a range is, by what the log states of the farthest detections.
-    """
-    trust, seen = settings.calibration.trust, log.cycles[:STATED_CYCLES]
-    ranges = np.concatenate([np.zeros(0), *(np.hypot(*one.points_vehicle.T) for one in seen)])
-    if trust is not None or len(ranges) == 0 or not log.detections_stated:
-        return trust != "ranges"
-    covariances = np.concatenate([one.covariances for one in seen])
-    far = ranges >= np.quantile(ranges, FAR)
-    shares = np.sqrt(np.linalg.eigvalsh(covariances[far])[:, 0]) / ranges[far]
-    return bool(np.median(shares) > settings.odometry.sigma_scale)
+    return replace(settings, stations=False) if settings.lines else settings

@@ -1,4 +1,4 @@
-"""Scan matching for points of a line: a detection is drawn to the line beside it, not to a point of it.
+"""Points of a line: which detections they are, and scan matching that draws them to the line beside them.
 
 The line is that of the recent points about a detection: their weighted mean, and the direction in which they
 are spread most. Only the distance across it counts, so what a line cannot tell, the way along it, stays open.
@@ -10,10 +10,14 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from pathspace_graph.factors import _kernels as kernels
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation, to_map
+from pathspace_graph.io.log import Detections
+from pathspace_graph.settings.mapper import MapperSettings
 
+MOST_CELLS: Final = 1 << 20  # in a row of cells, which is more than any sensor sees
+MERGE_CELL: Final = 1.0  # side of the cells (m) in which points are merged: 5 mm beside an arc of 9 m
 LINE_REACH: Final = 1.5  # reach of a line by that of a cone: its points are spread over the gap of points
 LEAST_POINTS: Final = 2.0  # least sum of weights of the points that tell a line
 LEAST_SPREAD: Final = 0.3  # least standard deviation of these along the line, by the reach
@@ -25,6 +29,31 @@ LINES_ALIKE: Final = np.array([1.0, 0.03, 0.003]) ** 2
 """Variances (m^2, m^2, rad^2) of errors that all points of a match share, vehicle frame: nothing is known
 along the lines, and they are taken for straight."""
 HEADING_TOLD: Final = 0.05  # standard deviation of the heading (rad) up to which lines hold the pose
+
+
+def of_line(labels: IntArray, settings: MapperSettings) -> BoolArray:
+    """Return which detections (m,) are points of a line: all where both sides are, whatever the label."""
+    if settings.kind == "line":
+        return np.ones(len(labels), bool)
+    return np.isin(labels, settings.lines) if settings.lines else np.zeros(len(labels), bool)
+
+
+def merged(detections: Detections, is_line: BoolArray) -> Detections:
+    """Return detections with the points of a line that share label and cell replaced by their mean."""
+    if not is_line.any():
+        return detections
+    line = detections.where(is_line)
+    column, row = np.floor(line.points_vehicle / MERGE_CELL).astype(np.intp).T
+    keys = (line.labels * MOST_CELLS + column) * MOST_CELLS + row
+    _, first, cell, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
+    points = _means(line.points_vehicle, cell, counts)
+    covariances = _means(line.covariances.reshape(-1, 4), cell, counts) / counts[:, None]
+    mean = Detections(line.t, points, covariances.reshape(-1, 2, 2), line.labels[first])
+    return detections.where(~is_line).with_others(mean)
+
+
+def _means(values: Array, cell: IntArray, counts: IntArray) -> Array:
+    return np.column_stack([np.bincount(cell.ravel(), column) for column in values.T]) / counts[:, None]
 
 
 class Limits(NamedTuple):

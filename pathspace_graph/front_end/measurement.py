@@ -101,7 +101,7 @@ def _cones(sightings: Sightings) -> _Cones | None:
     if len(chosen) < MIN_ROWS:
         return None
     table = sightings.where(chosen[np.argsort(sightings.cone[chosen], kind="stable")])
-    begins, counts = _runs(table.cone)
+    begins, counts = runs(table.cone)
     axes = np.einsum("nij,nkj->kni", rotations(table.pose[:, 2]), ray_axes(table.point))
     points, ranges = to_map(table.point, table.pose), np.hypot(*table.point.T)
     columns = _columns(table, np.repeat(begins, counts), table.point)
@@ -112,7 +112,7 @@ def _columns(table: Sightings, first: IntArray, seen: Array) -> Array:
     return kernels.by_constants(seen, table.twist, table.pose, table.by_bias, first, BENDS_FROM)
 
 
-def _runs(groups: IntArray) -> tuple[IntArray, IntArray]:
+def runs(groups: IntArray) -> tuple[IntArray, IntArray]:
     """Return the first row and the size (c,) of each group; groups (n,) of equal number are neighbours."""
     begins = np.flatnonzero(np.diff(groups, prepend=-1))
     return begins, np.diff(np.append(begins, len(groups)))
@@ -121,22 +121,23 @@ def _runs(groups: IntArray) -> tuple[IntArray, IntArray]:
 def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
     """Return constants b (7,), both covariances of them, and what is left (n, 2) of the sightings.
 
-    The cones' places, weighted means of `p + A b`, are eliminated. One covariance is `_clustered`.
+    The cones' places, weighted means of `p + A b`, are eliminated. One covariance is `clustered`.
     """
     columns, points, own, vectors = kernels.centred(cones.begins, information, cones.columns, cones.points)
     covariance = np.asarray(np.linalg.inv(own.sum(axis=0) + np.diag(PRIOR**-2)), np.float64)
     errors = -covariance @ vectors.sum(axis=0)
     scores = vectors + own @ errors
-    return errors, covariance, _clustered(cones, scores, covariance), points + columns @ errors
+    middle = np.add.reduceat(cones.table.t, cones.begins) / cones.counts
+    return errors, covariance, clustered(middle, scores, covariance), points + columns @ errors
 
 
-def _clustered(cones: _Cones, scores: Array, covariance: Array) -> Array:
+def clustered(middle: Array, scores: Array, covariance: Array) -> Array:
     """Return the covariance (7, 7) of the constants by how much the stretches of the drive disagree.
 
-    With the scores g (c, 7) of the cones summed over `CLUSTER_TIME` seconds it is `P (sum g g') P` (White's
-    estimator for clusters), which has the errors of the odometry in it.
+    With the scores g (c, 7) of cones, which were seen about `middle` (c,) in s, summed over `CLUSTER_TIME`
+    seconds it is `P (sum g g') P` (White's estimator for clusters), which has the errors of the odometry in
+    it.
     """
-    middle = np.add.reduceat(cones.table.t, cones.begins) / cones.counts
     _, stretch = np.unique(np.floor(middle / CLUSTER_TIME), return_inverse=True)
     count = int(stretch.max()) + 1
     summed = np.zeros((count, scores.shape[1]))
@@ -165,7 +166,7 @@ def _residuals(cones: _Cones, errors: Array, noise: Rays, odometry: Array) -> tu
 
 def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
     """Return all ordered pairs of rows of one group, by index; groups (n,) of equal number are neighbours."""
-    begins, counts = _runs(groups)
+    begins, counts = runs(groups)
     repeats = np.repeat(counts, counts)
     i = np.repeat(np.arange(len(groups)), repeats)
     nth = np.arange(len(i)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
@@ -185,14 +186,14 @@ def _ray_noise(
     medians = 0.5 * (size[begins + (counts - 1) // 2] + size[begins + counts // 2])
     scatter = (MAD * medians) ** 2
     sigma = np.sqrt(np.clip(scatter - known, 0.25 * scatter, 4.0 * scatter))
-    found = RayNoise(np.maximum(_line(middle, sigma), least))
+    found = RayNoise(np.maximum(line_through(middle, sigma), least))
     share, time = _staying(lagged, off, reference, found.sigmas(ranges))
     count = len(np.unique(cones.table.cone[rows]))
     share = (count * share + FIRST_CONES * FIRST_SHARE) / (count + FIRST_CONES)
     return replace(found, share=share, time=time)
 
 
-def _line(ranges: Array, sigma: Array) -> Array:
+def line_through(ranges: Array, sigma: Array) -> Array:
     """Return `a, b >= 0` with the least `sum ((a + b r) / sigma - 1)^2` for sigmas (k,) at ranges r (k,)."""
     columns = np.stack([np.ones(len(ranges)), ranges], axis=1) / sigma[:, None]
     line = np.linalg.lstsq(columns, np.ones(len(sigma)), rcond=None)[0]
@@ -245,12 +246,8 @@ class Measurement:
     @classmethod
     def of(cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None) -> Self | None:
         """Return a measurement; None where not even the noise of the odometry can be told."""
-        white = twists.white()
-        if white is None:
-            return None
-        sigma, interval = white
-        found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
-        return cls(cycles, replace(found, odometry=sigma, interval=interval))
+        found = odometry_of(twists, known)
+        return None if found is None else cls(cycles, found)
 
     def copy(self) -> Self:
         """Return a copy that goes on independently."""
@@ -305,25 +302,12 @@ class Measurement:
 
         What stays of a cone's errors shifts its place; only what changes is taken for an error of the sensor.
         """
-        (sightings,), count = self._sightings, int(np.median(cones.counts))
-        stamps = np.unique(sightings.t)
-        period = float(np.median(np.diff(stamps)))
-        stays = max(one.inflation_of_slope(count, period) for one in self._noise)
+        stamps = np.unique(self._sightings[0].t)
+        counts = int(np.median(cones.counts)), float(np.median(np.diff(stamps)))
+        stays = max(one.inflation_of_slope(*counts) for one in self._noise)
         sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
-        sigmas = np.hypot(sigmas, MODEL_ERROR * np.abs(errors))
-        is_bent = np.abs(errors[OF_BEND]) > SURE * sigmas[OF_BEND]
-        return replace(
-            self._found,
-            along=self._noise[0],
-            across=self._noise[1],
-            count=count,
-            period=period,
-            per_cycle=len(sightings.t) / len(stamps),
-            sensor=errors[:SENSOR_SIZE],
-            sensor_sigma=sigmas[:SENSOR_SIZE],
-            range_bend=float(errors[OF_BEND]) if is_bent else 0.0,
-            seconds=float(np.sum(np.minimum(np.diff(np.unique(cones.table.t)), 1.0))),
-        )
+        per_cycle = len(self._sightings[0].t) / len(stamps)
+        return with_detections(self._found, self._noise, errors, sigmas, cones.table.t, (*counts, per_cycle))
 
     def _passed(self, found: MeasuredNoise) -> MeasuredNoise | None:
         self._passes -= 1
@@ -331,13 +315,40 @@ class Measurement:
         return None if self._passes else found
 
 
-def measure(
-    cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None
-) -> MeasuredNoise | None:
-    """Return the noise that the readings show; None where not even the odometry's is known."""
-    measurement = Measurement.of(cycles, twists, known)
-    if measurement is None:
+def odometry_of(twists: TwistRecord, known: MeasuredNoise | None) -> MeasuredNoise | None:
+    """Return what is known, with the noise of the odometry; None where not even that can be told."""
+    white = twists.white()
+    if white is None:
         return None
-    while (found := measurement.advance()) is None:
-        pass
-    return found
+    sigma, interval = white
+    found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
+    return replace(found, odometry=sigma, interval=interval)
+
+
+def with_detections(
+    found: MeasuredNoise,
+    noise: Rays,
+    errors: Array,
+    sigmas: Array,
+    t: Array,
+    counts: tuple[int, float, float],
+) -> MeasuredNoise:
+    """Return what was found with the noise of detections that were seen at t (n,), and constants (7,).
+
+    The counts are the detections of one cone, the time between them (s), and the detections of a cycle.
+    """
+    sigmas = np.hypot(sigmas, MODEL_ERROR * np.abs(errors))
+    is_bent = np.abs(errors[OF_BEND]) > SURE * sigmas[OF_BEND]
+    count, period, per_cycle = counts
+    return replace(
+        found,
+        along=noise[0],
+        across=noise[1],
+        count=count,
+        period=period,
+        per_cycle=per_cycle,
+        sensor=errors[:SENSOR_SIZE],
+        sensor_sigma=sigmas[:SENSOR_SIZE],
+        range_bend=float(errors[OF_BEND]) if is_bent else 0.0,
+        seconds=float(np.sum(np.minimum(np.diff(np.unique(t)), 1.0))),
+    )

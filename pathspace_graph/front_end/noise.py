@@ -9,13 +9,14 @@ import numpy as np
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import NoiseSource, RunNoise
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
+from .line_noise import LineMeasurement
 from .measurement import Measurement
 from .sightings import SeenCycle, TwistRecord
 
@@ -31,8 +32,11 @@ REFERENCE_RANGE: Final = 10.0  # range at which the scatter of ranges tells how 
 class NoiseLearner:
     """Measurement of the noise of a drive as it goes on, which never reads ahead."""
 
-    def __init__(self, known: KnownNoise, use: str | None) -> None:
-        """Keep what is known before the drive; `use` is `MapperSettings.noise`."""
+    def __init__(self, known: KnownNoise, use: str | None, *, of_lines: bool = False) -> None:
+        """Keep what is known before the drive; `use` is `MapperSettings.noise`.
+
+        All detections that it observes are points of lines, or none are.
+        """
         self.known = known
         self.of_odometry = use == "measured" or (use is None and not known.odometry_stated)
         self.of_detections = use == "measured" or (use is None and not known.detections_stated)
@@ -41,7 +45,8 @@ class NoiseLearner:
         self.measured = known.measured  # what was measured so far, or by an earlier look at the whole drive
         self._cycles: tuple[SeenCycle, ...] = ()  # the newest ones
         self._twists = TwistRecord()
-        self._measurement: Measurement | None = None
+        self._of_lines = of_lines
+        self._measurement: Measurement | LineMeasurement | None = None
         self._driven, self._due = 0.0, FIRST
         self._t: float | None = None
 
@@ -80,7 +85,7 @@ class NoiseLearner:
         self._t = detections.t
         if self._measurement is None and self._driven >= self._due:
             self._due = AGAIN * self._driven
-            self._measurement = Measurement.of(self._cycles, self._twists, self.measured)
+            self._measurement = begun(self._cycles, self._twists, self.measured, of_lines=self._of_lines)
         found = None if self._measurement is None else self._measurement.advance()
         if found is None:
             return False
@@ -179,3 +184,22 @@ def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
     if stated and not (measured and known):
         return "stated"
     return "measured" if known else "assumed"
+
+
+def begun(
+    cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None, *, of_lines: bool
+) -> Measurement | LineMeasurement | None:
+    """Begin to measure the noise of cones or of lines; None where not even the odometry's can be told."""
+    return (LineMeasurement if of_lines else Measurement).of(cycles, twists, known)
+
+
+def measure(
+    cycles: Sequence[SeenCycle], twists: TwistRecord, *, of_lines: bool = False
+) -> MeasuredNoise | None:
+    """Return the noise that the readings show, of cones or of lines; None where none can be told."""
+    measurement = begun(cycles, twists, None, of_lines=of_lines)
+    if measurement is None:
+        return None
+    while (found := measurement.advance()) is None:
+        pass
+    return found

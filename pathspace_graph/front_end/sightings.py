@@ -63,6 +63,20 @@ class SeenCycle:
     twist: Array  # (3,) twist of the vehicle: m/s, m/s, rad/s
 
 
+def by_bias(t: Array, poses: Array, since: tuple[float, Array, Array] | None = None) -> Array:
+    """Return the derivatives (c, 3) of poses (c, 3) at t (c,) by the bias of the yaw rate.
+
+    It acts since a stamp with a pose and its derivative (3,), or since the first pose.
+    """
+    stamp, pose, begun = since or (t[0], poses[0], np.zeros(3))
+    moved, dt = np.diff(poses[:, :2], axis=0, prepend=pose[None, :2]), np.diff(t, prepend=stamp)
+    turned = begun[2] - (t - stamp)
+    middle = turned + 0.5 * dt
+    derivatives = np.column_stack([np.cumsum(left_of(moved) * middle[:, None], axis=0), turned])
+    derivatives[:, :2] += begun[:2]
+    return derivatives
+
+
 class ConeTracker:
     """Cones that were seen in the last seconds, by dead reckoning."""
 
@@ -96,20 +110,10 @@ class ConeTracker:
         cones, self._cones, self._count = kernels.followed(
             *cycles_seen, self._cones, self._count, (MAX_AGE, *FOLLOWING)
         )
-        of_cone, by_bias = cones >= 0, self._by_bias(t, poses)
-        own = cycle[of_cone]
-        return Sightings(cones[of_cone], t[own], measured[of_cone], twists[own], poses[own], by_bias[own])
-
-    def _by_bias(self, t: Array, poses: Array) -> Array:
-        """Return the derivatives (c, 3) of the poses by the bias of the yaw rate."""
-        stamp, pose, by_bias = self._from or (t[0], poses[0], np.zeros(3))
-        moved, dt = np.diff(poses[:, :2], axis=0, prepend=pose[None, :2]), np.diff(t, prepend=stamp)
-        turned = by_bias[2] - (t - stamp)
-        middle = turned + 0.5 * dt
-        derivatives = np.column_stack([np.cumsum(left_of(moved) * middle[:, None], axis=0), turned])
-        derivatives[:, :2] += by_bias[:2]
+        of_cone, derivatives = cones >= 0, by_bias(t, poses, self._from)
         self._from = t[-1], poses[-1], derivatives[-1]
-        return derivatives
+        own = cycle[of_cone]
+        return Sightings(cones[of_cone], t[own], measured[of_cone], twists[own], poses[own], derivatives[own])
 
     def _gates(self, ranges: Array) -> tuple[Array, Array]:
         """Return how far along and across its ray a detection (m,) may be from its cone (m)."""

@@ -8,7 +8,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, move_points, rotation
 
-from .map import Map, MapBoundary, PointBoundary, SplineBoundary
+from .map import Map, MapBoundary, PointBoundary
 from .results import RunResult
 
 Run = TypeVar("Run", bound=RunResult)
@@ -31,7 +31,7 @@ def _moved(boundary: MapBoundary, motion: Array) -> MapBoundary:
     if isinstance(boundary, PointBoundary):
         return _moved_points(boundary, motion)
     spline = replace(boundary.spline, control_points=move_points(motion, boundary.spline.control_points))
-    return SplineBoundary(spline, _turned(boundary.covariance, motion), boundary.confirmed_until)
+    return replace(boundary, spline=spline, covariance=_turned(boundary.covariance, motion))
 
 
 def _moved_points(cones: PointBoundary, motion: Array) -> PointBoundary:

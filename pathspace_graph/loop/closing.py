@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from scipy.linalg import block_diag
 
-from pathspace_graph.batch.association import POSE_STEP, headings, locate_poses
+from pathspace_graph.batch.association import LINE_STEP, POSE_STEP, headings, locate_poses
 from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.arrays import Array
@@ -82,14 +82,21 @@ class PeriodicCurve:
 
 
 def make_periodic(
-    boundary: Boundary, control_points: Array, settings: MapperSettings, knots: Knots
+    boundary: Boundary,
+    control_points: Array,
+    settings: MapperSettings,
+    knots: Knots,
+    *,
+    is_line: bool = False,
 ) -> PeriodicCurve:
     """Return the periodic curve that is nearest to an open one with control points (n, 2).
 
-    Its number of control points is a share of that of its cones, which lie at their parameters on the curve.
+    Its number of control points is a share of that of its cones, which lie at their parameters on the curve,
+    or of the places that stand for those of a line.
     """
     spline, overlap = boundary.spline(control_points), find_overlap(boundary, control_points)
     period, u = overlap.period, boundary.cone_parameters
+    u = np.arange(0.0, period, LINE_STEP) if is_line else u
     u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
     if knots == "curvature" or size >= len(u):
@@ -136,8 +143,9 @@ def find_overlap(boundary: Boundary, control_points: Array) -> Overlap:
 def simplify(smoother: CurveSmoother) -> None:
     """Replace every open curve by a periodic one of its final size, and step to the new optimum."""
     state, settings = smoother.map.state, smoother.map.settings
+    knots, lines = settings.spline.knots, settings.lines
     periodic = {
-        label: make_periodic(boundary, state.control_points(label), settings, settings.spline.knots)
+        label: make_periodic(boundary, state.control_points(label), settings, knots, is_line=label in lines)
         for label, boundary in state.boundaries.items()
     }
     substitute(smoother, periodic)

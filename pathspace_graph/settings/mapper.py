@@ -236,7 +236,7 @@ class MapperSettings(Positive):
     kind: Kind | None = None
     """What detections are of: cones, which stay where they are, or a line, whose points lie anywhere along
     it, on both sides or on one. By default the log states it, or its first seconds tell it; an online
-    estimator that is made without one takes cones."""
+    estimator that is made without one takes cones, and a notice tells if they are of a line."""
     scale: float | None = None
     """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road. All
     lengths of the settings are those at scale 1. By default the first metres of the log tell it; an online

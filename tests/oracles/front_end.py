@@ -10,7 +10,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_bend, by_sensor
-from pathspace_graph.front_end.measurement import OF_BEND, PRIOR, _runs, pairs
+from pathspace_graph.front_end.measurement import OF_BEND, PRIOR, pairs, runs
 from pathspace_graph.front_end.sightings import Cones
 
 from .measuring import to_map
@@ -215,7 +215,7 @@ def references(
     i, j = pairs(cone)
     chosen = (np.abs(t[j] - t[i]) < time) & (ranges[j] < share * ranges[i])
     i, j = i[chosen], j[chosen]
-    begins, counts = _runs(i)
+    begins, counts = runs(i)
     rows = i[begins]
     both, total = np.column_stack([np.abs(t[j] - t[i]), values[j]]), np.add.reduceat(weight[j], begins)
     means = np.add.reduceat(weight[j, None] * both, begins) / total[:, None]

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from pathspace_graph.front_end.kind import KindJudge, kind_of, trusts_odometry, with_kind
-from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
+from pathspace_graph.front_end.front_end import OF_LINES, FrontEnd
+from pathspace_graph.front_end.kind import KindJudge, kind_of, with_kind
+from pathspace_graph.io.log import Detections, Odometry, SensorInfo
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ...scenes.lines import line_drive
@@ -95,42 +96,11 @@ def test_a_setting_comes_before_the_log_and_the_log_before_its_readings() -> Non
     }
 
 
-# --- the size of the map ---------------------------------------------------------------------------------
-
-
-def log_with(sigma: float, at: float, stated: bool = True) -> Log:
-    """Return a log of two rows of lines whose detections at a range (m) have a standard deviation (m)."""
-    points = np.column_stack([np.full(8, 0.6 * at), np.full(8, 0.8 * at)])
-    near = np.concatenate([points, points / 10.0])  # whose noise is a larger share of their ranges
-    turned = np.array([[0.6, -0.8], [0.8, 0.6]])
-    smeared = turned @ np.diag([sigma**2, 9.0]) @ turned.T  # nothing is claimed along the line
-    labels = np.full(len(near), LEFT)
-    seen = Detections(0.0, near, np.tile(smeared, (len(near), 1, 1)), labels)
-    return replace(line_drive(1, 1.0), cycles=(seen,), detections_stated=stated)
-
-
-@pytest.mark.parametrize(
-    ("sigma", "stated", "trust", "expected"),
-    [
-        (0.03, True, None, False),  # a laser: 0.3 % of a range, where the odometry's scale is known to 0.5 %
-        (0.10, True, None, True),  # a camera: 1 %
-        (0.03, False, None, True),  # what is assumed says nothing
-        (0.03, True, "odometry", True),
-        (0.10, True, "ranges", False),
-    ],
-)
-def test_what_is_known_better_sets_the_size_of_the_map(
-    sigma: float, stated: bool, trust: Any, expected: bool
-) -> None:
-    settings = MapperSettings(kind="line")
-    settings = replace(settings, calibration=replace(settings.calibration, trust=trust))
-    log = log_with(sigma, 10.0, stated)
-    found = with_kind(settings, log)
-    assert trusts_odometry(settings, log) is expected
-    assert found.odometry.hold_scale is expected
-    assert found.calibration.sigma_range_scale == (0.05 if expected else 0.0005)
-
-
-def test_cones_are_measured_and_their_priors_stay() -> None:
-    settings = MapperSettings(kind="cones")
-    assert with_kind(settings, log_with(0.10, 10.0)) == settings
+def test_a_live_mapper_tells_once_that_it_takes_lines_for_cones() -> None:
+    log = line_drive(1, 1.0)
+    notices = {}
+    for kind in (None, "line"):
+        front_end = FrontEnd(MapperSettings(kind=kind), log.noise)
+        readings = [front_end.update(*cycle).notice for cycle in list(split_odometry(log))[:160]]
+        notices[kind] = [notice for notice in readings if notice]
+    assert notices == {None: [OF_LINES.format("line")], "line": []}

@@ -6,8 +6,7 @@ import numpy as np
 
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.front_end.front_end import FrontEnd
-from pathspace_graph.front_end.line_matching import match_lines, targets_on_lines
-from pathspace_graph.front_end.lines import merged
+from pathspace_graph.front_end.line_matching import match_lines, merged, targets_on_lines
 from pathspace_graph.front_end.scan_matching import MATCH_LIMITS, REACHES, REACHES_CHECK
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
