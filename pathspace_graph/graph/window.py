@@ -285,7 +285,7 @@ def rows_on_poses(
     None where one holds points of the map, which are others in a batch. The rows are owned by the cycle.
     """
     found = []
-    for linear in _linear([one for one in factors if _holds_pose(one)], variables):
+    for linear in _linear(factors, variables):
         keys, (A, b) = keys_of_factor(linear), linear.jacobian()
         if not (are_poses(keys) | np.isin(keys, variables.calibration_keys)).all():
             return None

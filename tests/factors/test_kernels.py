@@ -16,7 +16,14 @@ from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import CALIBRATION_KEY, ORIGIN_KEY, Layout, control_keys, pose_keys
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    INDEX_BITS,
+    ORIGIN_KEY,
+    Layout,
+    control_keys,
+    pose_keys,
+)
 
 from ..oracles import cones, curves, footpoint, front_end, measuring, rows, spans
 
@@ -194,11 +201,18 @@ def views(rng: np.random.Generator, periodic: bool) -> tuple[Any, ...]:
     return laid, control_points, known, *where, beside, poses(rng, 1)[0], rooms, 0.7, 50
 
 
+def keys_to_lay_out(rng: np.random.Generator) -> tuple[Any, ...]:
+    """Keys of letters 1 to 6, of which 3 is that of the sensors' calibrations, and 5 the first of poses."""
+    letter = 1 << INDEX_BITS
+    keys = np.sort(rng.integers(1, 7, COUNT) * letter + rng.integers(0, 9, COUNT))
+    return keys, 3 * letter, 5 * letter, (2, 5, 3), letter * np.arange(1, 7)
+
+
 CASES: dict[str, Arguments] = {
     "summed": rows_of_a_system,
     "block_of": lambda rng: ((system := rows_with_keys(rng))[0], [system[1]] * 2),
     "moved_residual": lambda rng: (*rows_with_keys(rng), rng.normal(size=30)),
-    "laid_out": lambda rng: (np.sort(rng.integers(0, 50, COUNT)), 5, 40, (2, 5, 3), np.arange(0, 60, 7)),
+    "laid_out": keys_to_lay_out,
     "columns_of": some_columns,
     "spread": lambda rng: (rng.integers(0, 99, COUNT), rng.integers(0, 4, COUNT)),
     "shifted": lambda rng: (rng.normal(size=(COUNT, 2)) * 9.0, poses(rng), rng.normal(size=5)),

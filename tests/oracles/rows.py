@@ -12,7 +12,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.graph.inactive import Link
 from pathspace_graph.graph.relative import by_frame_of, from_frame, rotations, to_frame
 from pathspace_graph.graph.rows import Parts, Rows, among, stacked_rows
-from pathspace_graph.graph.variables import NO_KEYS, POSE, UNKNOWN, Layout
+from pathspace_graph.graph.variables import INDEX_BITS, NO_KEYS, POSE, UNKNOWN, Layout
 
 
 def laid_out(
@@ -20,7 +20,8 @@ def laid_out(
 ) -> tuple[IntArray, IntArray, int, list[int]]:
     """Return the widths (k,) and the first columns (k,) of variables, and their number of columns."""
     point, sensor, pose = sizes
-    widths = np.where(keys >= first_pose, pose, np.where(keys == sensor_key, sensor, point))
+    senses = (keys >= sensor_key) & (keys < sensor_key + (1 << INDEX_BITS))
+    widths = np.where(keys >= first_pose, pose, np.where(senses, sensor, point))
     ends = np.append(0, widths.cumsum())
     return widths, ends[:-1], int(ends[-1]), ends[keys.searchsorted(bounds)].tolist()
 

@@ -6,6 +6,7 @@ import hashlib
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future
+from dataclasses import is_dataclass
 from functools import cached_property
 from typing import Any
 
@@ -32,7 +33,7 @@ def digest(estimator: object) -> str:
 
 
 def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
-    """The contents of an object, each object once."""
+    """The contents of an object, each once that can change: equal frozen ones may be one or several."""
     if isinstance(value, np.ndarray):
         yield f"{value.dtype}{value.shape}".encode() + value.tobytes()
     elif isinstance(value, dict):
@@ -44,7 +45,8 @@ def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
             yield from _parts(entry, seen)
     elif type(value).__module__.startswith("pathspace_graph") and not isinstance(value, Gate | RowStore):
         if id(value) not in seen:
-            seen.add(id(value))
+            if not _is_frozen(value):
+                seen.add(id(value))
             yield type(value).__qualname__.encode()
             yield from _parts(_held(value), seen)
     elif isinstance(value, gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet):
@@ -56,6 +58,10 @@ def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
         yield from _parts(np.array(value.data) if isinstance(value, KDTree) else value.parts(), seen)
     elif not isinstance(value, Gate | Future):
         yield repr(value).encode()
+
+
+def _is_frozen(value: object) -> bool:
+    return is_dataclass(value) and bool(value.__dataclass_params__.frozen)  # type: ignore[attr-defined]
 
 
 def _held(value: object) -> dict[str, Any]:
