@@ -62,6 +62,14 @@ class KnownMap:
         return cls(splines, confirmed, joint, cones, keep)
 
     @property
+    def ends(self) -> dict[int, float]:
+        """Return from where on each curve grows (m), infinity where all of it is confirmed: it is whole."""
+        return {
+            label: np.inf if self.kept or self.confirmed[label] >= spline.domain[1] else self.confirmed[label]
+            for label, spline in self.splines.items()
+        }
+
+    @property
     def closed(self) -> bool:
         return any(spline.periodic for spline in self.splines.values())
 

@@ -224,7 +224,7 @@ def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array)
     smoother.reactivate(with_prior=False)
     before, removed = state.poses[-1].copy(), state.map_keys
     road.move(as_pose(motion))
-    road.growth.wait_for({} if known.closed else known.confirmed)
+    road.growth.wait_for({} if known.closed else known.ends)
     curves = {label: _next(state.boundaries, known, label, road.settings) for label in known.splines}
     state.replace_curves(curves)
     added = np.concatenate([control_keys(label, b.numbers) for label, b in state.boundaries.items()])

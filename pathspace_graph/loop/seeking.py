@@ -141,7 +141,7 @@ class Seeking:
 
 
 class OnOpenMap:
-    """A known map that is open: it is localized on and refined, and grows past its end."""
+    """A known map that is open: it is localized on and refined, and grows past a tentative end."""
 
     uses_detections = True
 

@@ -44,9 +44,8 @@ def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
         for entry in sorted(value) if isinstance(value, set | frozenset) else value:
             yield from _parts(entry, seen)
     elif type(value).__module__.startswith("pathspace_graph") and not isinstance(value, Gate | RowStore):
-        if id(value) not in seen:
-            if not _is_frozen(value):
-                seen.add(id(value))
+        if _is_frozen(value) or id(value) not in seen:
+            seen.add(id(value))
             yield type(value).__qualname__.encode()
             yield from _parts(_held(value), seen)
     elif isinstance(value, gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet):
