@@ -30,6 +30,7 @@ from .experiment.study import Baseline, Study, find_study, read_study_file
 from .experiment.tables import TextTable
 from .hints import HintStudy
 from .joint import JointStudy, joint_table
+from .known import KnownStudy, known_table
 from .views import ESTIMATORS, LANDMARKS, ONLINE, Figure, Rows, View
 
 FORMAT: Final = "pathspace-figures/1"
@@ -44,7 +45,17 @@ PAGES: Final = {  # tables of each page, from the root of the project
     ),
     "docs/real.md": ("real-runs", "real-maps", "real-joint", "real-measured"),
     "docs/closing.md": ("skidpad",),
-    "docs/studies.md": ("camera", "closing", "hard", "lines", "endurance", "reach", "joint", "paper"),
+    "docs/studies.md": (
+        "camera",
+        "closing",
+        "hard",
+        "lines",
+        "endurance",
+        "reach",
+        "known",
+        "joint",
+        "paper",
+    ),
     "docs/reliability.md": ("faults", "recovery", "hints"),
     "docs/ablations.md": ("centerline", *ABLATIONS),
 }
@@ -196,6 +207,11 @@ class Plan:
         frame = JointStudy(jobs=self.jobs, **small).measure(self.on_cell)
         return {"joint": joint_table(frame)}
 
+    def known(self, _: Path) -> Views:
+        small: dict[str, Any] = {"tracks": (60,), "begins": (0.3,)} if self.quick else {}
+        frame = KnownStudy(jobs=self.jobs, **small).measure(self.on_cell)
+        return {"known": known_table(frame)}
+
     def speed(self, _: Path) -> Views:
         seeds, laps = (GENERATED[:1], 1) if self.quick else (GENERATED, 5)
         runs = [{m.key: m.value for m in metrics(measure_drive(seed, laps))} for seed in seeds]
@@ -249,6 +265,7 @@ EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
     "centerline": Plan.centerline,
     **dict.fromkeys(ABLATIONS, Plan.ablation),
     "hints": Plan.hints,
+    "known": Plan.known,
     "joint": Plan.joint,
     "speed": Plan.speed,
     "scale": Plan.scale,

@@ -159,8 +159,8 @@ class Report:
 
     The experiments are `accuracy`, `skidpad`, `camera`, `faults`, `hard`, `endurance`, `centerline`, the
     ablations `gauge`, `robust`, `density`, `lag`, `relinearize`, `degree` and `covariance`, and `hints`,
-    `joint`, `speed`, `scale` and, with logs, `real`. Each study keeps its runs in a folder of its own, from
-    which a second call goes on.
+    `known`, `joint`, `speed`, `scale` and, with logs, `real`. Each study keeps its runs in a folder of its
+    own, from which a second call goes on.
     """
 
     out: Path

@@ -1,0 +1,169 @@
+"""How a vehicle finds itself on a known map: anywhere on it, on that of another track, on a changed one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+from joblib import Parallel, delayed
+
+from pathspace_graph.batch.known_map import map_of_cones
+from pathspace_graph.estimators import DEFAULT_ONLINE, make_online, settings_of
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import compose
+from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.map import Map
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.run import run_online
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+
+from .experiment.run import OnCell, workers
+from .metrics.accuracy import lap_metrics
+from .metrics.trajectory import interpolate_poses
+from .views import Figure, View
+
+CARS: Final[Mapping[str, SimulationSettings]] = {
+    "plain": SimulationSettings(laps=2),
+    "drawn": SimulationSettings(laps=2, draw=True),
+}
+"""Drives of cars with white noise, and of other cars, each drawn with errors of its own."""
+OWN, SURVEYED, MOVED, OTHER = "another drive's", "surveyed", "surveyed, 7 cones moved", "another track's"
+KINDS: Final = (OWN, SURVEYED, MOVED, OTHER)  # of known maps
+SIGMA_SURVEY: Final = 0.15  # of the cones of a surveyed map (m)
+MOVED_CONES, MOVED_BY = 7, 2.5  # number of neighbours on the left that were moved, and how far (m)
+SOON: Final = 8.0  # time after which the vehicle should be found (s)
+DRIVEN: Final = 40.0  # time that is driven on a known map (s)
+WRONG: Final = 2.0  # distance (m) from the true pose at which the place where it was found is a wrong one
+COLUMNS: Final = {  # of the table: title, digits, factor
+    "found": ("found [%]", 0, 100.0),
+    "soon": (f"within {SOON:.0f} s [%]", 0, 100.0),
+    "wrong": ("at a wrong place [%]", 0, 100.0),
+    "error": ("pose error [m]", 2, 1.0),
+    "map": ("rmse of the map [m]", 2, 1.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownStudy:
+    """Drives of generated tracks that begin anywhere on a map that was known before."""
+
+    tracks: tuple[int, ...] = (60, 61, 62, 63, 64, 65, 66, 67)  # seeds
+    begins: tuple[float, ...] = (0.0, 0.3, 0.6)  # where drives begin, as shares of the first lap's time
+    cars: Mapping[str, SimulationSettings] = field(default_factory=lambda: CARS)
+    jobs: int = 1
+
+    def measure(self, on_cell: OnCell | None = None) -> pd.DataFrame:
+        """Return a row for each drive: car, track, kind of map, begin, and the metrics of `COLUMNS`."""
+        cells = [(car, track) for track in self.tracks for car in self.cars]
+        rows = list[dict[str, Any]]()
+        with workers(self.jobs, None):
+            running = Parallel(return_as="generator_unordered")(
+                delayed(self._of_track)(car, track) for car, track in cells
+            )
+            for done, found in enumerate(running, start=1):
+                rows += found
+                if on_cell is not None:
+                    on_cell(done, len(cells))
+        return pd.DataFrame(rows)
+
+    def _of_track(self, car: str, number: int) -> list[dict[str, Any]]:
+        """Return the rows of the second drive of a track, on maps of the first one and of another track."""
+        settings, rows = self.cars[car], list[dict[str, Any]]()
+        first, second = (simulate(generated(number), settings, seed) for seed in (0, 1))
+        elsewhere = simulate(generated(number + 1000), settings, 0)
+        truth = truth_of(first)
+        motion = motion_onto(truth_of(second).cones, truth.cones)
+        rng = np.random.default_rng(number)
+        maps = {
+            OWN: mapped(first),
+            SURVEYED: surveyed(truth, rng),
+            MOVED: surveyed(truth, rng, MOVED_CONES),
+            OTHER: mapped(elsewhere),
+        }
+        for kind, known in maps.items():
+            rmse = np.nan if kind == OTHER else lap_metrics(known, truth, 0).rmse
+            for share in self.begins:
+                about = {"car": car, "track": number, "kind": kind, "begin": share, "map": rmse}
+                rows.append(about | drive_on(known, second, share, motion))
+        return rows
+
+
+def generated(number: int) -> Any:
+    return generate_track(np.random.default_rng(number))
+
+
+def truth_of(log: Log) -> Truth:
+    assert log.truth is not None
+    return log.truth
+
+
+def mapped(log: Log) -> Map:
+    """Return the online map of a drive."""
+    return run_online(log, make_online(DEFAULT_ONLINE, MapperSettings(), log), name=DEFAULT_ONLINE).map
+
+
+def surveyed(truth: Truth, rng: np.random.Generator, moved: int = 0) -> Map:
+    """Return the map of surveyed cones, before `moved` neighbours on the left were put elsewhere."""
+    rows = {label: truth.cones[truth.cone_labels == label] for label in (LEFT, RIGHT)}
+    cones = {label: row + SIGMA_SURVEY * rng.normal(size=row.shape) for label, row in rows.items()}
+    begin = int(rng.integers(len(cones[LEFT])))
+    chosen = (begin + np.arange(moved)) % len(cones[LEFT])
+    middle = np.array([cones[RIGHT][np.hypot(*(cones[RIGHT] - c).T).argmin()] for c in cones[LEFT][chosen]])
+    if moved:
+        outwards = cones[LEFT][chosen] - middle
+        cones[LEFT][chosen] += MOVED_BY * outwards / np.hypot(*outwards.T)[:, None]
+    return map_of_cones(cones[LEFT], cones[RIGHT], True, SIGMA_SURVEY)
+
+
+def begun_later(log: Log, share: float) -> Log:
+    """Return a log from a share of its first half's time on, without truth, which is in another frame."""
+    t = log.odometry.t
+    begin = float(t[0] + 0.5 * share * (t[-1] - t[0]))
+    later = log.odometry.between(begin, float(t[-1]))
+    cycles = tuple(cycle for cycle in log.cycles if later.t[0] < cycle.t < begin + DRIVEN)
+    return replace(log, odometry=later, cycles=cycles, truth=None)
+
+
+def drive_on(known: Map, log: Log, share: float, motion: Array) -> dict[str, Any]:
+    """Return how a drive goes that begins later on a known map, onto whose frame a motion (3,) leads."""
+
+    truth, later = truth_of(log), begun_later(log, share)
+    mapper = FixedLagMapper.on(known, settings_of(MapperSettings(), later), later.noise)
+    result = run_online(later, mapper, name=DEFAULT_ONLINE)
+    found_at = mapper.placed_at
+    if found_at is None:
+        return {"found": 0.0, "soon": 0.0, "wrong": 0.0, "error": np.nan}
+    true = compose(motion, interpolate_poses(truth.pose_t, truth.poses, result.trajectory_t))
+    away = np.hypot(*(result.trajectory - true)[result.trajectory_t >= found_at, :2].T)
+    is_soon, is_wrong = found_at - later.odometry.t[0] <= SOON, away[0] > WRONG
+    return {
+        "found": 1.0,
+        "soon": float(is_soon),
+        "wrong": float(is_wrong),
+        "error": float(np.sqrt(np.mean(away**2))),
+    }
+
+
+def motion_onto(points: Array, onto: Array) -> Array:
+    """Return the motion (3,) that leads points (n, 2) onto others, by least squares (Umeyama 1991)."""
+    middle, goal = points.mean(axis=0), onto.mean(axis=0)
+    a, b = (points - middle) @ [1.0, 1j], (onto - goal) @ [1.0, 1j]
+    turn = float(np.angle(np.vdot(a, b)))
+    turned = complex(*middle) * np.exp(1j * turn)
+    return np.array([goal[0] - turned.real, goal[1] - turned.imag, turn])
+
+
+def known_table(frame: pd.DataFrame) -> View:
+    """Return a row for each car and kind of map, over tracks: the drives of one are no sample."""
+    rows = []
+    for car, of_car in frame.groupby("car", sort=False):
+        for kind in KINDS:
+            drives = of_car[of_car["kind"] == kind]
+            means = drives.groupby("track")[[*COLUMNS]].mean()
+            figures = (Figure.of(means[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
+            rows.append((f"{car}, {kind} ({len(drives)} drives)", tuple(figures)))
+    return ("cars, known map", *(title for title, _, _ in COLUMNS.values())), tuple(rows)

@@ -1,0 +1,78 @@
+"""The study of known maps: what it drives on, how a drive begins later, and its table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pathspace_graph.eval.known import (
+    KINDS,
+    OWN,
+    begun_later,
+    drive_on,
+    known_table,
+    motion_onto,
+    surveyed,
+    truth_of,
+)
+from pathspace_graph.factors.se2 import compose, move_points
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.sim.track import to_map_frame
+
+from ..scenes.kidnapped import laps_log, pear_track
+
+LOG = laps_log(pear_track())
+
+
+def test_points_are_moved_onto_others_by_least_squares() -> None:
+    rng = np.random.default_rng(3)
+    points, motion = rng.normal(size=(9, 2)) * 20.0, np.array([3.0, -1.0, 2.5])
+    np.testing.assert_allclose(motion_onto(points, move_points(motion, points)), motion, atol=1e-9)
+    np.testing.assert_allclose(compose(motion, np.zeros(3)), motion)
+
+
+def test_a_drive_that_begins_later_has_what_came_then_and_no_truth() -> None:
+    """A share of 0.4 of half the log is a fifth of it."""
+    later, t = begun_later(LOG, 0.4), LOG.odometry.t
+    begin = t[0] + 0.2 * (t[-1] - t[0])
+    assert later.odometry.t[0] == pytest.approx(begin, abs=0.11)
+    assert begin <= later.cycles[0].t < begin + 0.3
+    assert later.truth is None
+
+
+def test_of_a_surveyed_map_some_neighbours_on_the_left_stood_elsewhere() -> None:
+    truth, track = truth_of(LOG), to_map_frame(pear_track())
+    curves = surveyed(truth, np.random.default_rng(1), moved=7).splines
+    off = {
+        label: np.abs(curves[label].foot_points(cones).distance)
+        for label, cones in ((LEFT, track.left), (RIGHT, track.right))
+    }
+    assert 4 <= (off[LEFT] > 1.0).sum() <= 9
+    assert off[LEFT].max() < 3.5
+    assert off[RIGHT].max() < 0.6
+
+
+def test_a_vehicle_is_held_against_its_true_place_on_the_map() -> None:
+    known = surveyed(truth_of(LOG), np.random.default_rng(1))
+    found = drive_on(known, LOG, 0.5, np.zeros(3))
+    assert (found["found"], found["soon"], found["wrong"]) == (1.0, 1.0, 0.0)
+    assert found["error"] < 0.2
+    displaced = drive_on(known, LOG, 0.5, np.array([5.0, 0.0, 0.0]))
+    assert displaced["wrong"] == 1.0
+    assert displaced["error"] == pytest.approx(5.0, abs=0.3)
+
+
+def test_the_table_has_a_row_for_each_kind_of_map_over_tracks() -> None:
+    rest = {"car": "plain", "soon": 1.0, "wrong": 0.0, "map": 0.1}
+    rows = [
+        {**rest, "track": track, "kind": kind, "found": found, "error": error}
+        for kind in KINDS
+        for track, found, error in ((0, 1.0, 0.1), (0, 0.0, np.nan), (1, 1.0, 0.3))
+    ]
+    header, table = known_table(pd.DataFrame(rows))
+    assert header[0] == "cars, known map"
+    assert [label for label, _ in table] == [f"plain, {kind} (3 drives)" for kind in KINDS]
+    assert table[0][0].startswith(f"plain, {OWN}")
+    assert table[0][1][0].value == pytest.approx(75.0)  # not two thirds: each track counts once
+    assert table[0][1][3].value == pytest.approx(0.2)
