@@ -6,7 +6,6 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
 
 from pathspace_graph.batch.joint_mapper import join
 from pathspace_graph.batch.mapper import BatchResult
@@ -16,19 +15,14 @@ from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.moved import moved_run
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track_generator import generate_track
 
-from .experiment.run import OnCell, workers
+from .cars import CARS, generated, on_tracks
+from .experiment.run import OnCell
 from .metrics.alignment import shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
 from .metrics.trajectory import position_rms, trajectory_errors
 from .views import Figure, View
 
-CARS: Final[Mapping[str, SimulationSettings]] = {
-    "plain": SimulationSettings(laps=2),
-    "drawn": SimulationSettings(laps=2, draw=True),
-}
-"""Drives of cars with white noise, and of as many other cars, each drawn with errors of its own."""
 COLUMNS: Final = {  # of the table: title, digits, factor
     "shape": ("rmse of the shape [m]", 3, 1.0),
     "ratio": ("by half as many", 2, 1.0),
@@ -49,21 +43,11 @@ class JointStudy:
 
     def measure(self, on_cell: OnCell | None = None) -> pd.DataFrame:
         """Return a row for each map: car, track, number of drives, and the metrics of `COLUMNS`."""
-        cells = [(car, track) for track in self.tracks for car in self.cars]
-        rows = list[dict[str, Any]]()
-        with workers(self.jobs, None):
-            running = Parallel(return_as="generator_unordered")(
-                delayed(self._of_track)(car, track) for car, track in cells
-            )
-            for done, found in enumerate(running, start=1):
-                rows += found
-                if on_cell is not None:
-                    on_cell(done, len(cells))
-        return pd.DataFrame(rows)
+        return on_tracks(self._of_track, [*self.cars], self.tracks, self.jobs, on_cell)
 
     def _of_track(self, car: str, number: int) -> list[dict[str, Any]]:
         """Return the rows of one track, each drive of which is solved alone once."""
-        track, settings = generate_track(np.random.default_rng(number)), self.cars[car]
+        track, settings = generated(number), self.cars[car]
         logs = {str(seed): simulate(track, settings, seed) for seed in range(self.drives)}
         alone = {name: solve_alone(log) for name, log in logs.items()}
         names, rows, count = [*logs], list[dict[str, Any]](), 1

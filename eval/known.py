@@ -6,7 +6,6 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
 
 from pathspace_graph.batch.known_map import map_of_cones
 from pathspace_graph.estimators import DEFAULT_ONLINE, make_online, settings_of
@@ -19,18 +18,13 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track_generator import generate_track
 
-from .experiment.run import OnCell, workers
+from .cars import CARS, generated, on_tracks
+from .experiment.run import OnCell
 from .metrics.accuracy import lap_metrics
 from .metrics.trajectory import interpolate_poses
 from .views import Figure, View
 
-CARS: Final[Mapping[str, SimulationSettings]] = {
-    "plain": SimulationSettings(laps=2),
-    "drawn": SimulationSettings(laps=2, draw=True),
-}
-"""Drives of cars with white noise, and of other cars, each drawn with errors of its own."""
 OWN, SURVEYED, MOVED, OTHER = "another drive's", "surveyed", "surveyed, 7 cones moved", "another track's"
 KINDS: Final = (OWN, SURVEYED, MOVED, OTHER)  # of known maps
 SIGMA_SURVEY: Final = 0.15  # of the cones of a surveyed map (m)
@@ -58,17 +52,7 @@ class KnownStudy:
 
     def measure(self, on_cell: OnCell | None = None) -> pd.DataFrame:
         """Return a row for each drive: car, track, kind of map, begin, and the metrics of `COLUMNS`."""
-        cells = [(car, track) for track in self.tracks for car in self.cars]
-        rows = list[dict[str, Any]]()
-        with workers(self.jobs, None):
-            running = Parallel(return_as="generator_unordered")(
-                delayed(self._of_track)(car, track) for car, track in cells
-            )
-            for done, found in enumerate(running, start=1):
-                rows += found
-                if on_cell is not None:
-                    on_cell(done, len(cells))
-        return pd.DataFrame(rows)
+        return on_tracks(self._of_track, [*self.cars], self.tracks, self.jobs, on_cell)
 
     def _of_track(self, car: str, number: int) -> list[dict[str, Any]]:
         """Return the rows of the second drive of a track, on maps of the first one and of another track."""
@@ -90,10 +74,6 @@ class KnownStudy:
                 about = {"car": car, "track": number, "kind": kind, "begin": share, "map": rmse}
                 rows.append(about | drive_on(known, second, share, motion))
         return rows
-
-
-def generated(number: int) -> Any:
-    return generate_track(np.random.default_rng(number))
 
 
 def truth_of(log: Log) -> Truth:

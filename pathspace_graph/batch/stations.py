@@ -13,6 +13,7 @@ from pathspace_graph.mapping.detections import NO_STATION, DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.stations import SIGMA_POSE, CurveStations, Stations
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import ahead_of
 
 from .association import ROW_CONES, cones_of_curve, feet_of_cones
 
@@ -104,7 +105,7 @@ def laps_of(state: State, detections: DetectionTable, label: int) -> IntArray:
     """Return the lap (m,) on a closed curve in which each detection's foot point was passed, from 0."""
     pose_u, length = state.pose_u[label], state.boundaries[label].length
     at = pose_u[detections.cycle]
-    ahead = np.mod(detections.u - at + 0.5 * length, length) - 0.5 * length
+    ahead = ahead_of(at, detections.u, length)
     return np.asarray(np.floor((at + ahead - pose_u[0]) / length), np.intp)
 
 

@@ -28,9 +28,7 @@ class KnownTrack:
 
     path: Path
     map: Map
-    start: (
-        Array | None
-    )  # pose (3,) in m, m and rad, map frame, of the begin of an open one; None of a closed one
+    start: Array | None  # pose (3,) at the begin of an open one (m, m, rad), map frame; None of a closed one
 
     def found_at(self, estimator: OnlineEstimator) -> float | None:
         """Return the stamp (s) at which the vehicle was found on the map, if it was."""

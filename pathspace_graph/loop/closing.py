@@ -38,9 +38,7 @@ SEAM_MARGIN: Final = 0.5  # distance from the seam below which a cone is one of 
 SIGMAS_CALIBRATIONS: Final = (0.05, 0.02, 0.03, 0.1, 0.05, 0.05, 0.2)
 """Standard deviations of the calibrations where a known map is met: speeds and rates, then the sensor's yaw
 (rad), offset (m), latency (s), and scale and bias (m) of ranges. A map tells them all, its size as well."""
-FIRST_ROOM: Final = (
-    2.0  # by which the first place beside a pose on an open curve may be farther than another (m)
-)
+FIRST_ROOM: Final = 2.0  # by which the first place beside a pose may be farther off than another (m)
 FIRST_REACH: Final = 20.0  # about it, in which the poses of the window are located (m along the curve)
 SIGMA_STEP: Final = 10.0  # free motion of a control point in a step while the loop is optimized (m)
 

@@ -26,7 +26,7 @@ from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import GrowthSettings
-from pathspace_graph.spline.boundary import sampled
+from pathspace_graph.spline.boundary import ahead_of, sampled
 from pathspace_graph.spline.bspline import BSpline
 
 from .closing import SIGMA_STEP
@@ -213,11 +213,11 @@ def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bo
     boundary, points = state.boundaries[label], state.control_points(label)
     u = boundary.find_anywhere(points, cones).u
     middle = np.angle(np.exp(2j * np.pi * u / boundary.length).mean()) * boundary.length / (2.0 * np.pi)
-    within = _beyond(u, middle, boundary.length)
+    within = ahead_of(middle, u, boundary.length)
     low, high = within.min() - ROW, within.max() + ROW
 
     def is_there(at: Array) -> BoolArray:
-        beyond = _beyond(at, middle, boundary.length)
+        beyond = ahead_of(middle, at, boundary.length)
         return np.asarray((beyond > low) & (beyond < high))
 
     moved, every = np.flatnonzero(is_there(boundary.abscissae)), np.arange(*boundary.ends, SAMPLE)
@@ -233,11 +233,6 @@ def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bo
     place_again(smoother, state.keys(label)[moved], points[moved] + change, REPLACED)
     smoother.map.forget_cones(label, is_there)
     return True
-
-
-def _beyond(u: Array, middle: float, length: float) -> Array:
-    """Return how far parameters of a closed curve are beyond one of them (m)."""
-    return np.asarray(np.mod(u - middle + 0.5 * length, length) - 0.5 * length)
 
 
 def carried(points: Array, before: Array, after: Array) -> Array:

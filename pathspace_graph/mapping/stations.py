@@ -13,6 +13,7 @@ import numpy as np
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.spline.boundary import ahead_of
 
 from .detection_rows import DetectionRows, measuring_keys
 from .detections import NO_STATION, DetectionTable
@@ -51,7 +52,7 @@ class CurveStations:
         else:
             after = self.u.searchsorted(self.u[0] + np.mod(u - self.u[0], self.length))
             both = np.stack([after - 1, after]) % len(self.u)
-            beyond = np.mod(u - self.u[both] + 0.5 * self.length, self.length) - 0.5 * self.length
+            beyond = ahead_of(self.u[both], u, self.length)
         second = np.abs(beyond[1]) < np.abs(beyond[0])
         return np.where(second, both[1], both[0]), np.where(second, beyond[1], beyond[0])
 

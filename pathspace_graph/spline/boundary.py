@@ -261,6 +261,11 @@ def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
     return Boundary(knots, False, settings, gauge)
 
 
+def ahead_of(at: Array | float, u: Array, length: float) -> Array:
+    """Return how far parameters u are ahead of others (m), the shorter way around a curve of a length."""
+    return np.asarray(np.mod(u - at + 0.5 * length, length) - 0.5 * length)
+
+
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
     """Return the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
 

@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline as ScipyBSpline
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
-from pathspace_graph.spline.boundary import Boundary, open_boundary, relocate
+from pathspace_graph.spline.boundary import Boundary, ahead_of, open_boundary, relocate
 
 from ..scenes.maps import boundary_through
 
@@ -221,3 +221,9 @@ def test_an_open_curve_is_searched_only_at_its_end() -> None:
     """On its last 15 m the U-turn leads back only: a pose on the way there is given its end."""
     boundary, points = u_turn()
     assert relocate(boundary, points, np.array([5.0, 0.0, 0.0]), 15.0) == boundary.trusted
+
+
+def test_around_a_closed_curve_the_shorter_way_counts() -> None:
+    """On a curve of 10 m, 9.5 is half a metre behind 0, and 21 is one ahead of it."""
+    np.testing.assert_allclose(ahead_of(0.0, np.array([9.5, 21.0, 3.0]), 10.0), [-0.5, 1.0, 3.0])
+    np.testing.assert_allclose(ahead_of(np.array([9.0, 2.0]), np.array([1.0, 8.0]), 10.0), [2.0, -4.0])
