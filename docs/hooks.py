@@ -40,7 +40,9 @@ def figure(row: dict[str, str]) -> str:
 
 
 def made() -> str:
-    """Return a line with each commit, machine and date at which tables were measured."""
-    rows = [row for file in FIGURES.glob("*.csv") for row in read(file.name)]
-    each = sorted({(row["date"], row["commit"], row["machine"]) for row in rows})
-    return f"*Measured at {'; '.join(f'{commit} ({date}, machine {on})' for date, commit, on in each)}.*"
+    """Return a line with the commits and dates at which all tables were measured, by machine."""
+    machines = dict[str, set[str]]()
+    for row in (row for file in FIGURES.glob("*.csv") for row in read(file.name)):
+        machines.setdefault(row["machine"], set()).add(f"{row['date']} at {row['commit']}")
+    each = (f"{', '.join(sorted(times))} (machine: {name})" for name, times in sorted(machines.items()))
+    return f"*Measured {'; '.join(each)}.*"

@@ -106,9 +106,9 @@ class Plan:
         return {"": views.laps_table(frame, (1, 2, study.laps), CLOSING)}
 
     def lines(self, folder: Path) -> Views:
-        """Drive the study `lines`, and at its second spacing the landmark graph beside it."""
+        """Drive the study `lines`, and the landmark graph where points are 4 m apart: each is a landmark."""
         study, frame = self._shipped("lines", folder / "curves", seeds=(0,))
-        name = list(study.noise)[1]
+        name = "4 m"
         beside = replace(study, estimators=(LANDMARKS,), noise={name: study.noise[name]})
         frame = pd.concat([frame, self._run(beside, folder / "landmarks")], ignore_index=True)
         return {"": views.runs_table(frame, ("noise", "estimator"), LINES)}

@@ -352,7 +352,7 @@ def test_a_line_that_links_figures_becomes_their_table(
     (tmp_path / "one.csv").write_text("\n".join(["of,column,value,half_width,commit,machine,date", *rows]))
     page = hooks.on_page_markdown("[all](figures/)\n\n[One](figures/one.csv)\n\nsee [it](figures/one.csv)\n")
     assert page.splitlines() == [
-        "*Measured at abc (d, machine m).*",
+        "*Measured d at abc (machine: m).*",
         "",
         "| of | x | y |",
         "| :--- | ---: | ---: |",
