@@ -175,9 +175,8 @@ class Plan:
     def scale(self, _: Path) -> Views:
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
         header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
-        return {
-            "": (header, tuple((name, Figure.row((v for v, _ in row), 2)) for name, row in found.items()))
-        }
+        rows = ((name, Figure.row((value for value, _ in row), 2)) for name, row in found.items())
+        return {"": (header, tuple(rows))}
 
     def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:
         """Drive a shipped study, made smaller: with `quick` the first variant for one lap."""
