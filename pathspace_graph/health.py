@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from math import nan
-from typing import ClassVar, Final, Self
+from typing import ClassVar, Final
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 
 from .labels import BOUNDARIES, NAMES
 from .lengths import Length, Text
@@ -58,7 +58,7 @@ class Evidence:
     odometry: str = ""  # what is wrong with it since the cycle before
 
 
-class HealthMonitor:
+class HealthMonitor(Copyable):
     """Judge of the newest cycles' evidence together."""
 
     def __init__(self) -> None:
@@ -66,12 +66,6 @@ class HealthMonitor:
         self._offered = 0  # by all the recent cycles together
         self._last_offered: float | None = None
         self._wrong: int | None = None  # this boundary is wrong, as long as it explains too little
-
-    def copy(self) -> Self:
-        """Return a monitor that can go on independently."""
-        other = shallow(self)
-        other._recent = self._recent.copy()
-        return other
 
     def restart(self) -> None:
         self._recent.clear()

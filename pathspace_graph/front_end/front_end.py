@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
@@ -57,7 +57,7 @@ class Reading:
     notice: str = ""  # what the labels mean from now on, where that has changed
 
 
-class FrontEnd:
+class FrontEnd(Copyable):
     """Judge of each cycle's readings by those of the cycles before, without any map."""
 
     def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
@@ -69,14 +69,6 @@ class FrontEnd:
         self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
         self._kind = None if settings.kind else KindJudge()  # until the kind is known
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently, and shares what nothing changes."""
-        other = shallow(self)
-        other.noise, other.gate = self.noise.copy(), self.gate.copy()
-        other._motion, other._sides = self._motion.copy(), self._sides.copy()
-        other._kind = self._kind and self._kind.copy()
-        return other
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
         """Return a usable cycle, or raise a ReadingError."""

@@ -8,12 +8,12 @@ A cycle comes in metres of its scene and leaves the gate at scale 1; its result 
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.errors import InputError, ReadingError
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
@@ -75,7 +75,7 @@ class Admitted:
         return replace(result, notice=notice, dropped=self.dropped, refused=self.refused)
 
 
-class Gate:
+class Gate(Copyable):
     """Check of each cycle, which counts refused cycles."""
 
     def __init__(self, limits: LimitSettings, scale: float = 1.0) -> None:
@@ -84,10 +84,6 @@ class Gate:
         self.refused = 0  # number of cycles that were refused since the last one that was used
         self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
         self._dropping = False
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def admit(self, odometry: Odometry, detections: Detections, newest: Newest) -> Admitted:
         """Return a cycle as an estimator may use it; otherwise raise a ReadingError and count it as refused.

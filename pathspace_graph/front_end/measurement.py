@@ -11,7 +11,7 @@ from typing import Final, Self
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, ray_axes
@@ -232,7 +232,7 @@ def _staying(lagged: Lagged, off: Array, reference: Array, sigma: Array) -> tupl
     return float(shares[best]), STAY_TIMES[best]
 
 
-class Measurement:
+class Measurement(Copyable):
     """Measurement of noise in steps short enough for a perception cycle.
 
     Each pass follows the cones by what was found so far, and then finds errors, noise and weights in turn.
@@ -248,12 +248,6 @@ class Measurement:
         """Return a measurement; None where not even the noise of the odometry can be told."""
         found = odometry_of(twists, known)
         return None if found is None else cls(cycles, found)
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other._tracker = self._tracker.copy()
-        return other
 
     def _begin(self, found: MeasuredNoise) -> None:
         self._found, self._tracker, self._followed = found, ConeTracker(found), 0

@@ -1,11 +1,11 @@
 """The motion between two cycles: odometry, checked against what the detections say of it."""
 
 from dataclasses import replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import integrate_twists, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation
@@ -35,7 +35,7 @@ SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # m, m, rad, of a motion at rest from c
 SIGMAS_STANDS: Final = (0.02, 0.02, 0.002)  # of one that the detections alone tell
 
 
-class MotionCheck:
+class MotionCheck(Copyable):
     """Odometry of each cycle, checked against the detections of the newest cycles.
 
     Its frame is that of the motion so far, which drifts; only its newest part is used.
@@ -53,13 +53,6 @@ class MotionCheck:
         self._velocity: Array | None = None
         self._t: float | None = None
         self._doubted_at = -np.inf  # the odometry was contradicted last at this stamp (s)
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other._twists, other._matcher = shallow(self._twists), self._matcher.copy()
-        other._rest, other._standstill = self._rest.copy(), self._standstill.copy()
-        return other
 
     def set_noise(self, sigma: Array) -> None:
         """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten."""
@@ -212,7 +205,7 @@ class MotionCheck:
         return MeasuredMotion(replace(replaced, twist=twist), twist[None], *found)
 
 
-class HeldTwists:
+class HeldTwists(Copyable):
     """Twists as they are measured, each held until the next one."""
 
     def __init__(self, settings: MotionSettings) -> None:
@@ -247,15 +240,11 @@ class HeldTwists:
         return MeasuredMotion(integrated, odometry.twist, False, missing, stuck, None, durations, excess)
 
 
-class Rest:
+class Rest(Copyable):
     """Judge of whether the vehicle stands, by the odometry; it averages the yaw rate meanwhile."""
 
     def __init__(self) -> None:
         self.end()
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def end(self) -> None:
         self._since: float | None = None

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
@@ -29,7 +29,7 @@ SIGMA_FREE: Final = 0.02  # of the scale of the ranges, beside that measured, wh
 REFERENCE_RANGE: Final = 10.0  # range at which the scatter of ranges tells how well their scale is known (m)
 
 
-class NoiseLearner:
+class NoiseLearner(Copyable):
     """Measurement of the noise of a drive as it goes on, which never reads ahead."""
 
     def __init__(self, known: KnownNoise, use: str | None, *, of_lines: bool = False) -> None:
@@ -49,13 +49,6 @@ class NoiseLearner:
         self._measurement: Measurement | LineMeasurement | None = None
         self._driven, self._due = 0.0, FIRST
         self._t: float | None = None
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other._twists = self._twists.copy()
-        other._measurement = self._measurement and self._measurement.copy()
-        return other
 
     @property
     def is_learning(self) -> bool:

@@ -9,12 +9,12 @@ by -psi. Detections that are late by tau lie too far ahead by `tau v`, which cha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import IntegratedOdometry
@@ -69,17 +69,13 @@ class Seen(NamedTuple):
 _TINY: Final = float(np.finfo(float).tiny)
 
 
-class RecentDetections:
+class RecentDetections(Copyable):
     """Detections of the newest cycles in one frame."""
 
     def __init__(self) -> None:
         self.points: Array = np.zeros((0, 2))  # (n, 2) place of each detection, m
         # a row is [stamp | point as measured | place of the vehicle | derivatives of x | derivatives of y]
         self._table: Array = np.zeros((0, 5 + 2 * len(LEARNED_ERRORS)))
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
         """Add detections (m, 2) at t (s) from a pose (3,), and their derivatives (m, 2, e) by errors."""
@@ -197,7 +193,7 @@ class Difference:
     shifts: Array  # (3, 2) its derivatives by the errors of the sensor
 
 
-class SensorErrors:
+class SensorErrors(Copyable):
     """Kalman filter of the errors e = (yaw, latency) of the sensor, in rad and s.
 
     Detections are corrected by the mean. What is left shifts a match, in the vehicle frame, by `(d_y, -d_x,
@@ -211,10 +207,6 @@ class SensorErrors:
         self._drift: Array = np.diag(np.square(SIGMAS_CHANGES)) / MINUTE
         self._velocity: Array = np.zeros(3)
         self._possible: Array = 0.5 * SCAN_MEMORY * np.array(settings.accelerations)
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def contradict(self, settings: CalibrationSettings) -> bool:
         """Return whether the errors contradict the sensor's prior, by `settings.doubt` sigmas."""
@@ -263,20 +255,13 @@ class SensorErrors:
 # --- matches of each cycle -------------------------------------------------------------------------------
 
 
-class ScanMatcher:
+class ScanMatcher(Copyable):
     """Matches of each cycle with the newest ones, and what they show of the sensor and its noise."""
 
     def __init__(self, settings: MotionSettings) -> None:
         self._settings = settings
         self._misfit = 1.0  # mean of those of the matches that agreed, the newest counting most
         self.forget()
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other.recent, other.recent_lines = self.recent.copy(), self.recent_lines.copy()
-        other.errors = self.errors.copy()
-        return other
 
     def forget(self) -> None:
         """Forget the newest cycles, and what was learned of the sensor."""

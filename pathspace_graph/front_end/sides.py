@@ -6,11 +6,11 @@ vehicle ahead, each cone to the row that it fits better.
 """
 
 from dataclasses import replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.cone_rows import ConeRow, deal_out
@@ -37,7 +37,7 @@ PATH_TELLS: Final = 3.0  # length ahead of it up to which the path tells sides, 
 HALF_WIDTH: Final = 1.5  # distance beside the vehicle at which a row without any cone begins, m
 
 
-class SideJudge:
+class SideJudge(Copyable):
     """Judge of the side of each detection, which gives it the label."""
 
     def __init__(self, settings: SidesSettings) -> None:
@@ -48,12 +48,6 @@ class SideJudge:
         self._cones = NearCones()
         self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
         self._known = self._unknown = 0.0  # newest detections with and without a colour
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other._path, other._cones = self._path and shallow(self._path), self._cones.copy()
-        return other
 
     def update(
         self, pose: Array, twists: Array, detections: Detections, *, in_lane: bool = False
@@ -145,7 +139,7 @@ class SideJudge:
         return ConeRow(SIDES[label], line, ahead, candidates, cones.tolist())
 
 
-class NearCones:
+class NearCones(Copyable):
     """Cones near the vehicle as means of their detections, with the colours in which they were seen."""
 
     def __init__(self) -> None:
@@ -154,10 +148,6 @@ class NearCones:
         self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)  # (n, 2) detections by label
         self.judged: BoolArray = np.zeros(0, bool)  # (n,) whether its colour was compared with its side
         self._last: Array = np.zeros(0)
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: arrays that are written into are new in each call."""
-        return shallow(self)
 
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:
         """Add detections at points (m, 2) with labels (m,), seen at t (s); return the cone (m,) of each."""

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from math import comb
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import MeasuredNoise
@@ -77,7 +77,7 @@ def by_bias(t: Array, poses: Array, since: tuple[float, Array, Array] | None = N
     return derivatives
 
 
-class ConeTracker:
+class ConeTracker(Copyable):
     """Cones that were seen in the last seconds, by dead reckoning."""
 
     def __init__(self, known: MeasuredNoise) -> None:
@@ -86,10 +86,6 @@ class ConeTracker:
         self._cones: Cones = (np.zeros((0, 2)), none, np.zeros(0), np.zeros(0), none)
         self._count = 0
         self._from: tuple[float, Array, Array] | None = None  # stamp, pose and `by_bias` of the latest cycle
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def follow(self, cycles: Sequence[SeenCycle]) -> Sightings:
         """Return the sightings of the next cycles as measured, in order of time, the nearest first."""
@@ -125,15 +121,11 @@ class ConeTracker:
         return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
 
 
-class TwistRecord:
+class TwistRecord(Copyable):
     """Newest twists that were measured while the vehicle drove."""
 
     def __init__(self) -> None:
         self._parts: tuple[Odometry, ...] = ()
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def add(self, odometry: Odometry) -> None:
         self._parts = (*self._parts, odometry)

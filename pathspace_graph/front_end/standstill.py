@@ -7,11 +7,11 @@ nothing is seen of the motion, as between walls, both fit alike, and the odometr
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, move_points, relative
 
@@ -35,15 +35,11 @@ class _Cycle:
     gains: Array  # (5, k) sums of `_gains` over the newest k cycles before
 
 
-class Standstill:
+class Standstill(Copyable):
     """Judge of whether the vehicle stands by the cones of the last second."""
 
     def __init__(self) -> None:
         self._cycles: tuple[_Cycle, ...] = ()  # the newest first
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def add(self, t: float, points: Array, covariances: Array, delta: Array) -> None:
         """Add corrected detections (n, 2), vehicle frame, at t (s) after a motion (3,) by the odometry."""

@@ -1,9 +1,7 @@
 """The closed map: it is localized on, refined, and repaired where cones contradict it."""
 
 from collections.abc import Mapping
-from typing import Self
 
-from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Health
 from pathspace_graph.labels import BOUNDARIES
@@ -21,10 +19,8 @@ from .map_repair import MapRepair
 from .worker import Unsolved
 
 
-class Closed:
+class Closed(Phase):
     """A closed map, and what may have to be done about it."""
-
-    uses_detections = True
 
     def __init__(self, road: Road, drive: Drive) -> None:
         """Begin where the curves have just been closed."""
@@ -33,13 +29,6 @@ class Closed:
         self._boundaries_cross = _crosses(road, drive)
         self._settled = road.path.length  # path (m) when the map was last replaced
         road.growth.clear()
-
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
-        other = shallow(self)
-        other.map_repair = self.map_repair.copy()
-        other.known_loop = shallow(self.known_loop)
-        return other
 
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading

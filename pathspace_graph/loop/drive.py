@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from functools import partial
 from math import nan
-from typing import Final, Protocol, Self
+from typing import ClassVar, Final
 
 import numpy as np
 
 from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.relative import Revisit
@@ -21,6 +21,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .closing import go_on_from, lay_on_known
 from .drive_record import DriveRecord
+from .known_loop import evidence_of
 from .lap_solver import LapSolver, Outcome
 from .revisit import lay_on
 
@@ -30,7 +31,7 @@ LEARNED: Final = "the drive contradicts the calibration, which is learned"
 """Notice of the cycle in which the priors of the calibrations are first doubted."""
 
 
-class Drive:
+class Drive(Copyable):
     """The record of a drive, the batches of it, the health of its estimate, and its priors."""
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -51,14 +52,6 @@ class Drive:
         self.keeps_map = False
         """Whether that map is held as it is."""
         self._rests_until = 0.0  # path (m)
-
-    def copy(self) -> Self:
-        """Return a drive that can go on independently; a batch that is under way is of both."""
-        other = shallow(self)
-        other.record = self.record.copy()
-        other.solver = self.solver.copy()
-        other.monitor = self.monitor.copy()
-        return other
 
     # --- priors and health -------------------------------------------------------------------------------
 
@@ -141,31 +134,28 @@ class Drive:
 class Step:
     """What a phase has made of a cycle."""
 
-    phase: "Phase"  # of the next cycle
+    phase: "Phase"  # phase of the next cycle
     jump: Array | None = None  # (3,) of the newest pose, where the map or its place was replaced
     notice: str = ""
     health: Health | None = None  # where it has changed
 
 
-class Phase(Protocol):
-    """What a cycle does beside mapping: on an open road, on a closed map, and where the vehicle is lost."""
+class Phase(Copyable):
+    """What a cycle does besides mapping; this one never replaces the map."""
 
-    uses_detections: bool
-    """Whether detections may change the road."""
-
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
+    uses_detections: ClassVar[bool] = True  # whether detections may change the road
 
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
     ) -> tuple["Phase", Health]:
         """Judge the estimate before its update; return the phase of this cycle, and the health."""
+        return self, drive.monitor.update(evidence_of(road.smoother, classified.tested, None, reading))
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Do what the phase does after the update of a cycle, which has taken `spent` (s) so far.
-
-        A drive that rests is left alone.
-        """
+        """Act after the update of a cycle, which has taken `spent` (s); do nothing while the drive rests."""
+        drive.record.estimated(road)
+        return Step(self)
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Go on from the result of a batch."""
+        """Continue from the result of a batch."""
+        return Step(self)

@@ -3,13 +3,13 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as chain_of
-from typing import Final, Generic, Self, TypeVar
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 
 from pathspace_graph.batch.lap import ClosedMap, OpenLap
 from pathspace_graph.batch.start import unwrap
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
@@ -50,7 +50,7 @@ def bend(poses: Array, known: Mapping[int, Array]) -> Array:
     return np.asarray(moved[0] + weight * change)
 
 
-class CycleList(Generic[T]):
+class CycleList(Copyable, Generic[T]):
     """A list that only grows, with one item for each cycle; its copies share all but the newest items."""
 
     BLOCK: Final = 200  # items of a shared block
@@ -58,11 +58,6 @@ class CycleList(Generic[T]):
     def __init__(self) -> None:
         self._blocks: tuple[list[T], ...] = ()
         self._newest: list[T] = []
-
-    def copy(self) -> Self:
-        other = shallow(self)
-        other._newest = self._newest.copy()
-        return other
 
     def __len__(self) -> int:
         return self.BLOCK * len(self._blocks) + len(self._newest)
@@ -89,7 +84,7 @@ class MeasuredCycle:
     orange: Detections  # those of orange cones
 
 
-class DriveRecord:
+class DriveRecord(Copyable):
     """The odometry, the detections and the poses of every cycle, kept as long as a batch can solve them."""
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -100,13 +95,6 @@ class DriveRecord:
         self.stamps: CycleList[float] = CycleList()  # stamp of each cycle (s)
         self._measured: CycleList[MeasuredCycle] = CycleList()
         self._factors: tuple[Rows, ...] = ()  # of the user's factors on poses, at values of zero
-
-    def copy(self) -> Self:
-        """Return a record that can go on independently."""
-        other = shallow(self)
-        other.stamps = self.stamps.copy()
-        other._measured = self._measured.copy()
-        return other
 
     def give_up(self, reason: str) -> None:
         """Drop the measurements; the first reason counts."""

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import KDTree
 
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.front_end.front_end import Reading
@@ -117,7 +118,7 @@ def lay_out_loop(track: CurveMap) -> Loop:
     return Loop(middle, stations, float(steps.sum()), beside, curves, mapped, begins)
 
 
-class KnownLoop:
+class KnownLoop(Copyable):
     """The closed map, laid out when it is asked for, and again once its curves were replaced by others."""
 
     def __init__(self) -> None:

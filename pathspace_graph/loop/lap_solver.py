@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from math import ceil
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.batch.lap import LapMarginal, OpenLap
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.settings.mapper import MapperSettings
 
 from . import worker
@@ -18,7 +18,7 @@ LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cy
 Outcome = LapMarginal | Unsolved
 
 
-class LapSolver:
+class LapSolver(Copyable):
     """The batch that is under way, if there is one, and the cycles in which batches have ended."""
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -28,10 +28,6 @@ class LapSolver:
         self._batch: LapBatch | None = None
         self._ends: tuple[int, ...] = ()
         self._prepared = False
-
-    def copy(self) -> Self:
-        """Return a solver that can go on independently; a batch that is under way is of both."""
-        return shallow(self)
 
     @property
     def is_busy(self) -> bool:

@@ -1,9 +1,8 @@
 """The lost vehicle: its place on the closed map is searched, and the road beside it is mapped anew."""
 
 from dataclasses import replace
-from typing import Final, Self
+from typing import Final
 
-from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, Health, HealthMonitor
 from pathspace_graph.mapping.road import Classified, Road
@@ -11,7 +10,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .drive import Drive, Phase, Step
 from .known_loop import evidence_of
-from .lap_solver import Outcome
 from .relocalization import FOUND, Search, start_anew
 
 ROAD: Final = 10.0  # length of both boundaries beside a lost vehicle that make a road (m)
@@ -19,7 +17,7 @@ NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
 """Reason of the health there, and notice of the first cycle."""
 
 
-class Lost:
+class Lost(Phase):
     """The search for a lost vehicle, while the closed map stays as it was."""
 
     uses_detections = False
@@ -31,15 +29,6 @@ class Lost:
         self.new_road: Road | None = None  # road beside the vehicle, in a frame of its own
         self._monitor = HealthMonitor()  # of the new road
         self._lost = self._health = health
-
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
-        other = shallow(self)
-        other.closed = self.closed.copy()
-        other.search = self.search.copy()
-        other.new_road = self.new_road and self.new_road.copy()
-        other._monitor = self._monitor.copy()
-        return other
 
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
@@ -62,10 +51,6 @@ class Lost:
         drive.monitor.restart()
         jump = start_anew(road.smoother, first_cycle, found)
         return Step(self.closed, jump, FOUND, Health(DEGRADED, FOUND))
-
-    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Leave the map as it is."""
-        return Step(self)
 
     def _map_new_road(self, road: Road, drive: Drive, reading: Reading) -> bool:
         """Map the road beside the vehicle as an open one, with the calibration as it is known.

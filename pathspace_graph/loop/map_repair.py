@@ -6,7 +6,7 @@ begins at these poses, with curves through the cones that were seen.
 """
 
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.simplification import fit_through
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.graph.changes import place_again
@@ -56,18 +56,12 @@ class ContradictedStretch:
     cones: Array  # (k, 2) positions in m, map frame, in no order
 
 
-class Contradictions:
+class Contradictions(Copyable):
     """The detections that no curve of a closed map explains, by label."""
 
     def __init__(self, settings: GrowthSettings) -> None:
         merging = replace(settings, sightings=SIGHTINGS, forget_after=REPAIR_MEMORY)
         self._tracks = {label: TentativeTracks(merging) for label in BOUNDARIES}
-
-    def copy(self) -> Self:
-        """Return tracks that can go on independently."""
-        other = shallow(self)
-        other._tracks = {label: tracks.copy() for label, tracks in self._tracks.items()}
-        return other
 
     def observe(self, track: CurveMap, loop: Loop, new: slice, t: float) -> None:
         """Add the new coloured detections, seen at t (s), that are not in use, or are used beside a gap."""
@@ -130,7 +124,7 @@ def in_rows(points: Array, apart: float) -> list[IntArray]:
     return [np.flatnonzero(group == number) for number in range(count)]
 
 
-class MapRepair:
+class MapRepair(Copyable):
     """Whether a closed map is contradicted, and the batch that repairs it."""
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -140,12 +134,6 @@ class MapRepair:
         self._asked = -np.inf
         self._wait_until = 0.0
         self._attempts = 0
-
-    def copy(self) -> Self:
-        """Return a repair that can go on independently."""
-        other = shallow(self)
-        other.contradictions = self.contradictions.copy()
-        return other
 
     def is_due(self, known: KnownLoop, smoother: CurveSmoother, t: float, driven: float) -> bool:
         """Return whether the closed map is contradicted at t (s), after a path of this length (m)."""

@@ -1,23 +1,20 @@
 """The open road: its map grows, until a return to its beginning starts the batch that closes the loop."""
 
 from dataclasses import replace
-from typing import ClassVar, Final, Self
+from typing import ClassVar, Final
 
 from pathspace_graph.batch.association import LINE_STEP
-from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.changes import solve_loop
 from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.health import Health
 from pathspace_graph.lengths import joined
 from pathspace_graph.mapping.registration import RefinedMotion
-from pathspace_graph.mapping.road import Classified, Road
+from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closed import Closed
 from .closing import SIGMA_STEP, apply_correspondences, simplify
 from .drive import Drive, Phase, Step
-from .known_loop import evidence_of
 from .lap_solver import Outcome
 from .returns import ReturnFinder
 from .revisit import Revisits
@@ -29,31 +26,16 @@ REVISITED: Final = "the road was met again, and the open map is laid on its earl
 """Notice of the first cycle with a revisit."""
 
 
-class Open:
+class Open(Phase):
     """The search for a return, and for road that is met again on the way."""
 
     CLOSED: ClassVar = Closed  # class of the phase after the loop has closed
-    uses_detections = True
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
         self.returns = ReturnFinder(settings.closing)
         self.revisits = Revisits(settings)
         self.returned_by: Revisit | None = None  # return that began the newest batch
-
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
-        other = shallow(self)
-        other.returns = self.returns.copy()
-        other.revisits = shallow(self.revisits)
-        return other
-
-    def judge(
-        self, road: Road, drive: Drive, classified: Classified, reading: Reading
-    ) -> tuple[Phase, Health]:
-        """Judge the estimate by the tested detections."""
-        evidence = evidence_of(road.smoother, classified.tested, None, reading)
-        return self, drive.monitor.update(evidence)
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
         """Look for a return, which begins a batch, and go on from the batch or from road met again."""

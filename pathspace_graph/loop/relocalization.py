@@ -7,12 +7,12 @@ one is clearly better than all others, twice in a row, the window starts anew th
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.batch.association import locate_poses
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import move_points, path_lengths, to_map, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
@@ -62,7 +62,7 @@ class Place:
 Choice = Callable[[list[Place] | None], RefinedMotion | None]
 
 
-class Search:
+class Search(Copyable):
     """What a lost vehicle has seen, and the search for its place on a closed map."""
 
     def __init__(self, road: Road, start: Array | None = None) -> None:
@@ -77,13 +77,6 @@ class Search:
         self._last: Motion | None = None  # of the last attempt
         self._agreed = 0  # attempts in a row that have found the same place
         self._missed = 0  # attempts in a row in which no place agreed
-
-    def copy(self) -> Self:
-        """Return a search that can go on independently."""
-        other = shallow(self)
-        other._poses = self._poses.copy()
-        other._seen = self._seen.copy()
-        return other
 
     def look(self, road: Road, classified: Classified, reading: Reading) -> None:
         """Remember the newest cycle of a road, with its detections as the calibration corrects them."""

@@ -1,12 +1,12 @@
 """The return to the beginning of a drive, by the newest curves or cones, or by the shape of the road."""
 
 from math import inf
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.batch.start import unwrap
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.relative import Revisit
@@ -34,7 +34,7 @@ LONG_PATH: Final = 1000.0
 """Path from which on the distance of attempts grows with it (m), as the cost of an attempt does."""
 
 
-class ReturnFinder:
+class ReturnFinder(Copyable):
     """The search for a return of an open road, in three ways, of which one at most is tried in a cycle."""
 
     def __init__(self, settings: ClosingSettings) -> None:
@@ -43,12 +43,6 @@ class ReturnFinder:
         """Path (m) and cycle of the last attempt in each way."""
         self._rests_until = 0.0  # path (m)
         self._placed_until = 0.0  # path (m) up to which the vehicle is not lost (`is_lost`)
-
-    def copy(self) -> Self:
-        """Return a search that can go on independently."""
-        other = shallow(self)
-        other._tried = self._tried.copy()
-        return other
 
     def rest(self, road: Road, length: float) -> None:
         """Look for no return for a length (m) from here on; zero ends a rest."""

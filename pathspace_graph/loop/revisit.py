@@ -17,6 +17,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.batch.start import REVISIT_INTERVAL
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import (
     compose,
@@ -62,7 +63,7 @@ DIVERGED: Final = 8.0  # distance that the ways to the place must have had, as s
 WAY, WAY_STEP = 100.0, 4.0  # length of the ways that are compared, and the step at which they are (m)
 
 
-class Revisits:
+class Revisits(Copyable):
     """The search for road of an open drive that is met again."""
 
     def __init__(self, settings: MapperSettings) -> None:

@@ -1,12 +1,11 @@
 """A known map: the vehicle's place on it is searched, while a road of its own is mapped."""
 
 from functools import partial
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.batch.known_map import KnownMap
-from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import Reading
@@ -20,7 +19,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .closed import Closed
 from .drive import Drive, Phase, Step
-from .known_loop import evidence_of
 from .lap_solver import Outcome
 from .open import Open
 from .relocalization import Place, Search
@@ -40,10 +38,8 @@ NEAR: Final = Expected.within(8.0, 0.3, (2.0, 2.0, 0.1))
 """How far from the place that the curves tell the one that the cones tell may be."""
 
 
-class Seeking:
+class Seeking(Phase):
     """An open road of the vehicle's own, and the search for its place on a known map."""
-
-    uses_detections = True
 
     def __init__(
         self, settings: MapperSettings, track: Map, start: Array | None = None, keep: bool = False
@@ -54,13 +50,6 @@ class Seeking:
         self._known = known.smoother(settings)
         self._cones = known.constellation
         self._search: Search | None = None
-
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
-        other = shallow(self)
-        other.own = self.own.copy()
-        other._search = self._search and self._search.copy()
-        return other
 
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
@@ -140,26 +129,5 @@ class Seeking:
         return self.own.take(road, drive, outcome)
 
 
-class OnOpenMap:
-    """A known map that is open: it is localized on and refined, and grows past a tentative end."""
-
-    uses_detections = True
-
-    def copy(self) -> Self:
-        """Return the phase itself, which has no state."""
-        return self
-
-    def judge(
-        self, road: Road, drive: Drive, classified: Classified, reading: Reading
-    ) -> tuple[Phase, Health]:
-        """Judge the estimate by the tested detections."""
-        return self, drive.monitor.update(evidence_of(road.smoother, classified.tested, None, reading))
-
-    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Remember the pose."""
-        drive.record.estimated(road)
-        return Step(self)
-
-    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Leave the map as it is."""
-        return Step(self)
+class OnOpenMap(Phase):
+    """Localization on a known open map, which is refined and grows past a tentative end."""
