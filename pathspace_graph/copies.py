@@ -23,7 +23,7 @@ class Copyable:
         other = shallow(self)
         attributes = vars(other)
         for name, value in attributes.items():
-            if _is_mutable(type(value)):
+            if _is_mutable(value.__class__):
                 attributes[name] = _copied(value)
         return other
 
@@ -36,4 +36,4 @@ def _is_mutable(kind: type) -> bool:
 def _copied(value: Any) -> Any:
     if not isinstance(value, dict):
         return value.copy()
-    return {key: own.copy() if _is_mutable(type(own)) else own for key, own in value.items()}
+    return {key: own.copy() if _is_mutable(own.__class__) else own for key, own in value.items()}

@@ -1,4 +1,4 @@
-"""The front end of all estimators: what they are given of each cycle."""
+"""The front end of all estimators: it checks the readings of each cycle and assigns their noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,41 +27,41 @@ from .noise import NoiseLearner, measure
 from .sides import SideJudge
 from .sightings import SeenCycle, TwistRecord
 
-SWAPPED: Final = {  # notices that the colours are swapped from now on, or no longer
+SWAPPED: Final = {  # notices of the cycle in which colours become swapped, or no longer are
     True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "
     "is driven the other way round, or y points to the right in the whole log",
-    False: "the colours are as they were said to be",
+    False: "the colours are on the stated sides",
 }
-COLOURLESS: Final = {  # notices that most colours are unknown from now on, or no longer
-    True: "most detections have no colour: the way driven tells their sides",
+COLOURLESS: Final = {  # notices of the cycle in which most colours become unknown, or no longer are
+    True: "most detections have no colour: the driven path determines their sides",
     False: "most detections have a colour again",
 }
 OF_LINES: Final = (
-    "the detections are points of a line, mapped as cones: begin again with `kind` of the settings as {!r}"
+    "the detections are points of a line but are mapped as cones: start again with the setting `kind` = {!r}"
 )
-NEAREST: Final = 2  # number of nearest cones that are orange where the vehicle drives between orange cones
+NEAREST: Final = 2  # number of nearest cones that must be orange in a lane of orange cones
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Readings of a cycle after they were judged."""
+    """Checked readings of a cycle."""
 
-    motion: MeasuredMotion  # motion that leads to the cycle
-    detections: Detections  # detections of cones that bound the road
-    seen_again: BoolArray  # (m,) whether each of them lies where the cycles just before had one
-    orange: Detections  # detections of orange cones, which bound no road
-    stated: tuple[Detections, Detections]  # those of both kinds as they came, before any noise was measured
-    noise: NoiseLearner  # noise as it is known now
+    motion: MeasuredMotion  # motion from the previous cycle to this one
+    detections: Detections  # detections of boundary cones, with labels and covariances for the map
+    seen_again: BoolArray  # (m,) whether the previous cycles had a detection at the same place
+    orange: Detections  # detections of orange cones, which belong to no boundary
+    stated: tuple[Detections, Detections]  # both kinds of detections with their stated covariances
+    noise: NoiseLearner  # noise known so far
     sensor_doubted: bool = False  # whether readings contradict the prior of the sensor's yaw or latency
-    measured: MapperSettings | None = None  # with priors of calibrations that were measured in this cycle
-    notice: str = ""  # what the labels mean from now on, where that has changed
+    measured: MapperSettings | None = None  # settings with calibration priors measured in this cycle
+    notice: str = ""  # change of the meaning of the labels
 
 
 class FrontEnd(Copyable):
-    """Judge of each cycle's readings by those of the cycles before, without any map."""
+    """Checks of each cycle's readings against the previous cycles, without a map."""
 
     def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
-        """Begin with the noise known at scale 1; cycles come in metres of a scene of the scale."""
+        """Start with the noise known at scale 1; lengths of the cycles are divided by `scale`."""
         self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.kind == "line")
         self.gate = Gate(settings.limits, scale)
         self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
@@ -71,11 +71,11 @@ class FrontEnd(Copyable):
         self._kind = None if settings.kind else KindJudge()  # until the kind is known
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
-        """Return a usable cycle, or raise a ReadingError."""
+        """Return the cycle at scale 1; raise a ReadingError if it is unusable."""
         return self.gate.admit(odometry, detections, self._motion.newest)
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
-        """Return the judged readings of a cycle: the twists since the last one, and its detections."""
+        """Check the readings of a cycle: the twists since the previous one, and its detections."""
         noise, check, sides = self.noise, self._motion, self._sides
         of_orange = is_orange(detections)
         cones, orange = detections.where(~of_orange), detections.where(of_orange)
@@ -92,7 +92,7 @@ class FrontEnd(Copyable):
         notices += self._found_kind(odometry, cones)
         stated = cones, orange
         judged, orange = noise.for_map(cones), noise.for_map(orange)
-        # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
+        # measured noise includes measured errors of the sensor, and `calibrated` checks its prior with them
         settings, calibration = self._settings, self._settings.calibration
         may_doubt = not (self._sensor_doubted or noise.of_detections)
         if may_doubt and check.errors.contradict(calibration):
@@ -108,7 +108,7 @@ class FrontEnd(Copyable):
         return Reading(motion, judged, seen, orange, stated, noise, self._sensor_doubted, measured, notice)
 
     def _found_kind(self, odometry: Odometry, cones: Detections) -> list[str]:
-        """Return a notice where detections that are taken for cones turn out to be of a line."""
+        """Return a notice if detections mapped as cones turn out to be points of a line."""
         if self._kind is None:
             return []
         self._kind.see(odometry, cones)
@@ -129,17 +129,17 @@ class FrontEnd(Copyable):
 
 @dataclass(frozen=True, eq=False)
 class JudgedLog:
-    """Readings of a whole log after they were judged cycle by cycle."""
+    """Checked readings of a whole log."""
 
     chain: LogOdometry  # motion from each cycle to the next
-    cycles: Sequence[Detections]
-    orange: Sequence[Detections]  # those of orange cones
-    settings: MapperSettings  # settings, with wide priors of the sensor where the readings contradict them
+    cycles: Sequence[Detections]  # detections of boundary cones
+    orange: Sequence[Detections]  # detections of orange cones
+    settings: MapperSettings  # settings, with wide sensor priors where the readings contradict them
     noise: RunNoise
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
-    """Return a log of scale 1 as the front end gives it to a batch; unknown noise is measured on it first."""
+    """Check a log at scale 1 for a batch; unknown noise is measured on the whole log first."""
     front_end = FrontEnd(settings, noise)
     if front_end.noise.is_learning:
         front_end = FrontEnd(settings, replace(noise, measured=measure_log(log, settings)))
@@ -154,14 +154,14 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
 
 
 def measurable(detections: Detections, settings: MapperSettings) -> Detections:
-    """Return the detections that noise is measured on: the cones, or points of lines where all are."""
+    """Return the detections for noise measurement: cones, or points of lines if the log has no cones."""
     if settings.kind == "line":
         return detections
     return detections.where(~of_line(detections.labels, settings))
 
 
 def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
-    """Return whether the nearest cones are orange: the vehicle comes to a track, or is at a gate."""
+    """Whether the nearest cones are orange: the vehicle drives to the track, or is at a gate."""
     if of_orange.sum() < NEAREST:
         return False
     nearest = np.argsort(np.hypot(*detections.points_vehicle.T), kind="stable")[:NEAREST]
@@ -173,16 +173,16 @@ def is_orange(detections: Detections) -> BoolArray:
 
 
 def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoise | None:
-    """Return the noise of a whole log and the constant errors of its sensor, by its readings alone.
+    """Measure the noise of a whole log and the constant errors of its sensor from its readings alone.
 
-    The settings say which detections are points of lines.
+    `settings.kind` and `settings.lines` select the detections that are points of lines.
     """
     settings = settings or MapperSettings()
     return measure(*seen_cycles(log, settings), of_lines=settings.kind == "line")
 
 
 def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
-    """Return the cones of a log where odometry alone, which is not doubted, places them, and the twists."""
+    """Return the detections of a log with poses by odometry alone, and its twists; odometry is trusted."""
     settings = settings or MapperSettings()
     readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
     for odometry, _ in readings:
