@@ -197,8 +197,8 @@ class SensorErrors(Copyable):
     """Kalman filter of the sensor errors e = (yaw, latency), in rad and s.
 
     Detections are corrected by the mean. A remaining yaw shifts a match, in the vehicle frame, by
-    `(d_y, -d_x, 0)`, and a latency by `mean(v) - v`. d is the displacement from the mean position of the remembered
-    detections' poses, v the velocity, and mean(v) its mean over these.
+    `(d_y, -d_x, 0)`, and a latency by `mean(v) - v`. d is the displacement from the mean position of the
+    poses of the remembered detections, v the velocity, and mean(v) its mean over these poses.
     """
 
     def __init__(self, settings: MotionSettings) -> None:
