@@ -30,7 +30,7 @@ class Cause(NamedTuple):
     unit: float  # size in words of a calibration of 1
     signs: tuple[str, str]  # words for a positive and a negative calibration
 
-    def make_hint(self, value: float) -> str:
+    def text_of(self, value: float) -> str:
         return self.template.format(self.unit * abs(value), self.signs[0 if value > 0.0 else 1])
 
 
