@@ -76,24 +76,38 @@ class FrontEnd(Copyable):
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Check the readings of a cycle: the twists since the previous one, and its detections."""
-        noise, check, sides = self.noise, self._motion, self._sides
-        of_orange = is_orange(detections)
-        cones, orange = detections.where(~of_orange), detections.where(of_orange)
-        cones = merged(cones, of_line(cones.labels, self._settings))
+        noise, check = self.noise, self._motion
+        cones, orange, is_line, in_lane = split_detections(detections, self._settings)
         checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
-        is_line = of_line(cones.labels, self._settings)
         motion = check.update(odometry, checked, noise.is_settled, is_line)
+        cones, notices = self._labelled(cones, checked, motion, in_lane=in_lane)
+        notices += self._found_kind(odometry, cones)
+        for_map, orange_for_map = noise.for_map(cones), noise.for_map(orange)
+        measured = self._measured(odometry, cones, motion)
+        doubted, notice = self._sensor_doubted, "; ".join(notices)
+        stated = cones, orange
+        return Reading(
+            motion, for_map, check.seen_again, orange_for_map, stated, noise, doubted, measured, notice
+        )
+
+    def _labelled(
+        self, cones: Detections, checked: Detections, motion: MeasuredMotion, *, in_lane: bool
+    ) -> tuple[Detections, list[str]]:
+        """Label cones by their sides, and return notices if the meaning of the colours changes."""
+        sides = self._sides
         swapped, colourless = sides.swapped, sides.colourless
-        in_lane = is_in_orange_lane(detections, of_orange)
-        labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane).labels
+        labels = sides.update(self._motion.pose, motion.twists, checked, in_lane=in_lane).labels
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
-        cones = replace(cones, labels=labels)
-        notices += self._found_kind(odometry, cones)
-        stated = cones, orange
-        judged, orange = noise.for_map(cones), noise.for_map(orange)
-        # measured noise includes measured errors of the sensor, and `calibrated` checks its prior with them
+        return replace(cones, labels=labels), notices
+
+    def _measured(
+        self, odometry: Odometry, cones: Detections, motion: MeasuredMotion
+    ) -> MapperSettings | None:
+        """Measure noise and errors of the sensor; return settings with new priors of the calibrations."""
+        noise, check = self.noise, self._motion
         settings, calibration = self._settings, self._settings.calibration
+        # measured noise includes measured errors of the sensor, and `calibrated` checks its prior with them
         may_doubt = not (self._sensor_doubted or noise.of_detections)
         if may_doubt and check.errors.contradict(calibration):
             self._sensor_doubted = True
@@ -103,9 +117,7 @@ class FrontEnd(Copyable):
             check.set_noise(noise.twist_sigma)
         if fresh or not self._begun:
             settings, self._begun = noise.calibrated(self._settings), True
-        measured = None if settings is self._settings else settings
-        seen, notice = check.seen_again, "; ".join(notices)
-        return Reading(motion, judged, seen, orange, stated, noise, self._sensor_doubted, measured, notice)
+        return None if settings is self._settings else settings
 
     def _found_kind(self, odometry: Odometry, cones: Detections) -> list[str]:
         """Return a notice if detections mapped as cones turn out to be points of a line."""
@@ -160,6 +172,20 @@ def measurable(detections: Detections, settings: MapperSettings) -> Detections:
     return detections.where(~of_line(detections.labels, settings))
 
 
+def split_detections(
+    detections: Detections, settings: MapperSettings
+) -> tuple[Detections, Detections, BoolArray, bool]:
+    """Split detections into boundary cones (m) and orange ones.
+
+    The others are whether each boundary cone is a point of a line (m,), and `is_in_orange_lane`.
+    """
+    of_orange = is_orange(detections)
+    cones = detections.where(~of_orange)
+    cones = merged(cones, of_line(cones.labels, settings))
+    is_line = of_line(cones.labels, settings)
+    return cones, detections.where(of_orange), is_line, is_in_orange_lane(detections, of_orange)
+
+
 def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
     """Whether the nearest cones are orange: the vehicle drives to the track, or is at a gate."""
     if of_orange.sum() < NEAREST:
@@ -191,10 +217,7 @@ def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[
     sigma = log.odometry_sigma if white is None else white.twist_sigma
     check, sides = MotionCheck(sigma, settings.motion), SideJudge(settings.sides)
     for odometry, detections in readings:
-        of_orange = is_orange(detections)
-        cones, in_lane = detections.where(~of_orange), is_in_orange_lane(detections, of_orange)
-        cones = merged(cones, of_line(cones.labels, settings))
-        is_line = of_line(cones.labels, settings)
+        cones, _, is_line, in_lane = split_detections(detections, settings)
         motion = check.update(odometry, cones, may_doubt=None, is_line=is_line)
         labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
         cycles.append(SeenCycle(measurable(labelled, settings), check.pose, motion.odometry.twist))
