@@ -303,7 +303,7 @@ def test_a_users_factor_on_control_points_keeps_the_prior_and_it_is_said() -> No
         results.append(mapper.update(odometry, detections, given))
     assert mapper.closed
     said = [result.notice for result in results if result.notice]
-    assert said == [HELD, f"{OWN_PRIOR}: the user's factors hold control points, which are others in a batch"]
+    assert said == [HELD, f"{OWN_PRIOR}: the user's factors hold control points, and a batch has other ones"]
     assert all(result.jump is None for result in results)
 
 
