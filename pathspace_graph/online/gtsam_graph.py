@@ -17,10 +17,7 @@ from pathspace_graph.spline.boundary import Boundary
 
 
 def window_graph(road: Road) -> gtsam.NonlinearFactorGraph:
-    """Return the factors of a road on its active variables; the graph shares nothing with the road.
-
-    Linearized at the estimate, they give the system of the next step in GTSAM's tangent space of the poses.
-    """
+    """Return the factors of a road on its active variables, as in `MapperEstimate.graph`."""
     smoother, track, settings = road.smoother, road.smoother.map, road.settings
     factors: list[gtsam.NonlinearFactor] = []
     anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)

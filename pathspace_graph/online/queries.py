@@ -83,10 +83,7 @@ def track_ahead_of(road: Road, distance: float, step: float) -> TrackAhead:
 
 
 def readings_of(road: Road) -> Readings:
-    """Return the used and gated detections of the newest cycle, with foot points.
-
-    Parameters of the foot points are of the last linearization, positions of the present curve.
-    """
+    """Return the used and gated detections of the newest cycle, as in `MapperEstimate.readings`."""
     track, table = road.smoother.map, road.smoother.map.detections
     newest = slice(int(table.cycle.searchsorted(road.next_cycle - 1)), None)
     used, boundary = table.used[newest].copy(), table.boundary[newest].copy()

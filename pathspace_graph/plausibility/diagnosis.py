@@ -18,7 +18,7 @@ from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
 from pathspace_graph.lengths import POSE_LENGTHS, Length, Text, joined, scaled
 from pathspace_graph.spline.crossing import Crossing, crossed_boundaries
 
-from .hint import Hint, make_hint
+from .hint import Hint, hint_of
 
 PRIOR_LIMIT: Final = 3.0  # prior standard deviations from zero beyond which a calibration is reported
 
@@ -157,7 +157,7 @@ def _odometry_hints(log: Log) -> list[Hint]:
         figures = [_scatter(k, float(values[k]), float(stated[k])) for k in np.flatnonzero(which).tolist()]
         if figures:
             slow = ", unless it stands for errors that change slowly" if size == "large" else ""
-            hints.append(make_hint("noise of odometry", figures=joined(figures, ", "), size=size + slow))
+            hints.append(hint_of("noise of odometry", figures=joined(figures, ", "), size=size + slow))
     return hints
 
 
@@ -185,7 +185,7 @@ def _detection_hints(log: Log) -> list[Hint]:
             scatter = float(ray.sigmas(np.array([at]))[0])
             stated = scatter * float(np.median(sigmas[near, axis] / ray.sigmas(ranges[near])))
             figures = {"scatter": Length(scatter), "at": Length(at), "stated": Length(stated)}
-            hints.append(make_hint("noise of detections", way=name, size=size, **figures))
+            hints.append(hint_of("noise of detections", way=name, size=size, **figures))
     return hints
 
 

@@ -133,6 +133,6 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
 }  # fmt: skip
 
 
-def make_hint(mistake: str, **figures: Any) -> Hint:
+def hint_of(mistake: str, **figures: Any) -> Hint:
     """Return a hint of `TABLE` with its figures; one in m or m/s is a `Length`."""
     return Hint(*(Text(text, **figures) for text in TABLE[mistake]))

@@ -23,7 +23,7 @@ from pathspace_graph.settings.online import LimitSettings
 
 from . import hypotheses
 from .diagnosis import noise_hints
-from .hint import Hint, because, make_hint
+from .hint import Hint, because, hint_of
 from .hypotheses import AS_WRITTEN, DEGREE, Hypothesis, Mounting, Pairs, Trial, Trials, far_better
 
 LEAST_TWISTS: Final = 20  # least number of twists for hints
@@ -115,10 +115,10 @@ def whole_stamps(log: Log) -> list[Hint]:
         falls = np.flatnonzero(np.diff(t) < 0.0)
         if len(falls) >= 2 and np.ptp(t) <= max(1.0, 1.0 / min(TIME_UNITS)):
             found.append(
-                make_hint("fraction of seconds", file=file, falls=len(falls), low=t.min(), high=t.max())
+                hint_of("fraction of seconds", file=file, falls=len(falls), low=t.min(), high=t.max())
             )
         elif len(t) > 2 and (np.diff(t) == 0.0).mean() > 0.5 and (t == np.floor(t)).all():
-            found.append(make_hint("whole seconds", file=file, rows=len(t) / len(np.unique(t))))
+            found.append(hint_of("whole seconds", file=file, rows=len(t) / len(np.unique(t))))
     return found
 
 
@@ -130,9 +130,7 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
         fitting = [one for one in TIME_UNITS if SHORTEST_STEP <= step * one <= LONGEST_STEP]
         if step > LONGEST_STEP and fitting:
             unit = factors[file] = fitting[0]
-            found.append(
-                make_hint("unit of stamps", file=file, step=step, unit=TIME_UNITS[unit], factor=unit)
-            )
+            found.append(hint_of("unit of stamps", file=file, step=step, unit=TIME_UNITS[unit], factor=unit))
     of_odometry, of_cycles = (factors.get(file, 1.0) for file in (ODOMETRY_FILE, DETECTIONS_FILE))
     odometry = replace(log.odometry, t=log.odometry.t * of_odometry)
     cycles = tuple(replace(cycle, t=cycle.t * of_cycles) for cycle in log.cycles)
@@ -145,7 +143,7 @@ def one_clock(log: Log) -> list[Hint]:
     first, last = float(log.odometry.t[0]), float(log.odometry.t[-1])
     begin, end = log.cycles[0].t, log.cycles[-1].t
     apart = begin > last or end < first
-    return [make_hint("two clocks", begin=begin, end=end, first=first, last=last)] if apart else []
+    return [hint_of("two clocks", begin=begin, end=end, first=first, last=last)] if apart else []
 
 
 def ends_apart(log: Log) -> list[Hint]:
@@ -157,9 +155,9 @@ def ends_apart(log: Log) -> list[Hint]:
     begin, end = log.cycles[0].t, log.cycles[-1].t
     found = []
     if driven.size and begin - driven[0] > WITHOUT_DETECTIONS:
-        found.append(make_hint("detections begin late", seconds=begin - t[0]))
+        found.append(hint_of("detections begin late", seconds=begin - t[0]))
     if driven.size and driven[-1] - end > WITHOUT_DETECTIONS:
-        found.append(make_hint("detections end early", seconds=t[-1] - end))
+        found.append(hint_of("detections end early", seconds=t[-1] - end))
     return found
 
 
@@ -173,15 +171,15 @@ def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
     else:
         return log, []
     cycles = [replace(cycle, points_vehicle=cycle.points_vehicle * unit) for cycle in log.cycles]
-    hint = make_hint("unit of positions", typical=Length(typical), what=what, factor=unit)
+    hint = hint_of("unit of positions", typical=Length(typical), what=what, factor=unit)
     return replace(log, cycles=tuple(cycles)), [hint]
 
 
 def beyond_any_vehicle(odometry: Odometry) -> list[Hint]:
     speed = float(np.quantile(np.hypot(odometry.twist[:, 0], odometry.twist[:, 1]), 0.9))
     rate = float(np.quantile(np.abs(odometry.twist[:, 2]), 0.9))
-    found = [make_hint("too fast", speed=Length(speed))] if speed > FASTEST else []
-    return [*found, make_hint("turns too fast", rate=rate)] if rate > FASTEST_TURN else found
+    found = [hint_of("too fast", speed=Length(speed))] if speed > FASTEST else []
+    return [*found, hint_of("turns too fast", rate=rate)] if rate > FASTEST_TURN else found
 
 
 def _stamps(log: Log) -> dict[str, Array]:
@@ -255,7 +253,7 @@ def _frame_hints(best: Trial, trials: Trials, figures: dict[str, float]) -> list
         mistake = "frame"
     side = "with y to the right, and " if frame.mirrored else ""
     what = FRAME_MEANINGS.get(frame.stands, f"the sensor's frame is {side}turned by {_angle(frame.turn)}")
-    return [make_hint(mistake, what=what, how=_remedy(frame), **figures)]
+    return [hint_of(mistake, what=what, how=_remedy(frame), **figures)]
 
 
 def _remedy(frame: Hypothesis) -> str:
@@ -274,14 +272,14 @@ def _angle(turn: float, decimals: int = 0) -> str:
 def _odometry_hints(meaning: Hypothesis, figures: dict[str, float]) -> list[Hint]:
     """Return hints about an odometry that is not a body twist in SI units."""
     if (meaning.speed, meaning.rate) == (1e-3, 1e-3):
-        return [make_hint("milliseconds", **figures)]
-    found = [] if meaning.content == "twist" else [make_hint(meaning.content, **figures)]
+        return [hint_of("milliseconds", **figures)]
+    found = [] if meaning.content == "twist" else [hint_of(meaning.content, **figures)]
     if meaning.speed != 1.0:
         what = hypotheses.SPEED_UNITS[meaning.speed]
-        found.append(make_hint("unit of speeds", what=what, factor=meaning.speed, **figures))
+        found.append(hint_of("unit of speeds", what=what, factor=meaning.speed, **figures))
     if meaning.rate != 1.0:
         what = hypotheses.RATE_UNITS[meaning.rate]
-        found.append(make_hint("unit of yaw rate", what=what, factor=meaning.rate, **figures))
+        found.append(hint_of("unit of yaw rate", what=what, factor=meaning.rate, **figures))
     return found
 
 
@@ -290,9 +288,7 @@ def _latency(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
     figures, seconds = far_better(late, best), late.hypothesis.late
     if figures is None:
         return best, []
-    return late, [
-        make_hint("late", seconds=abs(seconds), way="late" if seconds > 0.0 else "early", **figures)
-    ]
+    return late, [hint_of("late", seconds=abs(seconds), way="late" if seconds > 0.0 else "early", **figures)]
 
 
 def _rotation_hints(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
@@ -301,7 +297,7 @@ def _rotation_hints(found: list[Hint], best: Trial, mounting: Mounting) -> list[
     if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURN_TOLD or sigma > TURN_SIGMA):
         return found
     side = ", with y to the right" if frame.mirrored else ""
-    turned = make_hint("turned", angle=_angle(frame.turn + yaw, 1), side=side)
+    turned = hint_of("turned", angle=_angle(frame.turn + yaw, 1), side=side)
     figures = [one.found for one in found if one.cause == "sensor frame"]
     others = [one for one in found if one.cause not in ("sensor frame", "y to the right")]
     return [*others, replace(turned, found=figures[0]) if figures else turned]
@@ -315,7 +311,7 @@ def _offset_hints(mounting: Mounting) -> list[Hint]:
     words = {"ahead_or_behind": "ahead" if ahead > 0.0 else "behind"}
     words["left_or_right"] = "left" if left > 0.0 else "right"
     lengths = {"ahead": ahead, "left": left, "along": abs(ahead), "aside": abs(left)}
-    return [make_hint("place", **words, **{name: Length(value) for name, value in lengths.items()})]
+    return [hint_of("place", **words, **{name: Length(value) for name, value in lengths.items()})]
 
 
 def _covariance_hints(mounting: Mounting) -> list[Hint]:
@@ -324,7 +320,7 @@ def _covariance_hints(mounting: Mounting) -> list[Hint]:
     if not too_large and claimed * CLAIMED_LESS >= scatter:
         return []
     unit = "mm^2 or cm^2, not in m^2" if too_large else "another unit"
-    return [make_hint("covariances", scatter=Length(scatter), claimed=Length(claimed), unit=unit)]
+    return [hint_of("covariances", scatter=Length(scatter), claimed=Length(claimed), unit=unit)]
 
 
 def _label_hints(trials: Trials, best: Trial) -> list[Hint]:
@@ -332,7 +328,7 @@ def _label_hints(trials: Trials, best: Trial) -> list[Hint]:
     present = [label for label in (LEFT, RIGHT) if (labels == label).any()]
     if len(present) != 1 or (labels == UNKNOWN).any() or abs(best.sided - 0.5) > BOTH_SIDES:
         return []
-    return [make_hint("one label", label=NAMES[present[0]], share=100.0 * best.sided)]
+    return [hint_of("one label", label=NAMES[present[0]], share=100.0 * best.sided)]
 
 
 def _unexplained_hints(trials: Trials, best: Trial) -> list[Hint]:
@@ -341,7 +337,7 @@ def _unexplained_hints(trials: Trials, best: Trial) -> list[Hint]:
     near = np.hypot(motion[:, 0], motion[:, 1]) < SAME_CONES * np.nanmedian(size)
     near &= (np.abs(motion[:, 2]) < SAME_CONES) & (pairs.count >= SAME_CONES_SEEN)
     share = float(best.explained[near].mean()) if near.sum() >= SAME_CONES_PAIRS else 1.0
-    return [] if share > UNEXPLAINED else camera(pairs) or [make_hint("unexplained", share=100.0 * share)]
+    return [] if share > UNEXPLAINED else camera(pairs) or [hint_of("unexplained", share=100.0 * share)]
 
 
 def camera(pairs: Pairs) -> list[Hint]:
@@ -350,7 +346,7 @@ def camera(pairs: Pairs) -> list[Hint]:
     least, most = spread.min(), spread.max()
     in_line = least < LINE_RATIO * most
     thin, lengths = "xy"[int(spread.argmin())], {"least": Length(least), "most": Length(most)}
-    return [make_hint("camera", thin=thin, **lengths)] if in_line else []
+    return [hint_of("camera", thin=thin, **lengths)] if in_line else []
 
 
 NO_LABEL_WORDS: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
@@ -398,4 +394,4 @@ def _foreign_label_hints(folder: Path, log: Log) -> list[Hint]:
     met = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])
     foreign = [word for word, _ in met.most_common() if word.strip().lower() not in NO_LABEL_WORDS]
     words = ", ".join(map(shown, foreign[:SHOWN_WORDS]))
-    return [make_hint("foreign labels", words=words)] if foreign else []
+    return [hint_of("foreign labels", words=words)] if foreign else []
