@@ -106,12 +106,12 @@ class Belief:
 
     @property
     def points(self) -> Array:
-        """Return a view of the mean points (m, 2)."""
+        """View of the mean points (m, 2)."""
         return self.mean[HEAD:].reshape(-1, POINT)
 
     @property
     def sensor(self) -> Array:
-        """Return a view of the mean calibration of the sensor (5,)."""
+        """View of the mean calibration of the sensor (5,)."""
         return self.mean[POSE + CALIBRATION_SIZE : HEAD]
 
     def corrected(self, detections: Detections) -> Detections:

@@ -58,7 +58,7 @@ class LandmarkState:
 
     @property
     def landmarks(self) -> Array:
-        """Return the landmarks (n, 2) in the map frame, in m: a view."""
+        """Landmarks (n, 2) in the map frame, in m: a view."""
         return self.variables.block(LANDMARK_LETTER).reshape(-1, POINT)
 
     def positions(self, numbers: IntArray) -> IntArray:

@@ -50,17 +50,17 @@ class PlacedDrive:
 
     @property
     def state(self) -> State:
-        """Return the optimum of the drive alone, in its own frame."""
+        """Optimum of the drive alone, in its own frame."""
         return self.alone.optimum.state
 
     @property
     def settings(self) -> MapperSettings:
-        """Return the settings with the drive's own priors of its calibrations."""
+        """Settings with the drive's own priors of its calibrations."""
         return self.alone.system.settings
 
     @property
     def poses(self) -> Array:
-        """Return the poses (P, 3) of the drive alone, in the frame of the map."""
+        """Poses (P, 3) of the drive alone, in the frame of the map."""
         return compose(self.motion, self.state.poses)
 
 

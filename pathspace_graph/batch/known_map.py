@@ -101,7 +101,7 @@ class KnownMap:
 
     @property
     def constellation(self) -> Constellation | None:
-        """Return the cones in the map frame; None where their places are not known."""
+        """Cones in the map frame; None where their places are not known."""
         points, labels, sigmas = [], [], []
         for label, cones in self.cones.items():
             points.append(self.splines[label].evaluate(cones[:, 0]))

@@ -79,7 +79,7 @@ class BatchResult(BatchRun):
 
     @cached_property
     def pose_covariances(self) -> Array:
-        """Return the marginal covariance (n, 3, 3) of each pose (x, y, theta), map frame, computed once."""
+        """Marginal covariance (n, 3, 3) of each pose (x, y, theta), map frame, computed once."""
         with threadpool_limits(limits=1):
             weights = self.scale ** np.array(POSE_LENGTHS, float)
             marginals = self.system.eliminated(self.optimum).pose_marginals
@@ -90,7 +90,7 @@ class BatchResult(BatchRun):
 
     @property
     def cycles_of_drive(self) -> slice:
-        """Return the drive's cycles among those of the problem."""
+        """Drive's cycles among those of the problem."""
         state = self.optimum.state
         return state.drives.parts(len(state.poses))[self.drive]
 
@@ -114,7 +114,7 @@ class Found:
 
     @property
     def system(self) -> BatchSystem:
-        """Return the problem that was solved."""
+        """Problem that was solved."""
         return self.optimizer.system
 
 

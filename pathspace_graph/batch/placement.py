@@ -60,7 +60,7 @@ class Driven:
 
     @cached_property
     def driven(self) -> Array:
-        """Return the length (m) of the path to each pose (P,)."""
+        """Length (m) of the path to each pose (P,)."""
         return path_lengths(self.state.poses)
 
     def cones(self, begin: float = 0.0, end: float = np.inf) -> Constellation:
@@ -72,7 +72,7 @@ class Driven:
 
     @cached_property
     def all_cones(self) -> Constellation:
-        """Return the cones of the whole drive."""
+        """Cones of the whole drive."""
         return self.cones()
 
 
@@ -131,7 +131,7 @@ def _about_start(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
 
 
 def cones_agree(known: Driven, drive: Driven, motion: Array) -> bool:
-    """Return whether the cones of a stretch of a drive, after a motion (3,), surely lie on known ones.
+    """Whether the cones of a stretch of a drive, after a motion (3,), surely lie on known ones.
 
     A short way fits on many roads; its cones do not.
     """

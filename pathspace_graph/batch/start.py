@@ -122,17 +122,17 @@ class AlignedOdometry:
 
     @property
     def poses(self) -> Array:
-        """Return the poses (P, 3) of all cycles."""
+        """Poses (P, 3) of all cycles."""
         return self.variables.poses
 
     @property
     def calibration(self) -> Array:
-        """Return the calibration (2,) of the odometry."""
+        """Calibration (2,) of the odometry."""
         return self.variables.calibration
 
     @cached_property
     def covariances(self) -> Array:
-        """Return the marginal covariance (P, 3, 3) of each pose."""
+        """Marginal covariance (P, 3, 3) of each pose."""
         return self.system().pose_marginals
 
     def system(self) -> Elimination:
@@ -214,7 +214,7 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
 
 
 def _is_off(revisit: Revisit, poses: Array) -> bool:
-    """Return whether poses (P, 3) contradict a revisit so much that they are no place to search the next."""
+    """Whether poses (P, 3) contradict a revisit so much that they are no place to search the next."""
     off = relative(poses[revisit.earlier], poses[revisit.later]) - revisit.local
     off[2] = wrap_angle(off[2])
     return float(off @ NEARBY.information @ off) > OFF**2

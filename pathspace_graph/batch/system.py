@@ -182,7 +182,7 @@ class BatchSystem:
 
     @property
     def sigma_slide(self) -> float:
-        """Return the standard deviation of a control point's slide along its curve (m)."""
+        """Standard deviation of a control point's slide along its curve (m)."""
         return SIGMA_SLIDE if self.matches else self.settings.batch.sigma_slide
 
     def drive_rows(self, state: State) -> list[Rows]:

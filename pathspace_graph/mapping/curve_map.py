@@ -178,7 +178,7 @@ class CurveMap:
 
     @property
     def structure(self) -> object:
-        """Return an object that is replaced when the weak priors hold other control points than before."""
+        """Object that is replaced when the weak priors hold other control points than before."""
         return self.state.curves.keys if self.state.boundaries else None
 
     def gauge(self, whole: bool) -> list[Rows]:

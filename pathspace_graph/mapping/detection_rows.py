@@ -28,7 +28,7 @@ class DetectionRows:
 
     @property
     def whitened(self) -> Array:
-        """Return the residuals (m,) in sigmas."""
+        """Residuals (m,) in sigmas."""
         return np.asarray(self.residual / self.sigma)
 
     def scale(self, weights: Array) -> Array:

@@ -214,7 +214,7 @@ class DetectionTable(DetectionColumns):
 
     @property
     def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array]:
-        """Return the columns that say what is in use, where, and as what it was measured."""
+        """Columns that say what is in use, where, and as what it was measured."""
         decided = self.cycle, self.boundary, self.used, self.u
         return *decided, self.measured, self.twist, self.covariance
 

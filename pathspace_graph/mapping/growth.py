@@ -81,7 +81,7 @@ class Growth:
             tracks.clear()
 
     def _waits(self, state: State, label: int) -> bool:
-        """Return whether the vehicle is far from the end of a known curve."""
+        """Whether the vehicle is far from the end of a known curve."""
         at_end = self._known.get(label, -np.inf) - self.settings.reach
         return bool(state.pose_u[label][-1] < at_end)
 
@@ -276,7 +276,7 @@ def _stopped(track: CurveMap, label: int) -> Text:
 
 
 def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> BoolArray:
-    """Return whether places (n, 2) have at least as many detections of `label` within `radius` (m) as others.
+    """Whether places (n, 2) have at least as many detections of `label` within `radius` (m) as others.
 
     A sensor that now and then confuses colours sees the true one more often. All coloured detections of the
     window count, in use or not.

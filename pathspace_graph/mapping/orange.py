@@ -150,7 +150,7 @@ class _Pass:
 
 
 def _alone(together: IntArray, a: int, b: int) -> bool:
-    """Return whether two tracks were hardly ever detected in one cycle, as two cones would be."""
+    """Whether two tracks were hardly ever detected in one cycle, as two cones would be."""
     return bool(together[a, b] < SELDOM * min(together[a, a], together[b, b]))
 
 
@@ -162,12 +162,12 @@ class _Cone:
 
     @property
     def single(self) -> Array:
-        """Return the covariance (2, 2) of one detection (m^2)."""
+        """Covariance (2, 2) of one detection (m^2)."""
         return np.asarray(self.count * np.linalg.inv(self.information), np.float64)
 
     @property
     def covariance(self) -> Array:
-        """Return the covariance (2, 2) of the place (m^2); a part of each detection's error stays in it."""
+        """Covariance (2, 2) of the place (m^2); a part of each detection's error stays in it."""
         return (1.0 / self.count + STAYING) * self.single
 
     def apart(self, other: "_Cone", alone: bool) -> float:

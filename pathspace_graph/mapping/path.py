@@ -120,7 +120,7 @@ along_and_across: Final = kernels.along_and_across
 
 
 def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
-    """Return whether each segment from `begin` (2,) to one of `ends` (k, 2) crosses a polyline (n, 2)."""
+    """Whether each segment from `begin` (2,) to one of `ends` (k, 2) crosses a polyline (n, 2)."""
     step, relative = ends - begin, line - begin
     beside = step[:, :1] * relative[:, 1] - step[:, 1:] * relative[:, 0]
     edge = np.diff(line, axis=0)

@@ -139,7 +139,7 @@ class Registration:
 
 
 def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool:
-    """Return whether a pose (3,) may be on the beginning again: after a long path, near it, and along it."""
+    """Whether a pose (3,) may be on the beginning again: after a long path, near it, and along it."""
     if path.length < settings.min_path:
         return False
     away = np.hypot(*(path.beginning[:, :2] - pose[:2]).T)
@@ -148,7 +148,7 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
 
 
 def passes_start(state: State, path: DrivenPath, motion: Motion) -> bool:
-    """Return whether the newest path, moved, crosses the line at which the drive began, on its road.
+    """Whether the newest path, moved, crosses the line at which the drive began, on its road.
 
     In each round of a skidpad the vehicle is on its beginning again, but has not closed a lap.
     """
@@ -200,13 +200,13 @@ def register(
 
 
 def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
-    """Return whether the newest detections reach the beginning: otherwise only a lost vehicle registers."""
+    """Whether the newest detections reach the beginning: otherwise only a lost vehicle registers."""
     unmoved = Motion(track.state.poses[-1, :2], np.zeros(3))
     return bool(_with_beginning(track, times, settings).match(unmoved, REGISTERED_REACH).hessian.any())
 
 
 def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
-    """Return whether a pose with this covariance (3, 3) is less certain than the registration can bridge."""
+    """Whether a pose with this covariance (3, 3) is less certain than the registration can bridge."""
     prior = np.linalg.inv(covariance * settings.prior_scale**2)
     return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < REGISTERED_REACH**-2)
 
@@ -248,7 +248,7 @@ def sigma_of_information(information: Array) -> float:
 
 
 def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:
-    """Return whether nearly all of enough detections are inliers, on a long stretch of every boundary.
+    """Whether nearly all of enough detections are inliers, on a long stretch of every boundary.
 
     Outliers count only if the newest curves explain them: others are clutter, or of road not mapped yet.
     """
@@ -261,7 +261,7 @@ def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bo
 
 
 def is_certain(matches: Matches, posterior: Array, settings: ClosingSettings, lost: bool = False) -> bool:
-    """Return whether the motion is certain in every direction.
+    """Whether the motion is certain in every direction.
 
     The limit is wider once a long stretch of the beginning was driven again, as more detections would add
     little, unless the vehicle is `lost`: then one place along a straight agrees as well as the next.

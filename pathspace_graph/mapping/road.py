@@ -122,12 +122,12 @@ class Road:
 
     @property
     def closed(self) -> bool:
-        """Return whether the curves are closed: the map has its final size."""
+        """Whether the curves are closed: the map has its final size."""
         return self.smoother.map.state.closed
 
     @property
     def boundaries(self) -> dict[int, Boundary]:
-        """Return the curves by label."""
+        """Curves by label."""
         return self.smoother.map.state.boundaries
 
     @property
@@ -136,7 +136,7 @@ class Road:
 
     @property
     def poses(self) -> Array:
-        """Return a view of the poses (P, 3) in the window, the oldest first, map frame."""
+        """View of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.smoother.variables.poses
 
     @property

@@ -220,5 +220,5 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
 
 def _holds(active: IntArray, needed: IntArray, size: int) -> bool:
-    """Return whether one stretch of a boundary's `size` control points holds another; indices may wrap."""
+    """Whether one stretch of a boundary's `size` control points holds another; indices may wrap."""
     return int(needed[0] - active[0]) % size + len(needed) <= len(active)

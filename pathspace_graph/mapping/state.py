@@ -67,7 +67,7 @@ class Curves:
         return {name: value for name, value in vars(self).items() if name != "searched"}
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
-        """Return whether these are the curves of boundaries with active control points, by default all."""
+        """Whether these are the curves of boundaries with active control points, by default all."""
         tables = [boundary.tables for boundary in boundaries.values()]
         stretches = [active.get(label, boundary.everything) for label, boundary in boundaries.items()]
         known = *self.tables, *self.active
@@ -79,7 +79,7 @@ class Curves:
 
     @cached_property
     def pairs(self) -> tuple[IntArray, Array, IntArray, IntArray]:
-        """Return the pairs of neighbouring active control points, by rows (r, 2) of `State.map_points`.
+        """Pairs of neighbouring active control points, by rows (r, 2) of `State.map_points`.
 
         Their nominal distances (r,) in m, keys (r, 2), and the numbers (r,) of their factors follow.
         """
@@ -95,7 +95,7 @@ class Curves:
 
     @property
     def trusted(self) -> Array:
-        """Return the parameter (k,) of each curve up to which foot points are allowed."""
+        """Parameter (k,) of each curve up to which foot points are allowed."""
         return np.array([boundary.trusted for boundary in self.boundaries])
 
     def find(
@@ -147,12 +147,12 @@ class State:
 
     @property
     def map_keys(self) -> IntArray:
-        """Return the keys (m,) of all boundaries' control points, in the order of `map_points`."""
+        """Keys (m,) of all boundaries' control points, in the order of `map_points`."""
         return np.concatenate([np.zeros(0, np.intp), *(self.keys(label) for label in self.boundaries)])
 
     @property
     def map_points(self) -> Array:
-        """Return a view of all boundaries' control points (m, 2) in m, map frame."""
+        """View of all boundaries' control points (m, 2) in m, map frame."""
         layout, (left, right) = self.variables.layout, CONTROL_LETTERS
         both = slice(layout.block(left).start, layout.block(right).stop)
         return self.variables.values[both].reshape(-1, 2)
@@ -163,7 +163,7 @@ class State:
 
     @property
     def poses(self) -> Array:
-        """Return a view of the poses (P, 3), the oldest first."""
+        """View of the poses (P, 3), the oldest first."""
         return self.variables.poses
 
     def calibration_keys(self, drive: int) -> IntArray:
@@ -175,7 +175,7 @@ class State:
 
     @property
     def closed(self) -> bool:
-        """Return whether a curve is closed; both are closed together."""
+        """Whether a curve is closed; both are closed together."""
         return any(boundary.periodic for boundary in self.boundaries.values())
 
     def spline(self, label: int) -> BSpline:
@@ -189,7 +189,7 @@ class State:
 
     @property
     def curves(self) -> Curves:
-        """Return the boundaries, at least one, side by side; the result is cached."""
+        """Boundaries, at least one, side by side; the result is cached."""
         known = self._curves
         if known is None or not known.is_of(self.boundaries, self.active_stretch):
             active = {label: self.active(label) for label in self.boundaries}
@@ -198,7 +198,7 @@ class State:
 
     @property
     def whole_curves(self) -> Curves:
-        """Return the boundaries side by side, with their inactive control points; the result is cached."""
+        """Boundaries side by side, with their inactive control points; the result is cached."""
         if self.whole:
             return self.curves
         known = self._whole_curves
@@ -240,7 +240,7 @@ class State:
 
     @property
     def whole(self) -> bool:
-        """Return whether every control point is active."""
+        """Whether every control point is active."""
         return not self.active_stretch
 
     def activate(self, keys: IntArray) -> None:

@@ -91,7 +91,7 @@ def test_foot_points_on_both_curves_are_those_on_each_alone(state: State) -> Non
     found = state.curves.find(state.map_points, points, curve, u - 3.0, u + 3.0)
     room = SplineSettings().refine_room
     stretch = u, u - room, np.minimum(u + room, state.curves.trusted[curve])
-    refined = refine_joint_foot_points(state.curves.searched, state.map_points, points, curve, *stretch)
+    refined = refine_joint_foot_points(state.curves.searched, state.map_points, points, curve, *stretch, 1)
     for index, label in enumerate((LEFT, RIGHT)):
         own, boundary = curve == index, state.boundaries[label]
         control = state.control_points(label)
