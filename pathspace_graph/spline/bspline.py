@@ -203,7 +203,7 @@ class BSpline:
         return left_of(self.tangent_unit(u))
 
     def curvature(self, u: Array) -> Array:
-        """Curvature `(x' y'' - y' x'') / |S'|^3` (k,) in 1/m, positive in a left turn; 0 where S' vanishes."""
+        """Curvature `(x' y'' - y' x'') / |S'|^3` (k,) in 1/m, positive to the left; 0 where S' vanishes."""
         _, first, second = self.derivatives(u, 2)
         bent = cross(first, second)
         cube = np.linalg.norm(first, axis=1) ** 3

@@ -113,7 +113,7 @@ class CentreCurve:
         return self.sides[0].size + self.sides[1].size
 
     def table(self, side: int) -> Array:
-        """Pairs (n, 2) of parameters of a boundary, ascending, and of the ribbon, over one period of a loop."""
+        """Pairs (n, 2) of parameters of a boundary, ascending, and of the ribbon; over a whole loop."""
         u, own = self.u, self.beside[side]
         if self.ribbon.periodic:
             (low, high), (begin, end) = self.sides[side].domain, self.ribbon.domain
