@@ -50,39 +50,5 @@ def foot_points(
     and kinks.
     """
     curve = np.zeros(len(points), np.intp)
-    alone = Curves([tables])
-    return joint_foot_points(alone, control_points, points, curve, u_low, u_high, coarse_step, iterations)
-
-
-def joint_foot_points(
-    curves: Curves,
-    control_points: Array,
-    points: Array,
-    curve: IntArray,
-    u_low: Array,
-    u_high: Array,
-    coarse_step: float,
-    iterations: int = SEARCH_ITERATIONS,
-) -> FootPoints:
-    """Find foot points as `foot_points` does, on several curves; `curve` (m,) is the index of each row's."""
     search = u_low, u_high, coarse_step, iterations
-    return FootPoints(*curves.search(control_points, points, curve, *search))
-
-
-def refine_joint_foot_points(
-    curves: Curves,
-    control_points: Array,
-    points: Array,
-    curve: IntArray,
-    u_start: Array,
-    u_low: Array,
-    u_high: Array,
-    iterations: int,
-) -> FootPoints:
-    """Find the local minima of |S(u) - p_i| downhill from u_start (m,) by safeguarded Newton steps.
-
-    The other arguments are as in `joint_foot_points`. A start outside its stretch is moved into it first. No
-    step exceeds one mean knot interval, and no row ends farther from the curve than it began.
-    """
-    search = u_start, u_low, u_high, iterations
-    return FootPoints(*curves.refine(control_points, points, curve, *search))
+    return FootPoints(*Curves([tables]).search(control_points, points, curve, *search))

@@ -31,7 +31,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.motion import known_noise, size_of_vehicle, with_inflated_priors, with_size
+from pathspace_graph.mapping.motion import known_noise, vehicle_of, with_inflated_priors, with_size
 from pathspace_graph.mapping.orange import OrangeCones, Sighting
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict
@@ -297,7 +297,7 @@ def result_of(
     parts = state.drives.parts(len(state.poses))
     poses, own = state.poses[parts[drive]].copy(), few.detections.of_drive(drive)
     records, laps = records_of(few, chain, sum(seconds.values()) / len(parts), drive)
-    vehicle = vehicle_of(state, known, found.system.settings, drive)
+    vehicle = _vehicle_of(found, known, drive)
     return BatchResult(
         estimator=NAME,
         settings=settings,
@@ -331,14 +331,12 @@ def known_of(system: BatchSystem, at: Evaluation) -> FactoredSystem:
     return FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
 
 
-def vehicle_of(state: State, known: FactoredSystem, settings: MapperSettings, drive: int) -> VehicleState:
+def _vehicle_of(found: Found, known: FactoredSystem, drive: int) -> VehicleState:
     """Return the last pose of a drive and its calibration, with their joint covariance."""
+    state, size = found.at.state, found.system.settings.odometry.sigma_size
     last, keys = state.drives.parts(len(state.poses))[drive].stop - 1, state.calibration_keys(drive)
-    pose, calibrations = state.poses[last], state.variables.of(keys)
     covariance = known.covariance(np.append(pose_key(last), keys))
-    values = size_of_vehicle(pose, len(calibrations))
-    covariance = with_size(covariance, values, settings.odometry.sigma_size)
-    return VehicleState.split(pose, calibrations, covariance)
+    return vehicle_of(state.poses[last], state.variables.of(keys), covariance, size)
 
 
 def _map_of_curves(few: Simplified, joint: Array, settings: MapperSettings) -> Map:

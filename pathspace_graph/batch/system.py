@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.footpoint import FootPoints, refine_joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
@@ -225,9 +225,8 @@ class BatchSystem:
         u, s = detections.u[rows], curves.boundaries[0].settings
         curve = curves.labels.searchsorted(detections.boundary[rows])
         stretch = u, u - s.refine_room, np.minimum(u + s.refine_room, curves.trusted[curve])
-        return refine_joint_foot_points(
-            curves.searched, state.map_points, points, curve, *stretch, s.refine_iterations
-        )
+        search = *stretch, s.refine_iterations
+        return FootPoints(*curves.searched.refine(state.map_points, points, curve, *search))
 
     def settle(self, state: State) -> None:
         """Refine the foot points of the used detections until they converge."""

@@ -168,9 +168,10 @@ def with_size(covariance: Array, values: Array, sigma: float) -> Array:
     return covariance + sigma**2 * np.outer(values, values)
 
 
-def size_of_vehicle(pose: Array, count: int) -> Array:
-    """Values of `with_size` (n,) of [pose | calibrations]; the first calibration is a scale."""
-    return np.concatenate([pose[:2], [0.0, -1.0], np.zeros(count - 1)])
+def vehicle_of(pose: Array, calibrations: Array, covariance: Array, sigma_size: float) -> VehicleState:
+    """Return the vehicle's state, given the covariance of [pose | calibrations] without that of the scale."""
+    values = np.concatenate([pose[:2], [0.0, -1.0], np.zeros(len(calibrations) - 1)])  # -1 by the scale error
+    return VehicleState.split(pose, calibrations, with_size(covariance, values, sigma_size))
 
 
 def vehicle_state(smoother: FixedLagSmoother[MapRows], sigma_size: float = 0.0) -> VehicleState:
@@ -179,9 +180,7 @@ def vehicle_state(smoother: FixedLagSmoother[MapRows], sigma_size: float = 0.0) 
     if len(variables.sensor):
         keys.append(SENSOR_KEY)
     covariance = smoother.covariance(np.array(keys, np.intp))
-    pose = variables.poses[-1]
-    covariance = with_size(covariance, size_of_vehicle(pose, len(variables.calibrations)), sigma_size)
-    return VehicleState.split(pose, variables.calibrations, covariance)
+    return vehicle_of(variables.poses[-1], variables.calibrations, covariance, sigma_size)
 
 
 def smoother_settings(settings: MapperSettings) -> SmootherSettings:

@@ -12,7 +12,7 @@ from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
-from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.graph.drives import ONE_DRIVE, Drives
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
@@ -104,7 +104,7 @@ class Curves:
         """Find the foot points of points (m, 2), each on its own curve (m,) and stretch [low, high]."""
         s, high = self.boundaries[0].settings, np.minimum(high, self.trusted[curve])
         search = (s.search_step, s.search_iterations)
-        return joint_foot_points(self.searched, control_points, points, curve, low, high, *search)
+        return FootPoints(*self.searched.search(control_points, points, curve, low, high, *search))
 
 
 def _first_active(boundaries: Sequence[Boundary], active: Sequence[IntArray]) -> list[int]:

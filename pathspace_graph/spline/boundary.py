@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors._kernels import Curves
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
-from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.factors.se2 import move_points, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
@@ -135,9 +135,9 @@ class Boundary:
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
         """Find the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
-        s, alone = self.settings, np.zeros(len(points), np.intp)
-        search = s.search_step, s.search_iterations
-        return joint_foot_points(self._curve_from(low), control_points, points, alone, low, high, *search)
+        s, curve = self.settings, np.zeros(len(points), np.intp)
+        search = low, high, s.search_step, s.search_iterations
+        return FootPoints(*self._curve_from(low).search(control_points, points, curve, *search))
 
     def _curve_from(self, low: Array) -> Curves:
         """Curve on its distinct control points; an open one from the least limit (m,) on."""
@@ -152,10 +152,10 @@ class Boundary:
 
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
         """Refine the foot points of points (m, 2), starting at the parameters u (m,)."""
-        s, alone = self.settings, np.zeros(len(points), np.intp)
+        s, curve = self.settings, np.zeros(len(points), np.intp)
         search = u, u - s.refine_room, self.within_trusted(u + s.refine_room), s.refine_iterations
         unwrapped = self.extended(control_points)
-        return refine_joint_foot_points(Curves([self.tables]), unwrapped, points, alone, *search)
+        return FootPoints(*Curves([self.tables]).refine(unwrapped, points, curve, *search))
 
     @property
     def trusted(self) -> float:

@@ -15,7 +15,7 @@ from pathspace_graph.factors.bspline import (
     periodic_knots,
     uniform_knots,
 )
-from pathspace_graph.factors.footpoint import FootPoints, foot_points, refine_joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints, foot_points
 
 GRID = 400
 """Coarse grid steps over the domain."""
@@ -33,7 +33,7 @@ def refine_foot_points(
 ) -> FootPoints:
     """The refinement on one curve."""
     alone = np.zeros(len(points), np.intp)
-    return refine_joint_foot_points(Curves([tables]), control_points, points, alone, *stretch, iterations)
+    return FootPoints(*Curves([tables]).refine(control_points, points, alone, *stretch, iterations))
 
 
 def whole(tables: SpanPolynomials, control_points: Array, points: Array, step: float = 0.0) -> FootPoints:
