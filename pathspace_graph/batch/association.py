@@ -228,20 +228,17 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     beside[~used], on_curve[~used], u[~used] = _beside(state, points[~used], cycles[~used], label, settings)
     u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
 
+    def along(chosen: BoolArray | IntArray) -> tuple[Array, Array, Array, float, bool, MapperSettings]:
+        return points[chosen], u[chosen], covariances[chosen], boundary.length, boundary.periodic, settings
+
     if label in settings.lines:
-        on_line = points[on_curve], u[on_curve], covariances[on_curve]
-        return points_along(*on_line, boundary.length, boundary.periodic, settings)
-
-    def clustered(chosen: BoolArray | IntArray) -> Cones:
-        along = points[chosen], u[chosen], covariances[chosen]
-        return cluster(*along, boundary.length, boundary.periodic, settings)
-
-    cones = clustered(on_curve)
+        return points_along(*along(on_curve))
+    cones = cluster(*along(on_curve))
     if len(cones.u) == 0:
         return cones
     others = np.flatnonzero(beside & ~on_curve)
     near = nearest_within(points[others], cones.points, settings.growth.merge_radius)[1]
-    off_curve = clustered(others[~near])
+    off_curve = cluster(*along(others[~near]))
     cones = cones.merged(off_curve.where(off_curve.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
         longest = state.drives.longest(len(state.poses))

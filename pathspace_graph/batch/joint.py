@@ -78,8 +78,11 @@ class JointSystem(BatchSystem):
     def __init__(self, placed: Sequence[PlacedDrive]) -> None:
         self.placed, self.drives = tuple(placed), drives_of(placed)
         detections = DetectionTable.of_drives([one.alone.system.detections for one in placed], self.drives)
-        begins = zip(placed, self.drives.first, strict=True)
-        own = [later_by(one, begin) for drive, begin in begins for one in drive.alone.system.revisits]
+        own = [
+            replace(one, earlier=one.earlier + begin, later=one.later + begin)
+            for drive, begin in zip(placed, self.drives.first, strict=True)
+            for one in drive.alone.system.revisits
+        ]
         super().__init__(detections, placed[0].chain, placed[0].settings, own)
         self.chains = [one.chain for one in placed]  # the odometry of each drive
         self.priors = [one.settings for one in placed]
@@ -118,10 +121,6 @@ class JointSystem(BatchSystem):
         one = self.placed[drive]
         back = compose(one.state.poses[0], inverse(poses[0]))
         return disagreement(one.alone.system, compose(back, poses))
-
-
-def later_by(revisit: Revisit, cycles: int) -> Revisit:
-    return replace(revisit, earlier=revisit.earlier + cycles, later=revisit.later + cycles)
 
 
 def in_drive(rows: Rows, number: int, first_cycle: int) -> Rows:
