@@ -29,7 +29,7 @@ from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive
-from .objections import speaks_against
+from .objections import evidence_against
 from .optimizer import Convergence, Effort, Optimizer
 from .simplification import boundary_of, map_block, own_settings, simplified
 from .start import start_odometry
@@ -115,7 +115,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             cones=scatter.places,
             stations=stations,
             seconds=time.perf_counter() - begin,
-            objection=speaks_against(system, at, few.splines, simple.detections),
+            objection=evidence_against(system, at, few.splines, simple.detections),
         )
 
 

@@ -39,7 +39,7 @@ from pathspace_graph.scale import solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .gtsam_graph import nonlinear_graph
-from .objections import speaks_against, unmapped
+from .objections import evidence_against, unmapped
 from .optimizer import Convergence, Optimizer
 from .simplification import Scatter, Simplified, map_block, own_settings, simplified
 from .start import CurveMapper, find_revisits, start_odometry, start_online
@@ -234,7 +234,7 @@ def find_closed_optimum(optimizer: Optimizer) -> Found | None:
         found = find_from_odometry(optimizer)
     except SolveError:
         return None
-    against = speaks_against(system, found.at, found.at.state.splines, system.detections)
+    against = evidence_against(system, found.at, found.at.state.splines, system.detections)
     return None if against else found
 
 

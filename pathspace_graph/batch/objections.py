@@ -66,13 +66,13 @@ def objection(splines: Mapping[int, BSpline], poses: Array, used: float, setting
             known[np.arange(first, last if last >= first else last + len(curve)) % len(curve)] = False
         wider = float(np.max(by_drive.query(curve[known])[0])) / aside
         if wider > DRIVE_RATIO:
-            return f"a boundary would be {wider:.1f} times as far from the drive as it is beside it"
+            return f"a boundary would be {wider:.1f} times as far from the drive as the drive is from it"
     if used < settings.batch.closure.used:
         return f"only {used:.0%} of the detections lie on its boundaries".replace("%", " %")
     return ""
 
 
-def speaks_against(
+def evidence_against(
     system: BatchSystem, at: Evaluation, splines: Mapping[int, BSpline], detections: DetectionTable
 ) -> str:
     """Describe the evidence against closed curves at an optimum, with their detections; empty if none."""
@@ -114,5 +114,5 @@ def unmapped(detections: DetectionTable, poses: Array) -> str:
     ends = np.minimum(MISS_STRETCH * edges.reshape(-1, 2), driven[-1]).tolist()[:MISS_SHOWN]
     told = [Text("{a:.3g} to {b:.3g} m", a=Length(a), b=Length(b)) for a, b in ends]
     where = Text(" ({stretches} of the drive)", stretches=joined(told, ", ")) if told else ""
-    said = "{share:.0f} % of what was detected near the drive lies on no boundary{where}"
+    said = "{share:.0f} % of the detections near the drive lie on no boundary{where}"
     return Text(said, share=100.0 * missed.sum() / near.sum(), where=where)

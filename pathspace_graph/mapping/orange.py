@@ -57,7 +57,7 @@ class OrangeCones:
         self._passes: dict[int, tuple[_Pass, ...]] = {}  # by label, in order
 
     def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
+        """Return an independent copy; no attribute is changed in place."""
         return shallow(self)
 
     def add(self, sighting: Sighting, sensor: Array) -> None:

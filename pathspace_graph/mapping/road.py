@@ -154,6 +154,6 @@ class Road:
         self.orange.place_again(self.smoother.variables.sensor, (0, corrected), window)
 
     def move(self, motion: Array) -> None:
-        """Move what is not a variable by a rigid motion (3,) of the map frame."""
+        """Move path, tracks and cones, which are no variables, by a rigid motion (3,) of the map frame."""
         for one in self.smoother.attached:
             one.move(motion)
