@@ -179,7 +179,7 @@ def seen_in(table: DetectionColumns) -> SeenIn:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Prior of the newest pose beside an earlier pass, about the estimate."""
+    """Prior of the newest pose beside an earlier pass, centred on its estimate."""
 
     radius: float  # largest distance (m)
     turn: float  # largest angle (rad)

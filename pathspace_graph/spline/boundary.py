@@ -301,7 +301,7 @@ def sampled(spline: BSpline, step: float) -> Array:
 
 
 def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array = NO_PATH) -> bool:
-    """Whether the left and the right boundary, sampled at a step (m), cross off the path's crossings."""
+    """Whether the boundaries, sampled at a step (m), cross elsewhere than where the path crosses itself."""
     found = crossings(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
     return not at_level_crossing(found, path).all()
 
