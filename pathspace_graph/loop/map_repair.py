@@ -208,7 +208,8 @@ def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bo
         beyond = ahead_of(middle, at, boundary.length)
         return np.asarray((beyond > low) & (beyond < high))
 
-    moved, every = np.flatnonzero(is_there(boundary.abscissae)), np.arange(*boundary.ends, SAMPLE)
+    tables = boundary.tables
+    moved, every = np.flatnonzero(is_there(boundary.abscissae)), np.arange(tables.low, tables.high, SAMPLE)
     held = every[~is_there(every)]
     at, targets = np.append(u, held), np.concatenate([cones, boundary.evaluate(points, held)])
     basis = boundary.basis(at)[:, moved]
