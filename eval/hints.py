@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Final, Never
+from typing import Annotated, Any, Final
 
 import numpy as np
 import pandas as pd
@@ -18,12 +18,13 @@ from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 from tyro.conf import arg
 
-from pathspace_graph.console import note, progress, say
-from pathspace_graph.errors import PathspaceError, SolveError, check_name
+from pathspace_graph.console import LINES, note, progress, say
+from pathspace_graph.errors import PathspaceError, check_name
 from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment.drives import load_tracks
 from pathspace_graph.eval.experiment.frame import write_csv
-from pathspace_graph.eval.experiment.run import OnCell, WorkerDiedError, run_cells
+from pathspace_graph.eval.experiment.rows import rows_of
+from pathspace_graph.eval.experiment.runner import unfinished
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.io.files import atomic_folder, check_target, write_text
@@ -180,8 +181,6 @@ GOOD: Final = {
 class HintStudy:
     """Spoil simulated logs by each mistake, and vary good ones; say how many are named and accused."""
 
-    out: Path
-    """Folder for the results; earlier ones there are kept as a numbered backup."""
     tracks: Annotated[tuple[str, ...], arg(metavar="TRACK...")] = ("0", "1")
     """Track files, folders of them, or seeds of generated tracks."""
     seeds: tuple[int, ...] = (0, 1)
@@ -196,53 +195,64 @@ class HintStudy:
     """Kinds of good logs that are spoiled."""
     maps: bool = False
     """Measure what becomes of the map of each spoiled log, too, which takes long."""
-    jobs: int = 1
-    """Number of processes at a time, -1 for one on each core."""
 
-    def measure(self, on_cell: OnCell | None = None) -> pd.DataFrame:
-        """Judge every log, and return a row for each."""
+    def measure(self, **how: Any) -> pd.DataFrame:
+        """Judge every log, and return a row for each; `how` is that of `rows_of`."""
         for name in self.mistakes:
             check_name(name, MISTAKES, "--mistakes: expected a known mistake")
         for name in self.kinds:
             check_name(name, GOOD, "--kinds: expected a known kind of good log")
         kinds = tuple(kind for kind in GOOD if self.good or kind in self.kinds)
         tracks = load_tracks([int(one) if one.isdigit() else Path(one) for one in self.tracks])
-        cells = [*product([self], tracks, self.seeds, kinds)]
-        rows = run_cells(cells, judge, lost, jobs=self.jobs, on_cell=on_cell)
-        return pd.DataFrame([row for of in rows for row in of])
+        shared = {"laps": self.laps, "is_good_judged": self.good, "maps": self.maps}
+        parts = [
+            {"track": track, "seed": seed, "kind": kind, **shared}
+            | {"mistakes": self.mistakes if kind in self.kinds else ()}
+            for track, seed, kind in product(tracks, self.seeds, kinds)
+        ]
+        return rows_of(judge, parts, **how)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Script(HintStudy):
+    """Spoil simulated logs by each mistake, and vary good ones; say how many are named and accused."""
+
+    out: Path
+    """Folder for the results; earlier ones there are kept as a numbered backup."""
+    jobs: int = 1
+    """Number of processes at a time, -1 for one on each core."""
 
     def run(self) -> TextTable:
         check_target(self.out, MARKER)
-        with progress("judging") as advance:
-            frame = self.measure(advance)
-        table = summary(frame)
-        with atomic_folder(self.out, MARKER) as folder:
-            write_csv(folder / MARKER, frame)
-            write_text(folder / "hints.md", table.markdown())
+        with unfinished(self.out) as folder:
+            with progress("judging", lines=LINES) as advance:
+                frame = self.measure(folder=folder, jobs=self.jobs, on_cell=advance)
+            table = summary(frame)
+            with atomic_folder(self.out, MARKER) as out:
+                write_csv(out / MARKER, frame)
+                write_text(out / "hints.md", table.markdown())
         return table
 
 
-HintCell = tuple[HintStudy, Track, int, str]  # study, track, seed and kind of good log
-
-
-def judge(cell: HintCell) -> list[Row]:
-    """Return a row for the good log of a cell, and for each of those that are spoiled."""
-    study, track, seed, kind = cell
-    spoil = kind in study.kinds
-    log = GOOD[kind].log(track, seed, study.laps)
+def judge(
+    track: Track,
+    seed: int,
+    kind: str,
+    laps: int,
+    mistakes: Sequence[str],
+    is_good_judged: bool,
+    maps: bool,
+) -> list[Row]:
+    """Return a row for the good log of a kind, and for each of those that are spoiled by mistakes."""
+    log = GOOD[kind].log(track, seed, laps)
     good: Row = {"kind": "good", "name": kind, "of": kind}
-    rows = [good | judged(log)] if study.good else []
-    clean = mapped(log) if study.maps and spoil else {}
-    for name in study.mistakes if spoil else ():
+    rows = [good | judged(log)] if is_good_judged else []
+    clean = mapped(log) if maps and mistakes else {}
+    for name in mistakes:
         spoiled = MISTAKES[name](log)
         row = {"of": kind, "kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))}
-        rows.append(row | (outcome(mapped(spoiled), clean) if study.maps else {}))
+        rows.append(row | (outcome(mapped(spoiled), clean) if maps else {}))
     return [{"track": track.name, "seed": seed} | row for row in rows]
-
-
-def lost(cell: HintCell, error: WorkerDiedError) -> Never:
-    _, track, _, kind = cell
-    raise SolveError(f"{kind} on {track.name}: {error}")
 
 
 def causes_of(mistake: str) -> tuple[str, ...]:
@@ -326,7 +336,7 @@ def _line(name: str, logs: pd.DataFrame, column: str) -> tuple[str, ...]:
 
 def main() -> None:
     """Run the script; the exit code is 2 on bad input."""
-    study = tyro.cli(HintStudy)
+    study = tyro.cli(Script)
     try:
         table = study.run()
     except PathspaceError as error:

@@ -199,17 +199,17 @@ class Plan:
     def hints(self, folder: Path) -> Views:
         small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
         tracks = tuple(map(str, GENERATED[: 1 if self.quick else 3]))
-        study = HintStudy(out=folder, tracks=tracks, seeds=(0,), jobs=self.jobs, **small)
-        return {"hints": views.hints_table(study.measure(self.on_cell))}
+        study = HintStudy(tracks=tracks, seeds=(0,), **small)
+        return {"hints": views.hints_table(study.measure(folder=folder, **self._how))}
 
-    def joint(self, _: Path) -> Views:
+    def joint(self, folder: Path) -> Views:
         small: dict[str, Any] = {"tracks": (50,), "drives": 2} if self.quick else {}
-        frame = JointStudy(jobs=self.jobs, **small).measure(self.on_cell)
+        frame = JointStudy(**small).measure(folder=folder, **self._how)
         return {"joint": joint_table(frame)}
 
-    def known(self, _: Path) -> Views:
+    def known(self, folder: Path) -> Views:
         small: dict[str, Any] = {"tracks": (60,), "begins": (0.3,)} if self.quick else {}
-        frame = KnownStudy(jobs=self.jobs, **small).measure(self.on_cell)
+        frame = KnownStudy(**small).measure(folder=folder, **self._how)
         return {"known": known_table(frame)}
 
     def speed(self, _: Path) -> Views:
@@ -251,7 +251,11 @@ class Plan:
         return study, self._run(study, folder)
 
     def _run(self, study: Study, folder: Path) -> pd.DataFrame:
-        return run_study(study, folder, jobs=self.jobs, on_cell=self.on_cell)
+        return run_study(study, folder, **self._how)
+
+    @property
+    def _how(self) -> dict[str, Any]:
+        return {"jobs": self.jobs, "on_cell": self.on_cell}
 
 
 EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {

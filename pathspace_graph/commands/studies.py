@@ -15,11 +15,11 @@ from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online
 from pathspace_graph.eval.benchmark import scaling as timing
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import measure_scaling
-from pathspace_graph.eval.experiment.cells import of_other_code
 from pathspace_graph.eval.experiment.drives import log_folders
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
 from pathspace_graph.eval.experiment.provenance import commit_of
-from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
+from pathspace_graph.eval.experiment.run import make_plan, run_plan
+from pathspace_graph.eval.experiment.runner import check_jobs, of_other_code
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figures, render_pages, to_json
