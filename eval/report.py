@@ -198,8 +198,7 @@ class Plan:
 
     def hints(self, folder: Path) -> Views:
         small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
-        tracks = tuple(map(str, GENERATED[: 1 if self.quick else 3]))
-        study = HintStudy(tracks=tracks, seeds=(0,), **small)
+        study = HintStudy(tracks=GENERATED[: 1 if self.quick else 3], seeds=(0,), **small)
         return {"hints": views.hints_table(study.measure(folder=folder, **self._how))}
 
     def joint(self, folder: Path) -> Views:
@@ -235,9 +234,10 @@ class Plan:
             "real-measured": real.measured_table(drives),
         }
 
-    def scale(self, _: Path) -> Views:
+    def scale(self, folder: Path) -> Views:
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
-        header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
+        scaling = measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings, folder=folder)
+        header, found = scaling_figures(scaling)
         rows = ((f"`{name}`", Figure.row((value for value, _ in row), 2)) for name, row in found.items())
         return {"results-scaling": (header, tuple(rows))}
 

@@ -27,6 +27,9 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.experiment.frame import write_csv
+from pathspace_graph.eval.experiment.provenance import code_of
+from pathspace_graph.eval.experiment.rows import rows_of
+from pathspace_graph.eval.experiment.runner import OnCell
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.style import MARKERS, PALETTE, WIDTH
@@ -45,7 +48,17 @@ Sweep = Literal["cones", "readings", "laps"]  # cones seen, detections of an upd
 CONES: Final[Sweep] = "cones"
 READINGS: Final[Sweep] = "readings"
 LAPS: Final[Sweep] = "laps"
-Logs = Sequence[tuple[Log, int, Array]]  # log, number of detections if varied, abscissae (NaN doesn't count)
+POINT: Final = ["sweep", "estimator", "at", "seconds", "cycles", "size"]  # columns of a point of a sweep
+SLOPE: Final = [
+    "sweep",
+    "estimator",
+    "slope",
+    "error",
+    "points",
+    "low",
+    "high",
+    "stopped",
+]  # and of its slope
 _HEIGHT: Final = 3.1  # height of a figure (in)
 _TITLES: Final[dict[Sweep, tuple[str, str]]] = {  # axis title and title of each panel
     CONES: ("cones seen", "(a) map size"),
@@ -156,7 +169,7 @@ def binned(sweep: Sweep, lane: Lane, edges: Array) -> pd.DataFrame:
     inside = (bins >= 0) & (bins < len(edges) - 1)
     points = frame[inside].groupby(bins[inside])
     means = points.mean().assign(sweep=sweep, estimator=lane.estimator, cycles=points.size())
-    return means[["sweep", "estimator", "at", "seconds", "cycles", "size"]].reset_index(drop=True)
+    return means[POINT].reset_index(drop=True)
 
 
 def fit_slope(
@@ -176,22 +189,51 @@ def fit_slope(
     return {"sweep": sweep, "estimator": estimator, **fitted, **ends, "stopped": stopped}
 
 
-def sweeps(drives: Drives, settings: ScalingSettings) -> dict[Sweep, tuple[Logs, Array, float]]:
-    """Return the logs of each sweep, the edges of its points' intervals, and where its slope begins."""
-    low, high = np.log(settings.cones_min), np.log(settings.cones_max + 1.0)
-    cones = np.exp(np.linspace(low, high, settings.bins + 1))
-    lap = 1.0 + np.searchsorted(drives.lap_ends, [seen.t for seen in drives.laps.cycles])
-    dense = []
+def lanes_of(
+    sweep: Sweep, drives: Drives, estimators: Sequence[str], settings: ScalingSettings
+) -> tuple[list[Lane], Array, float]:
+    """Return the lanes of a sweep, the edges of its points' intervals, and where its slope begins."""
+    if sweep == CONES:
+        low, high = np.log(settings.cones_min), np.log(settings.cones_max + 1.0)
+        edges = np.exp(np.linspace(low, high, settings.bins + 1))
+        return [Lane(name, drives.cones, drives.seen) for name in estimators], edges, settings.fit_from
+    if sweep == LAPS:
+        lap = 1.0 + np.searchsorted(drives.lap_ends, [seen.t for seen in drives.laps.cycles])
+        edges = np.arange(1.0, len(drives.lap_ends) + 2.0)
+        return [Lane(name, drives.laps, lap.astype(float)) for name in estimators], edges, 2.0
+    lanes = []
     for wanted, log in drives.readings.items():
         counts = np.array([len(seen.labels) for seen in log.cycles])
         counts[: settings.warm_up] = -1
-        dense.append((log, wanted, np.where(counts == wanted, float(wanted), np.nan)))
-    ends = np.arange(1.0, len(drives.lap_ends) + 2.0)
-    return {
-        CONES: ([(drives.cones, 0, drives.seen)], cones, settings.fit_from),
-        READINGS: (dense, np.append(np.sort(settings.readings), np.inf), 0.0),
-        LAPS: ([(drives.laps, 0, lap.astype(float))], ends, 2.0),
-    }
+        at = np.where(counts == wanted, float(wanted), np.nan)
+        lanes += [Lane(name, log, at, wanted) for name in estimators]
+    return lanes, np.append(np.sort(settings.readings), np.inf), 0.0
+
+
+def sweep_rows(
+    sweep: Sweep,
+    estimators: Sequence[str],
+    settings: ScalingSettings,
+    mapper: MapperSettings,
+    drives: Drives,
+    on_cycle: Callable[[], None],
+) -> list[dict[str, Any]]:
+    """Return the points of a sweep, each with its `cycles`, and the slope of each estimator."""
+    lanes, edges, fit_from = lanes_of(sweep, drives, estimators, settings)
+    run_lanes(lanes, mapper, settings.budget, on_cycle)
+    rows: list[dict[str, Any]] = []
+    for name in estimators:
+        own = [lane for lane in lanes if lane.estimator == name]
+        points = _joined([binned(sweep, lane, edges) for lane in own])
+        stops = [(lane.readings, lane.stopped) for lane in own if lane.stopped]
+        stopped = "; ".join(f"{k} readings: {why}" if k else why for k, why in stops)
+        rows += [*points.to_dict("records"), fit_slope(sweep, name, points, fit_from, stopped)]
+    return rows
+
+
+def memory_rows(estimator: str, mapper: MapperSettings, first_lap: Log) -> list[dict[str, Any]]:
+    """Return the peak memory (MB) of an estimator on the first lap."""
+    return [{"estimator": estimator, "megabytes": peak_memory(Lane(estimator, first_lap), mapper)}]
 
 
 def measure_scaling(
@@ -199,24 +241,37 @@ def measure_scaling(
     drives: Drives,
     settings: ScalingSettings,
     mapper: MapperSettings | None = None,
-    on_cycle: Callable[[], None] = lambda: None,
+    folder: Path | None = None,
+    on_cycle: OnCell = lambda *_: None,
 ) -> Scaling:
-    """Measure all three sweeps, and the memory; `on_cycle` is called after each cycle of a sweep."""
-    mapper = mapper or MapperSettings()
-    points, slopes = [], []
-    for sweep, (logs, edges, fit_from) in sweeps(drives, settings).items():
-        lanes = [Lane(name, log, at, k) for name in estimators for log, k, at in logs]
-        run_lanes(lanes, mapper, settings.budget, on_cycle)
-        for name in estimators:
-            own = [lane for lane in lanes if lane.estimator == name]
-            points.append(_joined([binned(sweep, lane, edges) for lane in own]))
-            stops = [(lane.readings, lane.stopped) for lane in own if lane.stopped]
-            stopped = "; ".join(f"{k} readings: {why}" if k else why for k, why in stops)
-            slopes.append(fit_slope(sweep, name, points[-1], fit_from, stopped))
+    """Measure all three sweeps, and the memory, each kept in a folder at once, or read from there.
+
+    `on_cycle` gets the numbers of cycles that are done, and of all that remained.
+    """
+    mapper, code = mapper or MapperSettings(), {name: code_of(name) for name in estimators}
+    shared, found = {"estimators": tuple(estimators), "settings": settings, "mapper": mapper}, []
+    done, total = 0, drives.cycles
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        on_cycle(done, total)
+
+    others = {"drives": drives, "on_cycle": count}
+    for sweep, logs in drives.by_sweep.items():
+        before = done
+        found.append(rows_of(sweep_rows, [{"sweep": sweep, **shared}], folder, others=others, depends=code))
+        total -= max(len(log.cycles) for log in logs) if done == before else 0  # it was kept
     end = int(np.searchsorted([seen.t for seen in drives.laps.cycles], drives.lap_ends[0]))
-    first_lap = first_cycles(drives.laps, end)
-    memory = {name: peak_memory(Lane(name, first_lap), mapper) for name in estimators}
-    return Scaling(settings, asdict(mapper), _joined(points), pd.DataFrame(slopes), memory)
+    others, parts = (
+        {"first_lap": first_cycles(drives.laps, end)},
+        [{"estimator": name, "mapper": mapper} for name in estimators],
+    )
+    memory = rows_of(memory_rows, parts, folder, others=others, depends=[code, settings])
+    rows = pd.concat(found, ignore_index=True)
+    points, slopes = rows[rows["cycles"].notna()], rows[rows["cycles"].isna()]
+    peaks = dict(zip(estimators, memory["megabytes"].tolist(), strict=True))
+    return Scaling(settings, asdict(mapper), points[POINT].reset_index(drop=True), slopes[SLOPE], peaks)
 
 
 def _joined(points: Sequence[pd.DataFrame]) -> pd.DataFrame:

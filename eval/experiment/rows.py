@@ -26,7 +26,8 @@ class RowsCell(Cell):
 
     function: RowsOf
     arguments: Mapping[str, Any]
-    watched: Mapping[str, Any] = field(default_factory=dict)  # arguments that change no row
+    others: Mapping[str, Any] = field(default_factory=dict)  # arguments that change no row
+    depends: Any = None  # on what its rows depend beside the arguments and its code
 
     @property
     def module(self) -> str:
@@ -34,14 +35,14 @@ class RowsCell(Cell):
 
     @property
     def names(self) -> dict[str, Any]:
-        return {name: str(value) for name, value in self.arguments.items()}
+        return {name: value for name, value in self.arguments.items() if isinstance(value, str | int | float)}
 
     @cached_property
     def meaning(self) -> str:
-        return str(joblib.hash([self.function.__qualname__, dict(self.arguments)]))
+        return str(joblib.hash([self.function.__qualname__, dict(self.arguments), self.depends]))
 
     def run(self) -> Record:
-        return {"rows": self.function(**self.arguments, **self.watched)}
+        return {"rows": self.function(**self.arguments, **self.others)}
 
 
 def rows_of(
@@ -51,18 +52,18 @@ def rows_of(
     *,
     jobs: int = 1,
     on_cell: OnCell | None = None,
-    watched: Mapping[str, Any] | None = None,
+    **more: Any,
 ) -> pd.DataFrame:
     """Return the rows of a function of a module for each of some arguments; SolveError where one fails.
 
-    With a `folder` they are kept there, so that a study that was killed goes on.
+    With a `folder` they are kept there, so that a study that was killed goes on. `more` is for the cells.
     """
     code, began = code_from(function.__module__), here()
-    cells = [RowsCell(function, of, watched or {}, code=code, began=began) for of in arguments]
+    cells = [RowsCell(function, of, code=code, began=began, **more) for of in arguments]
     with TemporaryDirectory() if folder is None else nullcontext(folder) as place, workers(jobs):
         records = run_cells(cells, Path(place), on_cell=on_cell, retry_failed=True)
     for cell in cells:
         if failure := records[cell.id]["failure"]:
-            raise SolveError(f"{', '.join(cell.names.values())}: {failure}")
+            raise SolveError(f"{', '.join(map(str, cell.names.values()))}: {failure}")
     rows = [row for cell in cells for row in records[cell.id]["rows"]]
     return pd.DataFrame([{k: np.nan if v is None else v for k, v in row.items()} for row in rows])

@@ -133,6 +133,15 @@ class Study:
         chosen = {group: overrides.pop(f"{group}.{PRESET}", PLAIN) for group in PRESETS}
         return replace(override(preset(chosen), overrides, f"noise.{noise}"), laps=self.laps)
 
+    def against(self, baseline: str) -> "Study":
+        """Return the study with a variant or an estimator as the baseline; SettingsError if it has none."""
+        if baseline in self.estimators:
+            return replace(self, baseline=Baseline(estimator=baseline))
+        check_name(
+            baseline, [*self._named(), *self.estimators], "--baseline: expected a variant or an estimator"
+        )
+        return replace(self, baseline=Baseline(baseline))
+
     @property
     def points(self) -> dict[str, Variant]:
         """Variants to run by name; of those that are equal the first."""

@@ -30,9 +30,14 @@ pytestmark = pytest.mark.usefixtures("png_only")
 @pytest.mark.slow
 def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:
     drives = make_drives(SMALL)
-    told: list[int] = []
-    scaling = measure_scaling(["fixed-lag"], drives, SMALL, on_cycle=lambda: told.append(1))
-    assert len(told) == drives.cycles
+    told: list[tuple[int, int]] = []
+    kept = tmp_path / "kept"
+    scaling = measure_scaling(["fixed-lag"], drives, SMALL, None, kept, lambda *of: told.append(of))
+    assert told == [(k, drives.cycles) for k in range(1, drives.cycles + 1)]
+    again = measure_scaling(["fixed-lag"], drives, SMALL, None, kept, lambda *of: told.append(of))
+    assert len(told) == drives.cycles, "what was measured is kept"
+    pd.testing.assert_frame_equal(again.points, scaling.points)
+    pd.testing.assert_frame_equal(again.slopes, scaling.slopes)
     assert scaling.of(LAPS, "fixed-lag")["at"].tolist() == [1.0, 2.0]
     assert scaling.of(READINGS, "fixed-lag")["at"].tolist() == [2.0, 6.0, 12.0]
     assert len(scaling.of(CONES, "fixed-lag")) == 4
