@@ -35,7 +35,7 @@ from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.style import MARKERS, PALETTE, WIDTH
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.files import atomic_folder, write_json, write_text
+from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry, timed_update, timed_wait
 from pathspace_graph.settings.mapper import MapperSettings
@@ -342,7 +342,7 @@ def write_scaling(out: Path, scaling: Scaling) -> None:
     }
     with atomic_folder(out, MARKER) as folder:
         write_csv(folder / "points.csv", scaling.points)
-        write_text(folder / "table.md", scaling_table(scaling).markdown())
+        scaling_table(scaling).write(folder, "table", "md")
         write_json(folder / MARKER, content)
         style.save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
 

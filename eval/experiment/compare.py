@@ -17,9 +17,9 @@ from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.summary import has_cones, versions
-from pathspace_graph.io.files import atomic_folder, write_json, write_text
+from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import TRAJECTORY_FILE, read_trajectory
+from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .cells import EstimatorCell
@@ -279,8 +279,7 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int) -> None:
         frames["paired"] = paired_frame(comparison)
     with atomic_folder(out, MARKER) as folder:
         for name, table in tables(comparison).items():
-            write_text(folder / f"{name}.md", table.markdown())
-            write_text(folder / f"{name}.tex", table.latex())
+            table.write(folder, name, "md", "tex")
         for name, frame in frames.items():
             write_csv(folder / f"{name}.csv", frame)
         for log in comparison.logs:
@@ -306,8 +305,8 @@ def _write_log(folder: Path, name: str, comparison: Comparison) -> None:
         if cell.names["track"] != name or record["failure"]:
             continue
         run = shutil.copytree(run_folder(comparison.folder, cell), folder / cell.estimator)
-        path = read_trajectory(run / TRAJECTORY_FILE)[1]
-        drawn[cell.estimator] = Drawn(read_map(run), path, record["rows"][-1])
+        file = next(run / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE) if (run / name).exists())
+        drawn[cell.estimator] = Drawn(read_map(run), read_trajectory(file)[1], record["rows"][-1])
         truth = cell.drive.load()[0].truth
     if drawn:
         save_figures(folder, {"maps": plot_maps(drawn, truth)})
