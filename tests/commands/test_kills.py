@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.cli import parse_command
+from pathspace_graph.eval.benchmark.lanes import CONES, LAPS, READINGS, fit_slope
 from pathspace_graph.eval.benchmark.roads import ScalingSettings
-from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, READINGS, Scaling, fit_slope
+from pathspace_graph.eval.benchmark.scaling import Scaling
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import Comparison, compare, plan_of
 from pathspace_graph.eval.experiment.tables import TextTable

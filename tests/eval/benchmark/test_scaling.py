@@ -10,12 +10,10 @@ import pytest
 
 from pathspace_graph import cli
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.benchmark.lanes import CONES, LAPS, READINGS
 from pathspace_graph.eval.benchmark.roads import ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import (
-    CONES,
-    LAPS,
     MARKER,
-    READINGS,
     measure_scaling,
     scaling_table,
     stops,

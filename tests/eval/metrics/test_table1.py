@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -77,6 +77,7 @@ def test_landmarks_are_measured_to_the_nearest() -> None:
     assert row.rmse == pytest.approx(np.sqrt(0.5))
 
 
+@settings(deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_the_closest_point_is_no_farther_than_any_sample(seed: int) -> None:
     rng = np.random.default_rng(seed)
