@@ -41,11 +41,11 @@ COLUMNS: Final[dict[str, dict[str, Column]]] = {  # of each table, in the order 
     ODOMETRY_FILE: {**_STAMP, "vx": _SPEED, "vy": _SPEED, "wz": Column(limits.MAX_YAW_RATE, "rad/s")},
     DETECTIONS_FILE: {
         **_STAMP,
-        **{"x": _RANGE, "y": _RANGE, "label": Column()},
+        **{"x": _RANGE, "y": _RANGE, "label": Column(read=label_from_name)},
         **dict.fromkeys(("xx", "xy", "yy"), _COVARIANCE),
     },
     TRUTH_POSES_FILE: {**_STAMP, **_POINT, "theta": Column(limits.MAX_ANGLE, "rad")},
-    TRUTH_CONES_FILE: {**_POINT, "label": Column()},
+    TRUTH_CONES_FILE: {**_POINT, "label": Column(read=label_from_name)},
     TRUTH_ASSOCIATIONS_FILE: {"cone": Column()},
 }
 TRUTH_FILES: Final = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE)  # which are optional
@@ -256,7 +256,9 @@ def _read_sensor(header: Header) -> SensorInfo:
 def _table(folder: Path, name: str) -> Table:
     """Return a table of a log; one of the truth that is not known has no rows."""
     if name in TRUTH_FILES and not (folder / name).exists():
-        return Table(folder / name, {column: [] for column in COLUMNS[name]}, [])
+        return Table(
+            folder / name, dict.fromkeys(COLUMNS[name], np.zeros(0)), np.zeros(0, int), COLUMNS[name]
+        )
     return read_table(folder / name, COLUMNS[name])
 
 
@@ -367,7 +369,7 @@ def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
 
 
 def labels_of(table: Table) -> IntArray:
-    return np.array([label_from_name(name) for name in table.columns["label"]], dtype=int)
+    return table.numbers("label").astype(int)
 
 
 def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) -> Truth | None:

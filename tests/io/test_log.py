@@ -169,7 +169,7 @@ BAD_ROWS = [
         "odometry.csv",
         "t,vx,vy,wz\n0,1,0,0\n0.1,1e5,0,0\n",
         3,
-        "1000 m/s in size in column 'vx', found '1e5'",
+        "1000 m/s in size in column 'vx', found 100000",
     ),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.1,1,0,-1e9\n", 3, "at most 1000 rad/s in size in column 'wz'"),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1000000000000000000,1,0,0\n", 3, "1e+10 s in size in column 't'"),
