@@ -306,11 +306,10 @@ def _read_rows(
     while chunk := [*islice(rows, CHUNK)]:  # numbers take a tenth of the memory of their texts
         places, fields = zip(*chunk, strict=True)
         lines.extend(places)
-        found = dict(zip(header, _columns(file, fields, places, len(header)), strict=True))
+        texts = dict(zip(header, _columns(file, fields, places, len(header)), strict=True))
         for name, part in parts.items():
-            has_commas = reader.dialect.delimiter != ","
-            texts = [*map(_with_point, found[name])] if has_commas else found[name]
-            part.extend([_numbers(file, name, declared[name], texts, places)] if declared else texts)
+            own = texts[name] if reader.dialect.delimiter == "," else [*map(_with_point, texts[name])]
+            part.extend([_numbers(file, name, declared[name], own, places)] if declared else own)
     empty = np.zeros(0)
     columns = {name: np.concatenate([empty, *part]) if declared else part for name, part in parts.items()}
     return Table(file, columns, np.array(lines), declared)
