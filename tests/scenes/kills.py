@@ -16,7 +16,7 @@ Contents = dict[str, bytes]
 
 SYNC = "fsync"
 STEPS = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.truncate", SYNC}
-"""Python announces a change of the disk by one of these audit events, or by `open`; SYNC is the recorder's."""
+"""Audit events of changes of the disk, beside `open`; SYNC is the recorder's."""
 
 
 class Recorder:
