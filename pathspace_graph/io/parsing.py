@@ -15,14 +15,17 @@ from io import BytesIO, TextIOWrapper
 from itertools import chain, islice
 from pathlib import Path
 from reprlib import Repr
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Any, Final, NamedTuple, NoReturn, TypeVar
 
+import msgspec
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+
+T = TypeVar("T")
 
 MAX_FILE_BYTES: Final = 2**30
 MAX_HEADER_BYTES: Final = 2**22  # also of a study
@@ -160,6 +163,19 @@ def read_json(file: Path, expected: str) -> Any:
 def parse_toml(text: str, file: Path) -> dict[str, Any]:
     content: dict[str, Any] = _parsed("TOML", tomllib.loads, text, file)
     return content
+
+
+def typed(value: Any, kind: type[T], file: Path, where: str = "") -> T:
+    """Return plain data in a type, checked by msgspec; an InputError names the file and the dotted key."""
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        said, _, at = str(error).partition(" - at ")
+        path = "".join(re.findall(r"`\$\.?([^`]*)`", at))
+        missing = "".join(re.findall("missing required field `(.*)`", said))
+        key = ".".join(filter(None, (where, path, missing)))
+        told = "expected, but missing" if missing else said[0].lower() + said[1:]
+        raise InputError(file, f"{key or 'the file'}: {told.replace('`', '')}") from None
 
 
 class _Loader(_YAML_LOADER):  # type: ignore[misc]
