@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -249,9 +249,9 @@ class _File(Struct):
     """The content of `map.json`."""
 
     closed: bool
-    boundaries: dict[Literal["left", "right"], Any]
+    boundaries: dict[Annotated[str, Meta(pattern="^(left|right)$")], Any]
     cross_covariance: Matrix | None = None
-    points: dict[Literal["orange", "big_orange"], _Points] = {}
+    points: dict[Annotated[str, Meta(pattern="^(orange|big_orange)$")], _Points] = {}
 
 
 def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:

@@ -174,6 +174,7 @@ def typed(value: Any, kind: type[T], file: Path, where: str = "") -> T:
         path = "".join(re.findall(r"`\$\.?([^`]*)`", at))
         missing = "".join(re.findall("missing required field `(.*)`", said))
         key = ".".join(filter(None, (where, path, missing)))
+        said = re.sub(r"str matching regex '\^\((.*)\)\$'", lambda words: f"one of {words[1]}", said)
         told = "expected, but missing" if missing else said[0].lower() + said[1:]
         raise InputError(file, f"{key or 'the file'}: {told.replace('`', '')}") from None
 
