@@ -170,13 +170,13 @@ def typed(value: Any, kind: type[T], file: Path, where: str = "") -> T:
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
-        said, _, at = str(error).partition(" - at ")
-        path = "".join(re.findall(r"`\$\.?([^`]*)`", at))
-        missing = "".join(re.findall("missing required field `(.*)`", said))
+        said, _, at = str(error).replace("`", "").partition(" - at ")
+        path = at.rpartition("$")[2].removeprefix(".")
+        missing = "".join(re.findall("missing required field (.*)", said))
         key = ".".join(filter(None, (where, path, missing)))
         said = re.sub(r"str matching regex '\^\((.*)\)\$'", lambda words: f"one of {words[1]}", said)
         told = "expected, but missing" if missing else said[0].lower() + said[1:]
-        raise InputError(file, f"{key or 'the file'}: {told.replace('`', '')}") from None
+        raise InputError(file, f"{key or 'the file'}: {told}") from None
 
 
 class _Loader(_YAML_LOADER):  # type: ignore[misc]
