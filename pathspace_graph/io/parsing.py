@@ -165,10 +165,13 @@ def parse_toml(text: str, file: Path) -> dict[str, Any]:
     return content
 
 
-def typed(value: Any, kind: type[T], file: Path, where: str = "") -> T:
-    """Return plain data in a type, checked by msgspec; an InputError names the file and the dotted key."""
+def typed(value: Any, kind: type[T], file: Path, where: str = "", *, strict: bool = True) -> T:
+    """Return plain data in a type, checked by msgspec; an InputError names the file and the dotted key.
+
+    Unless it is `strict`, a text may stand for a number: YAML takes 1e-5 for a word.
+    """
     try:
-        return msgspec.convert(value, kind)
+        return msgspec.convert(value, kind, strict=strict)
     except msgspec.ValidationError as error:
         said, _, at = str(error).replace("`", "").partition(" - at ")
         path = at.rpartition("$")[2].removeprefix(".")
