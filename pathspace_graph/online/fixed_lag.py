@@ -121,8 +121,9 @@ class FixedLagMapper(MapperEstimate):
         `next_pose_key`: `Pose2`), on control points (`control_keys`: `Point2`) and on the calibration. Each
         is relinearized at every step until one of its poses leaves the window; then it is part of the prior.
         The batch of the lap has those on poses as well, as they are linearized in this cycle; one on control
-        points leaves no batch, and is kept until the loop closes. SettingsError is raised, and nothing is
-        changed, if a key is not a variable of the graph or a number not finite.
+        points leaves no batch, and is kept until the loop closes. A factor that says nothing is left out.
+        SettingsError is raised, and nothing is changed, if a key is not a variable of the graph or a number
+        not finite.
 
         Nothing else is raised, unless `strict`: where a step fails, the mapper goes back to before the cycle
         and takes it again with less, as the notice says, and `failures` counts.
@@ -144,6 +145,7 @@ class FixedLagMapper(MapperEstimate):
     def _process(self, cycle: Admitted, factors: Sequence[gtsam.NonlinearFactor]) -> CycleResult:
         """Take the steps of the paper, and that of the phase."""
         watch, road, drive = Stopwatch(), self.road, self.drive
+        factors = road.smoother.informative(factors)
         held = road.add_factors(factors)
         reading = self.front_end.update(cycle.odometry, cycle.detections)
         road.predict(reading.motion, reading.orange)
