@@ -68,13 +68,8 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
                     stream.flush()
         return
     check_file_target(final)
-    with _parents(final), _beside(final, Path.touch) as temporary:
+    with replacing(final, backup=True) as temporary:
         yield temporary
-        check_file_target(final)
-        _sync(temporary)
-        _backup(final)
-        temporary.replace(final)
-        _sync(final.parent)
 
 
 def is_stream(path: Path) -> bool:
@@ -83,11 +78,14 @@ def is_stream(path: Path) -> bool:
 
 
 @contextmanager
-def replacing(file: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `file` that takes its place on success; no backup is kept."""
+def replacing(file: Path, *, backup: bool = False) -> Iterator[Path]:
+    """Yield a temporary path beside `file` that takes its place on success."""
     with _parents(file), _beside(file, Path.touch) as temporary:
         yield temporary
         _sync(temporary)
+        if backup:
+            check_file_target(file)
+            _backup(file)
         temporary.replace(file)
         _sync(file.parent)
 
