@@ -92,7 +92,7 @@ class Curves:
         coarse_step: float,
         iterations: int,
     ) -> _FootPoints:
-        """Return `footpoint:joint_foot_points`."""
+        """Find foot points as `footpoint:foot_points`; `curve` (m,) is the index of each row's curve."""
 
     def refine(
         self,
@@ -104,7 +104,11 @@ class Curves:
         u_high: Array,
         iterations: int,
     ) -> _FootPoints:
-        """Return `footpoint:refine_joint_foot_points`; a row that a step leads farther away is searched."""
+        """Find the local minima of |S(u) - p_i| downhill from u_start (m,) by safeguarded Newton steps.
+
+        The other arguments are as in `search`. A start outside its stretch is moved into it first. No step
+        exceeds one mean knot interval; a row that a step leads farther away is searched.
+        """
 
 # --- detections and odometry -----------------------------------------------------------------------------
 def to_map(points_vehicle: Array, poses: Array) -> Array:

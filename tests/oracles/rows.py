@@ -61,7 +61,7 @@ def moved_residual(layout: Layout, rows: Rows, change: Array) -> Array:
 
 
 def blocks_of(layout: Layout, groups: Sequence[Rows]) -> list[tuple[int, IntArray, Array]]:
-    """Return each owner, ascending, with places (h,) of its rows' variables and `[J -r]` (m, n + 1) on them."""
+    """Return each owner, ascending, with places (h,) of its rows' variables and `[J -r]` (m, n + 1)."""
     owners = np.unique(np.concatenate([NO_KEYS, *(rows.owner for rows in groups)])).tolist()
     own = {owner: [rows.where(rows.owner == owner) for rows in groups if len(rows)] for owner in owners}
     return [(owner, *_block(layout, [rows for rows in own[owner] if len(rows)])) for owner in owners]
