@@ -1,6 +1,5 @@
 """Output that appears as a whole or not at all, and never costs an earlier result."""
 
-import fcntl
 import json
 import math
 import os
@@ -20,6 +19,11 @@ import numpy as np
 from pathspace_graph.errors import OutputError
 
 from .manifest import MANIFEST_FILE, manifest_of
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks, nor opens folders
+    fcntl = None  # type: ignore[assignment]
 
 STDOUT: Final = Path("-")  # path at which a single file is written to standard output
 
@@ -245,6 +249,9 @@ def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Lock a path, or raise an OSError where another living process has; the kernel ends a dead one's."""
+    if fcntl is None:
+        yield
+        return
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
