@@ -22,7 +22,7 @@ from .manifest import MANIFEST_FILE, manifest_of
 
 try:
     import fcntl
-except ImportError:  # Windows has no such locks, nor opens folders
+except ImportError:  # Windows has no such locks
     fcntl = None  # type: ignore[assignment]
 
 STDOUT: Final = Path("-")  # path at which a single file is written to standard output
@@ -233,7 +233,7 @@ def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
     """
     stem, suffix = re.escape(f".{final.stem}."), re.escape(f".tmp{final.suffix}")
     for path in final.parent.iterdir():
-        if re.fullmatch(f"{stem}[0-9a-f]{{8}}{suffix}", path.name):
+        if fcntl and re.fullmatch(f"{stem}[0-9a-f]{{8}}{suffix}", path.name):
             with suppress(OSError), _locked(path):
                 _remove(path)
     # the suffix stays last, as writers choose the format by it
@@ -269,11 +269,12 @@ def _remove(path: Path) -> None:
 
 def _sync(path: Path) -> None:
     """Wait until the content of a file, or the names in a folder, are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
     except OSError:
-        if not path.is_dir():  # some file systems can't flush a folder
+        if not path.is_dir():  # some systems can't flush a folder
             raise
-    finally:
-        os.close(descriptor)
