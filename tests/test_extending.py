@@ -335,7 +335,7 @@ def test_the_new_track_format_is_read(tmp_path: Path, monkeypatch: pytest.Monkey
     assert len(track.left) == len(track.right) == 30
     assert track.name == "oval"
     file.write_text('{"left": [["a", 0]], "right": []}')
-    with pytest.raises(InputError, match="expected 2 numbers at left"):
+    with pytest.raises(InputError, match=r"left\[0\]\[0\]: expected float, got str"):
         track_files.read_track(file)
 
 

@@ -184,7 +184,7 @@ def straight_log() -> Log:
 def test_the_example_of_the_page_on_python_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    example, _ = blocks("python", (ROOT / "docs" / "python.md").read_text())
+    example, *_ = blocks("python", (ROOT / "docs" / "python.md").read_text())
     assert len(example.strip().splitlines()) <= 12
     write_log(straight_log(), tmp_path / "log")
     monkeypatch.chdir(tmp_path)
