@@ -63,7 +63,7 @@ class FrontEnd:
     def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
         """Begin with the noise known at scale 1; cycles come in metres of a scene of the scale."""
         self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.kind == "line")
-        self.gate = Gate(settings.limits, scale)
+        self.gate = Gate(settings.limits, scale, of_lines=settings.kind == "line")
         self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
         self._settings = settings
         self._begun = self._sensor_doubted = False

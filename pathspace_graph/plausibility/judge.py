@@ -95,7 +95,7 @@ def _hints(log: Log) -> list[Hint]:
         return of_ends + found + beyond_any_vehicle(log.odometry)
     trials = Trials(log, telling_pairs(log, pairs))
     others = _of_readings(trials, found)
-    if others and MapperSettings(kind=log.sensor.kind or kind_of(log)).lines:
+    if others and MapperSettings(kind=kind_of(log)).lines:
         others = _of_readings(trials, found, stay=False)
     return of_ends + others
 
