@@ -93,7 +93,8 @@ def targets_on_lines(placed: Array, recent: Array, reach: float, farthest: float
     near, points = placed - centre, recent - centre
     x, y = points.T
     square = (near**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * near @ points.T
-    weight = np.where(square < (farthest * reach) ** 2, np.exp(-0.5 * square / reach**2), 0.0)
+    beside, weight = square < (farthest * reach) ** 2, np.zeros(square.shape)
+    weight[beside] = np.exp(-0.5 * square[beside] / reach**2)
     total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)
     means = weight @ np.column_stack([x, y, x * x, x * y, y * y]) / total[:, None]
     mean, (xx, xy, yy) = means[:, :2], means[:, 2:].T

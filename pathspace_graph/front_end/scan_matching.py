@@ -32,6 +32,9 @@ MINUTE: Final = 60.0
 
 SCAN_MEMORY: Final = 0.65  # age of remembered detections, s, over which odometry hardly drifts
 MOST_REMEMBERED: Final = 2000  # largest number of remembered detections, which bounds the time of a match
+LINE_REMEMBERED: Final = (
+    40  # largest number of points of lines of a cycle that are: some cycles fill the gaps
+)
 REACH_FIRST: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
@@ -274,10 +277,11 @@ class ScanMatcher:
     def remember(self, detections: Detections, twist: Array, pose: Array, is_line: BoolArray) -> None:
         """Remember a cycle that was seen from a pose (3,), in motion by a twist (3,)."""
         measured = detections.points_vehicle
-        columns = by_errors(measured, twist)
-        for recent, chosen in ((self.recent, ~is_line), (self.recent_lines, is_line)):
-            if chosen.any():
-                recent.add(detections.t, measured[chosen], columns[chosen], pose)
+        columns, lines = by_errors(measured, twist), np.flatnonzero(is_line)
+        lines = lines[:: max(-(-len(lines) // LINE_REMEMBERED), 1)]
+        for recent, rows in ((self.recent, np.flatnonzero(~is_line)), (self.recent_lines, lines)):
+            if len(rows):
+                recent.add(detections.t, measured[rows], columns[rows], pose)
 
     def has(self, seen: Seen, pose: Array) -> BoolArray:
         """Return whether each detection (m,), from a pose (3,), lies where an earlier one does."""
