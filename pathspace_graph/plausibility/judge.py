@@ -207,6 +207,8 @@ def _by_motion(trials: Trials, *, stay: bool) -> list[Hint]:
     if len(trials.pairs) == 0:
         return beyond_any_vehicle(trials.log.odometry)
     best, found = _meant(trials)
+    if best.hypothesis.content == "nothing" and not stay:
+        return []  # walls look alike from everywhere along them
     if best.hypothesis.content == "nothing" or (found and camera(trials.pairs)):
         return found
     late, of_clocks = _late(trials, best)
