@@ -37,7 +37,7 @@ from .measurement import (
 )
 from .sightings import FOLLOW_RANGE, MAX_AGE, MIN_SPEED_SHARE, SeenCycle, Sightings, TwistRecord, by_bias
 
-CELL: Final = 4.0  # side of the cells (m) inside of which a line is a parabola; small ones cut off its noise
+CELL: Final = 4.0  # side of the cells (m) in which a line is a parabola; small ones cut off large errors
 MOST_POINTS: Final = 4000  # points that are measured on, which bounds the time of a round
 FEWEST: Final = 8  # points of a line in a cell
 SHAPE: Final = np.array([0.0, 0.25, 10.0])

@@ -32,9 +32,7 @@ MINUTE: Final = 60.0
 
 SCAN_MEMORY: Final = 0.65  # age of remembered detections, s, over which odometry hardly drifts
 MOST_REMEMBERED: Final = 2000  # largest number of remembered detections, which bounds the time of a match
-LINE_REMEMBERED: Final = (
-    40  # largest number of points of lines of a cycle that are: some cycles fill the gaps
-)
+LINE_REMEMBERED: Final = 40  # largest number of points of lines in a remembered cycle
 REACH_FIRST: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
