@@ -14,7 +14,8 @@ from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, inte
 from pathspace_graph.settings.online import MotionSettings
 
 from .gate import Newest
-from .scan_matching import MIN_DOUBTING, REACHES, REACHES_CHECK, Match, ScanMatcher, Seen, SensorErrors
+from .line_matching import Seen
+from .scan_matching import MIN_DOUBTING, REACHES, REACHES_CHECK, Match, ScanMatcher, SensorErrors
 from .standstill import Standstill
 
 NO_CALIBRATION: Final = np.zeros((3, 2))  # derivative by the calibration of a motion without odometry
