@@ -9,14 +9,12 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Final, Never
+from typing import Any, Final, Never
 
 import numpy as np
 import pandas as pd
-import tyro
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
-from tyro.conf import arg
 
 from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import PathspaceError, SolveError, check_name
@@ -30,6 +28,7 @@ from pathspace_graph.io.files import atomic_folder, check_target, write_text
 from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.io.overrides import Overrides, override
 from pathspace_graph.labels import LEFT
+from pathspace_graph.options.help import read_options
 from pathspace_graph.plausibility.judge import hints, read_plausible_log
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
@@ -182,7 +181,7 @@ class HintStudy:
 
     out: Path
     """Folder for the results; earlier ones there are kept as a numbered backup."""
-    tracks: Annotated[tuple[str, ...], arg(metavar="TRACK...")] = ("0", "1")
+    tracks: tuple[str, ...] = ("0", "1")
     """Track files, folders of them, or seeds of generated tracks."""
     seeds: tuple[int, ...] = (0, 1)
     """Seeds of the drives on each track."""
@@ -326,8 +325,8 @@ def _line(name: str, logs: pd.DataFrame, column: str) -> tuple[str, ...]:
 
 def main() -> None:
     """Run the script; the exit code is 2 on bad input."""
-    study = tyro.cli(HintStudy)
     try:
+        study = read_options(HintStudy, "pathspace_graph.eval.hints")
         table = study.run()
     except PathspaceError as error:
         note(f"hints: {error}")

@@ -35,9 +35,10 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import atomic_folder, write_json, write_text
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry, timed_update, timed_wait
+from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .roads import Drives, ScalingSettings, first_cycles
+from .roads import Drives, first_cycles
 
 MARKER: Final = "scaling.json"  # file by which a folder of results is known
 COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track

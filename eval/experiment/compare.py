@@ -13,13 +13,14 @@ import pandas as pd
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import check_name
 from pathspace_graph.eval.figures.style import save_figures
-from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
+from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.measures import online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.summary import has_cones, summarize, versions
 from pathspace_graph.io.files import atomic_folder, write_json, write_text
 from pathspace_graph.io.results import BatchRun, write_result
 from pathspace_graph.plausibility.judge import read_plausible_log
+from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 

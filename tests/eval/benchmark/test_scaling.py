@@ -10,7 +10,7 @@ import pytest
 
 from pathspace_graph import cli
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.benchmark.roads import ScalingSettings, make_drives
+from pathspace_graph.eval.benchmark.roads import make_drives
 from pathspace_graph.eval.benchmark.scaling import (
     CONES,
     LAPS,
@@ -21,6 +21,7 @@ from pathspace_graph.eval.benchmark.scaling import (
     stops,
     write_scaling,
 )
+from pathspace_graph.settings.evaluation import ScalingSettings
 
 from .timing import SMALL
 
