@@ -17,11 +17,12 @@ import pandas as pd
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.parsing import read_json, read_text
+from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.sim.mistakes import MISTAKES
 
 from . import real, views
 from .benchmark.measurement import measure_drive, metrics
-from .benchmark.roads import QUICK, ScalingSettings, make_drives
+from .benchmark.roads import QUICK, make_drives
 from .benchmark.scaling import measure_scaling, scaling_figures
 from .experiment.faults import at_strength, kinds, only, suite
 from .experiment.provenance import sources_digest

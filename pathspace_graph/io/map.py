@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 from scipy.linalg import block_diag
 
-from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.errors import MAX_INTEGER, InputError, SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.labels import BOUNDARIES, LABELS, LEFT, NAMES, POINTS, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
 from .brief import Brief, pictures
-from .parsing import MAX_COORDINATE, MAX_DEGREE, MAX_INTEGER, read_json, shown
+from .parsing import MAX_COORDINATE, MAX_DEGREE, read_json, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
