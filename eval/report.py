@@ -13,11 +13,12 @@ from typing import Any, Final
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
+from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.sim.mistakes import MISTAKES
 
 from . import real, views
 from .benchmark.measurement import measure_drive, metrics
-from .benchmark.roads import QUICK, ScalingSettings, make_drives
+from .benchmark.roads import QUICK, make_drives
 from .benchmark.scaling import measure_scaling, scaling_figures
 from .experiment.faults import at_strength, kinds, only, suite
 from .experiment.frame import write_csv

@@ -9,41 +9,60 @@ from importlib import import_module
 from importlib.metadata import version
 from multiprocessing import active_children
 from traceback import print_exc
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from .errors import PathspaceError, SettingsError, SolveError, check_name
+from .errors import PathspaceError, SolveError, check_name
 
 PROGRAM: Final = "pathspace-graph"
 DONE, BAD_INPUT, NOT_SOLVED, INTERRUPTED, BROKEN_PIPE, TERMINATED = 0, 2, 3, 130, 141, 143  # exit codes
+HELP: Final = ("-h", "--help", "--help-all")
+JSON: Final = "--json"
 # options of every command, each with its level of `console.Verbosity`
 LEVELS: Final = {"-q": "QUIET", "--quiet": "QUIET", "-v": "VERBOSE", "--verbose": "VERBOSE"}
-COMMANDS: Final = {  # module of `commands`, dataclass of the options in it, and line of the overview
-    "demo": ("compare", "Demo", "maps a generated track online, and shows a table, a map and its picture"),
-    "simulate": ("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
-    "convert": ("convert", "Convert", "writes a ROS bag, CSV files or a known data set as a log"),
-    "online": ("estimate", "Online", "maps a log online, cycle by cycle"),
-    "batch": ("estimate", "Batch", "optimizes a whole log at once, as the ground reference"),
-    "compare": ("compare", "Compare", "runs every estimator on one log or many, and gives the paper's table"),
-    "ablate": ("studies", "Ablate", "runs a study of estimators and settings over many drives"),
-    "faults": ("studies", "FaultSuite", "measures what each fault of a car costs, and what is said of it"),
-    "report": ("studies", "Report", "measures the figures of the pages, and writes their tables"),
-    "scale": ("studies", "Scale", "measures the time of an update against map size, detections and laps"),
-    "plot": ("plot", "Plot", "draws a map with its uncertainty band"),
-    "export": ("export", "Export", "writes a map in a format that planners and other tools read"),
-    "verify": ("plot", "Verify", "checks that the files of a folder are as they were written"),
+
+
+class Command(NamedTuple):
+    """Where a command is: imported only after its name is known, so that help need not wait for GTSAM."""
+
+    options: str  # module of `options` and dataclass in it
+    module: str  # of `commands`, with the function that runs it
+    summary: str
+
+
+GROUPS: Final = {
+    "maps": {
+        "demo": Command("map.Demo", "compare", "maps a generated track online: a table, a map, its picture"),
+        "online": Command("map.Online", "estimate", "maps a log online, cycle by cycle"),
+        "batch": Command("map.Batch", "estimate", "optimizes whole logs at once, as the ground reference"),
+        "plot": Command("map.Plot", "plot", "draws a map with its uncertainty band"),
+        "export": Command("map.Export", "export", "writes a map as planners and other tools read it"),
+    },
+    "data": {
+        "simulate": Command("data.Simulate", "simulate", "writes the log of a simulated drive, with truth"),
+        "convert": Command("data.Convert", "convert", "writes a ROS bag, CSV files or JSON lines as a log"),
+        "verify": Command("data.Verify", "plot", "checks that files are as they were written"),
+    },
+    "studies": {
+        "compare": Command("study.Compare", "compare", "runs every estimator on logs: the paper's table"),
+        "ablate": Command("study.Ablate", "studies", "runs a study of estimators and settings"),
+        "faults": Command("study.FaultSuite", "studies", "measures what each fault of a car costs"),
+        "scale": Command("study.Scale", "studies", "measures update time against map size"),
+        "report": Command("study.Report", "studies", "measures the figures of the pages"),
+    },
 }
+COMMANDS: Final = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return 0, or say what is wrong and return 2 for bad input, 3 for a failed estimate."""
+    """Run a command; return 0, or say what is wrong and return 2 for bad input, 3 for a bad estimate."""
     if threading.current_thread() is threading.main_thread():
         # temporary files are removed on the way
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads stall systems as small as these
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    level = next((LEVELS[word] for word in reversed(given) if word in LEVELS), "NORMAL")
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    level = next((LEVELS[word] for word in reversed(words) if word in LEVELS), "NORMAL")
     try:
-        _run([word for word in given if word not in LEVELS], level)
+        return _run([word for word in words if word not in LEVELS], level)
     except PathspaceError as error:
         return _refuse(str(error), level, NOT_SOLVED if isinstance(error, SolveError) else BAD_INPUT)
     except BrokenPipeError:  # `| head` has seen enough
@@ -57,53 +76,70 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 os.kill(worker.pid, signal.SIGTERM)
         print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return INTERRUPTED
-    return DONE
 
 
-def _run(arguments: list[str], level: str) -> None:
-    first = arguments[0] if arguments else ""
-    if first in ("-h", "--help"):
+def _run(words: list[str], level: str) -> int:
+    name, *rest = words or ["help"]
+    if name in ("help", *HELP) and not rest:
         print(overview())
-    elif first == "--version":
+    elif name == "help":
+        print(help_of(rest[0]), end="")
+    elif name == "--version":
         compiler = import_module(".factors", __package__).COMPILER
         print(f"{PROGRAM} {version(PROGRAM)} (GTSAM {version('gtsam')}, kernels: {compiler})")
-    elif first == "--completion":
-        options = import_module(".commands.options", __package__)
-        print(options.completion(PROGRAM, {name: command_class(name) for name in COMMANDS}, LEVELS))
-    elif first in COMMANDS:
-        with import_module(".console", __package__).verbosity(level):
-            command = parse_command(first, arguments[1:])
-            if command is not None:
-                command.run()
+    elif name == "--completion":
+        classes = {one: options_class(one) for one in COMMANDS}
+        print(import_module(".options.help", __package__).completion(PROGRAM, classes, (*LEVELS, JSON)))
+    elif found := next((word for word in rest if word in HELP), None):
+        print(help_of(name, full=found == "--help-all"), end="")
     else:
-        expected = f"expected a command ({', '.join(COMMANDS)})"
-        if not first:
-            raise SettingsError(f"{expected}, found none")
-        check_name(first, COMMANDS, expected)
+        options = parse_command(name, [word for word in rest if word != JSON])
+        return run_command(name, options, level, as_json=JSON in rest)
+    return DONE
 
 
 def overview() -> str:
     width = max(map(len, COMMANDS)) + 2
-    lines = [
-        f"usage: {PROGRAM} COMMAND [OPTIONS]\n",
-        *(f"  {name:<{width}}{summary}" for name, (_, _, summary) in COMMANDS.items()),
-        f"\n{PROGRAM} COMMAND --help explains each command.",
-        "-q prints errors and hints only, -v progress in lines and where an error comes from.",
-        f'eval "$({PROGRAM} --completion)" completes commands and options in bash and zsh.',
-    ]
-    return "\n".join(lines)
+    lines = [f"usage: {PROGRAM} COMMAND [OPTIONS]"]
+    for title, group in GROUPS.items():
+        lines += [f"\n{title}:", *(f"  {name:<{width}}{command.summary}" for name, command in group.items())]
+    return "\n".join([
+        *lines,
+        f"\n{PROGRAM} COMMAND --help explains a command. Each takes these options as well:",
+        "  -q      prints errors and hints only",
+        "  -v      prints progress in lines, and where an error comes from",
+        "  --json  prints the result as JSON",
+        f'eval "$({PROGRAM} --completion)" completes commands, options and values in bash and zsh.',
+    ])  # fmt: skip
 
 
-def parse_command(name: str, arguments: list[str]) -> Any:
-    options = import_module(".commands.options", __package__)
-    return options.parse(command_class(name), f"{PROGRAM} {name}", arguments)
+def help_of(name: str, *, full: bool = False) -> str:
+    helper = import_module(".options.help", __package__)
+    text: str = helper.help_of(options_class(name), f"{PROGRAM} {name}", full=full)
+    return text
 
 
-def command_class(name: str) -> type[Any]:
-    """Return the class of a command, whose module is imported only now: help need not wait for GTSAM."""
-    module, found, _ = COMMANDS[name]
-    command: type[Any] = getattr(import_module(f".commands.{module}", __package__), found)
-    return command
+def options_class(name: str) -> type[Any]:
+    """Return the dataclass of a command's options; SettingsError for an unknown command."""
+    check_name(name, COMMANDS, f"expected a command ({', '.join(COMMANDS)})")
+    module, found = COMMANDS[name].options.split(".")
+    options: type[Any] = getattr(import_module(f".options.{module}", __package__), found)
+    return options
+
+
+def parse_command(name: str, words: list[str]) -> Any:
+    """Return the options of a command; SettingsError for bad usage."""
+    options = options_class(name)
+    return import_module(".options.parse", __package__).parse(options, f"{PROGRAM} {name}", words)
+
+
+def run_command(name: str, options: Any, level: str = "NORMAL", *, as_json: bool = False) -> int:
+    """Run a command with its options; return 3 where the result is written, but can't be trusted."""
+    module = import_module(f".commands.{COMMANDS[name].module}", __package__)
+    with import_module(".console", __package__).verbosity("QUIET" if as_json else level):
+        outcome = getattr(module, f"{name}_command")(options)
+        outcome.show(as_json=as_json)
+    return NOT_SOLVED if outcome.wrong else DONE
 
 
 def _refuse(message: str, level: str, code: int = BAD_INPUT) -> int:

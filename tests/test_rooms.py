@@ -16,7 +16,11 @@ MOST_FILES = 15
 EXTRAS = {"distributed", "rerun", "rosbags"}
 """Optional packages, which are imported only where they are needed."""
 
-LATE = {"commands.estimate": {"eval.view.recording"}, "io.brief": {"eval.figures.map_plot", "frames"}}
+LATE = {
+    "commands.estimate": {"eval.view.recording", "commands.plot"},
+    "options.map": {"io.overrides"},
+    "io.brief": {"eval.figures.map_plot", "frames"},
+}
 """Modules that are imported by name when needed, since matplotlib is slow."""
 ASKED = {"io.brief"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""
@@ -29,7 +33,7 @@ BELOW_MAPPING = {
     "scale",
 }
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
-BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "plausibility"}
+BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "plausibility", "options"}
 
 ARROWS: dict[str, set[str]] = {
     **{leaf: set() for leaf in sorted(LEAVES)},
@@ -39,6 +43,7 @@ ARROWS: dict[str, set[str]] = {
     "spline": {"factors", "settings"},
     "io": {"spline", "factors", "settings"},
     "sim": {"io"},
+    "options": {"settings", "io", "sim", "convert"},
     "convert": {"io", "factors"},
     "graph": {"factors"},
     "health": set(),
@@ -60,11 +65,11 @@ ARROWS: dict[str, set[str]] = {
     "eval": BELOW_EVAL | {"eval.metrics", "eval.experiment", "eval.benchmark"},
     "eval.view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
     "commands": BELOW_EVAL
-    | {"convert", "frames"}
+    | {"convert", "frames", "options"}
     | {"eval"}
     | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark", "view")},
     "frames": {"io"},
-    "cli": {"commands"},
+    "cli": {"commands", "options"},
     "__main__": {"cli"},
 }
 """What each room may import, beside itself and the leaves: arrows point down only."""
@@ -184,7 +189,6 @@ ASSIGNED = {
     "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
     "mapping.road": {"self.smoother.attached"},
     "mapping.smoother": {"self.window.exact"},
-    "commands.options": {"entry.metadata"},  # of dataclasses
     "snapshot": {"array.flags.writeable"},  # of numpy
 }
 """Attributes that a module assigns to objects of others: no module may have another one."""

@@ -8,11 +8,10 @@ that baseline.
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import tyro
-
 from pathspace_graph.console import note, output, say
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.files import atomic_file, check_file_target, write_json
+from pathspace_graph.options.help import read_options
 
 from . import measurement
 
@@ -40,7 +39,7 @@ class Benchmark:
 def main() -> None:
     """Run the script; the exit code is 1 where a figure is worse than the baseline, 2 on bad files."""
     try:
-        if _is_worse(tyro.cli(Benchmark)):
+        if _is_worse(read_options(Benchmark, "pathspace_graph.eval.benchmark")):
             raise SystemExit(WORSE)
     except PathspaceError as error:
         note(f"benchmark: {error}")

@@ -17,9 +17,10 @@ from pathspace_graph.estimators import make_online
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry, timed_update, timed_wait
+from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .roads import Drives, ScalingSettings
+from .roads import Drives
 
 Sweep = Literal["cones", "readings", "laps"]  # cones seen, detections of an update, or lap
 CONES: Final[Sweep] = "cones"

@@ -6,11 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
-from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.summary import lap_times
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.log import Log
-from pathspace_graph.settings.checked import Positive
+from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.sim.curves import along_polyline, arc_lengths, left_normals, unit
 from pathspace_graph.sim.sensor import SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -24,42 +23,6 @@ DENT, DENTS = 0.12, 3  # share of the radius by which a closed road leaves its c
 SPEED, LATERAL = 20.0, 9.0  # speed of the vehicle (m/s) and its largest lateral acceleration (m/s^2)
 STEP: Final = 0.25  # distance of the samples of a road's middle (m)
 SPARE: Final = 1.1  # cones of an open road by those to be seen, since some are never detected
-
-
-@dataclass(frozen=True)
-class ScalingSettings(Positive):
-    """What is measured of how time scales."""
-
-    cones_min: float = 50.0
-    """Least number of cones seen of a point of the sweep over cones."""
-    cones_max: float = 2000.0
-    """Number of cones seen at which the sweep over cones ends."""
-    bins: int = 16
-    """Number of points of the sweep over cones, evenly spaced on a logarithmic axis."""
-    fit_from: float = 200.0
-    """Number of cones from which on the slope against cones is fitted."""
-    readings: tuple[int, ...] = (2, 4, 8, 14, 20, 28, 40)
-    """Numbers of detections of the updates that are timed."""
-    readings_cones: int = 300
-    """Number of cones of the dense road, where these updates are timed."""
-    warm_up: int = 30
-    """Cycles at the beginning of the dense road that are not counted."""
-    laps: int = 20
-    """Laps of the closed road."""
-    laps_cones: int = 100
-    """Cones of the closed road."""
-    budget: float = 0.5
-    """Mean update at which an estimator is stopped (s)."""
-    seed: int = 1
-    """Seed of the drives and of the choice of detections."""
-
-    def __post_init__(self) -> None:
-        """Raise SettingsError as well where a range is empty."""
-        super().__post_init__()
-        if self.cones_min >= self.cones_max:
-            raise SettingsError(f"cones_min: expected less than cones_max, found {self.cones_min:g}")
-        if not self.readings or min(self.readings) < 1:
-            raise SettingsError(f"readings: expected numbers of at least 1, found {self.readings}")
 
 
 QUICK: Final = ScalingSettings(  # takes less than a minute; its slopes mean little

@@ -28,10 +28,11 @@ from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.style import MARKERS, PALETTE, WIDTH
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import atomic_folder, write_json
+from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .lanes import CONES, LAPS, POINT, READINGS, SLOPE, Sweep, memory_rows, sweep_rows
-from .roads import Drives, ScalingSettings, first_cycles
+from .roads import Drives, first_cycles
 
 MARKER: Final = "scaling.json"  # file by which a folder of results is known
 COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track

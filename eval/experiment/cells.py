@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.eval.metrics.accuracy import GhostSettings
 from pathspace_graph.eval.metrics.measures import measure, online_cycles, stage_times
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times, summarize
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
@@ -20,6 +19,7 @@ from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.run import run_online
+from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .drives import AnyDrive, identity

@@ -14,12 +14,13 @@ import pandas as pd
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import check_name
 from pathspace_graph.eval.figures.style import save_figures
-from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
+from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
 from pathspace_graph.eval.metrics.summary import has_cones, versions
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
+from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .cells import EstimatorCell

@@ -12,11 +12,11 @@ import pandas as pd
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, OutputError
-from pathspace_graph.eval.metrics.accuracy import GhostSettings
 from pathspace_graph.eval.metrics.alignment import aligned_distance
 from pathspace_graph.io.files import check_target, remove_manifest, write_json
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.parsing import read_json, shown
+from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.sim.track import Track
 
 from .cells import EstimatorCell

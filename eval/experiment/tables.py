@@ -82,6 +82,10 @@ class TextTable:
             table.add_row(*(Text(_plain(cell)) for cell in row), end_section=number + 1 in self.groups)
         return table
 
+    def records(self) -> list[dict[str, str]]:
+        """Return the rows as texts by the names of their columns."""
+        return [dict(zip(self.header, map(_plain, row), strict=True)) for row in self.rows]
+
     def text(self) -> str:
         """Return the table for a text file, without its title: columns aligned by blanks."""
         return self._formatted("simple", [[_plain(cell) for cell in row] for row in self.rows])

@@ -15,7 +15,7 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
-from pathspace_graph.settings.checked import Positive
+from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.sim.curves import along_polyline, arc_lengths
 from pathspace_graph.spline.bspline import BSpline, segments_cross
 
@@ -256,15 +256,6 @@ def _crossings(points: Array, normals: Array, expected: Array, curve: Array) -> 
             if abs(nearest - expected[i]) < MISSED_DISTANCE:
                 offsets[i] = nearest
     return offsets
-
-
-@dataclass(frozen=True)
-class GhostSettings(Positive):
-    """Definition of a ghost."""
-
-    distance: float = 2.0
-    """Distance from the true boundary of its own colour beyond which a mapped point is a ghost (m). The
-    default exceeds the drift of a map whose loop is closed, but not the width of the narrowest lane (3 m)."""
 
 
 def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> dict[str, float]:

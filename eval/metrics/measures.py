@@ -14,9 +14,10 @@ from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import by_prior
+from pathspace_graph.settings.evaluation import GhostSettings
 
 from . import accuracy, trajectory
-from .accuracy import GhostSettings, true_lap_ends
+from .accuracy import true_lap_ends
 from .consistency import (
     aligned,
     consistency_at_cones,

@@ -1,17 +1,16 @@
 """`convert`: a ROS bag, CSV files of one's own or JSON lines as a log."""
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Final
 
 import numpy as np
-from tyro.conf import Positional, arg
 
 from pathspace_graph.console import note, progress, say
-from pathspace_graph.convert.bag import BagOptions, read_bag
+from pathspace_graph.convert.bag import read_bag
 from pathspace_graph.convert.recording import Recording, rate, to_log, windowed
-from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings, Window
+from pathspace_graph.convert.settings import LabelRule
 from pathspace_graph.convert.text_files import read_csv, read_json_lines
 from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.front_end.front_end import measure_log
@@ -19,6 +18,7 @@ from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, write_log
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
+from pathspace_graph.options.data import Convert
 from pathspace_graph.plausibility.diagnosis import measured_line
 from pathspace_graph.plausibility.hint import because
 from pathspace_graph.plausibility.judge import hints
@@ -26,91 +26,63 @@ from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .estimate import tell
+from .outcome import Outcome
 from .simulate import describe
 
-Kind = Literal["bag", "csv", "jsonl"]
 SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}  # of several in a folder
 
 
-@dataclass(frozen=True, kw_only=True)
-class Convert:
-    """Write a ROS bag, CSV files or JSON lines as a log, and say what was left out.
+def convert_command(options: Convert) -> Outcome:
+    records = _records(options)
+    if not records:
+        _convert(options, options.source, options.out)
+        return Outcome([options.out])
+    written, refused = list[Path](), list[str]()
+    for record in records:
+        say(f"{record}:")
+        try:
+            _convert(options, record, options.out / record.stem)
+            written.append(options.out / record.stem)
+        except PathspaceError as error:
+            refused.append(str(error))
+    if refused:
+        some = f"{len(refused)} of {len(records)} records were refused"
+        raise PathspaceError(f"{some}: {'; '.join(refused)}")
+    return Outcome(written)
 
-    A log is in order of time and in the vehicle frame. A folder of several records becomes a folder of logs.
-    """
 
-    source: Positional[Path]
-    """Bag (a file, or a folder with metadata.yaml), folder of CSV files, file of JSON lines, or a folder of
-    several of these."""
-    out: Path
-    """Folder of the log; an earlier log there is kept as a numbered backup."""
-    kind: Annotated[Kind, arg(name="from")] = "bag"
-    """Kind of the record."""
-    topics: Annotated[BagOptions, arg(name="")] = field(default_factory=BagOptions)
-    """Messages of a bag."""
-    label_field: str | None = None
-    """Field of the label of a detection in a bag; `none` means that there are no labels."""
-    labels: tuple[str, ...] = ()
-    """Values of the labels: left=0 right=1 is the default. Words are read as well, blue_cone as left and
-    yellow as right; anything else is unknown."""
-    columns: tuple[str, ...] = ()
-    """Columns of the CSV files: t=stamp vx=speed vy=v wz=yaw_rate of the odometry, t, x, y (or range and
-    bearing), label, xx, xy and yy of the detections. A minus changes the sign (wz=-yaw_rate). Where both
-    files name t in another way, detections.t=time is of one of them."""
-    units: tuple[str, ...] = ()
-    """Units of the CSV files: length=mm angle=deg time=ns, also speed=km/h and yaw_rate=deg/s, which
-    otherwise follow length and angle. Without them it is m, rad and s."""
-    frames: Annotated[Frames, arg(name="")] = field(default_factory=Frames)
-    """Frames of the record."""
-    window: Annotated[Window, arg(name="")] = field(default_factory=Window)
-    """Part of the record that counts."""
-    noise: Annotated[NoiseSettings, arg(name="")] = field(default_factory=NoiseSettings)
-    """Noise that the record does not state."""
+def _records(options: Convert) -> list[Path]:
+    """Return the records in the source where it is a folder of several, none where it is one itself."""
+    folder = options.source
+    if not folder.is_dir() or (folder / "metadata.yaml").exists():
+        return []
+    if options.kind == "csv":
+        file = options.topics.odometry or ODOMETRY_FILE
+        return [] if (folder / file).exists() else sorted(one.parent for one in folder.glob(f"*/{file}"))
+    known = [one for one in folder.iterdir() if one.suffix in SUFFIXES.get(options.kind, ())]
+    bags = [one.parent for one in folder.glob("*/metadata.yaml")] if options.kind == "bag" else []
+    return sorted({*known, *bags})
 
-    def run(self) -> None:
-        records = self._records()
-        if not records:
-            self._convert(self.source, self.out)
-            return
-        refused = []
-        for record in records:
-            try:
-                self._convert(record, self.out / record.stem)
-            except PathspaceError as error:
-                refused.append(str(error))
-        if refused:
-            some = f"{len(refused)} of {len(records)} records were refused"
-            raise PathspaceError(f"{some}: {'; '.join(refused)}")
 
-    def _records(self) -> list[Path]:
-        """Return the records in the source where it is a folder of several, none where it is one itself."""
-        folder = self.source
-        if not folder.is_dir() or (folder / "metadata.yaml").exists():
-            return []
-        if self.kind == "csv":
-            file = self.topics.odometry or ODOMETRY_FILE
-            return [] if (folder / file).exists() else sorted(one.parent for one in folder.glob(f"*/{file}"))
-        known = [one for one in folder.iterdir() if one.suffix in SUFFIXES.get(self.kind, ())]
-        bags = [one.parent for one in folder.glob("*/metadata.yaml")] if self.kind == "bag" else []
-        return sorted({*known, *bags})
+def _convert(options: Convert, source: Path, out: Path) -> None:
+    check_target(out, LOG_FILE)
+    rule = LabelRule(options.labels, options.label_field)
+    with progress("converting"):
+        record = windowed(_read(options, source, rule), options.window, source)
+        recorded = to_log(record, options.frames, options.noise, source, options.window.spacing)
+        log = with_measured_noise(recorded)
+        write_checked(log, out, source)
+    report(record.notes, rule, log)
+    tell(hints(log))
 
-    def _convert(self, source: Path, out: Path) -> None:
-        check_target(out, LOG_FILE)
-        rule = LabelRule(self.labels, self.label_field)
-        with progress("converting"):
-            record = windowed(self._read(source, rule), self.window, source)
-            log = with_measured_noise(to_log(record, self.frames, self.noise, source, self.window.spacing))
-            write_checked(log, out, source)
-        report(record.notes, rule, log, out)
-        tell(hints(log))
 
-    def _read(self, source: Path, rule: LabelRule) -> Recording:
-        if self.kind == "jsonl":
-            return read_json_lines(source, rule)
-        if self.kind == "csv":
-            files = self.topics.odometry or ODOMETRY_FILE, self.topics.detections or DETECTIONS_FILE
-            return read_csv(source / files[0], source / files[1], rule, self.columns, self.units)
-        return read_bag(source, self.topics, rule, mounted=self.frames.mounting is not None)
+def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
+    if options.kind == "jsonl":
+        return read_json_lines(source, rule)
+    if options.kind == "csv":
+        files = options.topics.odometry or ODOMETRY_FILE, options.topics.detections or DETECTIONS_FILE
+        return read_csv(source / files[0], source / files[1], rule, options.columns, options.units)
+    return read_bag(source, options.topics, rule, mounted=options.frames.mounting is not None)
 
 
 def with_measured_noise(log: Log) -> Log:
@@ -143,14 +115,14 @@ def write_checked(log: Log, out: Path, source: Path) -> None:
         raise InputError(source, f"its log would be refused ({where}): {why}") from None
 
 
-def report(notes: Counter[str], rule: LabelRule, log: Log, out: Path) -> None:
+def report(notes: Counter[str], rule: LabelRule, log: Log) -> None:
     """Print what the labels were taken for, what was left out or assumed how often, and the log in short."""
     say(*(f"{count} {text}" for text, count in notes.items() if count))
     measured = [] if log.measured is None else [measured_line(log.measured, scale_of(log))]
     labels = [rule.told()] if rule.met else []
     if hint := rule.hint():
         note(f"hint: {hint}")
-    say(*labels, outline(log), *measured, f"{out}: {describe(log)}")
+    say(*labels, outline(log), *measured, describe(log))
 
 
 def outline(log: Log) -> str:

@@ -3,16 +3,15 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from importlib import import_module
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.table import Table
 from rich.text import Text
-from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from pathspace_graph import estimators
 from pathspace_graph.batch.joint_mapper import JointResult, solve_together
@@ -35,203 +34,158 @@ from pathspace_graph.io.ribbon import as_ribbon
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.options.map import Batch, MapKind, Online, Plot
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online
-from pathspace_graph.settings.mapper import MapperSettings, Start
-from pathspace_graph.settings.output import FilmSettings, RecordingSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.crossing import crossings_told
 
-from .known import MAP_SIGMA, KnownTrack, read_known_map
+from .known import KnownTrack, read_known_map
+from .outcome import Outcome
 
-MapKind = Literal["boundaries", "centerline"]  # kind of map: two boundaries, or one centre line with a width
 Run = TypeVar("Run", bound=RunResult)
-NOT_TRUSTED: Final = 3  # exit code of a result that is written, but is not the optimum or no map of the drive
 
 
-@dataclass(frozen=True, kw_only=True)
-class Online:
-    """Map a log online, cycle by cycle, and write the map, the trajectory, the cycles and a summary."""
-
-    log: Positional[Path]
-    """Folder of the log."""
-    out: Path
-    """Folder for the map; an earlier map there is kept as a numbered backup."""
-    estimator: str = DEFAULT_ONLINE
-    """Name of the online estimator."""
-    map: MapKind = "boundaries"
-    """Kind of map: two boundaries, or one centre line with a width."""
-    on: Path | None = None
-    """Known map on which the vehicle drives: a map's folder, a track file, `skidpad` or `acceleration`."""
-    start: tuple[float, float, float] | None = None
-    """Pose X Y HEADING (m, m, rad) on the known map near which the drive begins; by default anywhere."""
-    keep_map: FlagCreatePairsOff[bool] = False
-    """Hold the known map as it is, and only localize."""
-    map_sigma: float = MAP_SIGMA
-    """Standard deviation of the cones of a track file, m."""
-    save: Path | None = None
-    """File to which the mapper is saved at the end, for `--resume`; only `fixed-lag` can be saved."""
-    resume: Path | None = None
-    """File of a saved mapper, which goes on with its settings, and with cycles after its newest."""
-    view: FlagCreatePairsOff[bool] = False
-    """Show the run in the window of the live viewer rerun while it goes on."""
-    save_view: Path | None = None
-    """File (.rrd) for what the viewer shows; an earlier one is kept as a numbered backup."""
-    animate: Path | None = None
-    """File for a film (.gif, or .mp4 if ffmpeg is installed); an earlier one is kept as a numbered backup."""
-    recording: RecordingSettings = field(default_factory=RecordingSettings)
-    film: FilmSettings = field(default_factory=FilmSettings)
-    settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """Settings of the estimator."""
-
-    def run(self) -> None:
-        estimators.check_online(self.estimator)
-        check_target(self.out, MAP_FILE)
-        self._check_snapshots()
-        known = self._known()
-        viewing = self._viewing()
-        if viewing is not None:
-            viewing.check_watchers(self)
-        log, hints = read_plausible_log(self.log, self.settings.limits)
-        tell(hints)
-        log, estimator = self._begin(log) if known is None else self._begin_on(known, log)
-        with nullcontext([]) if viewing is None else viewing.watchers(self, log) as observers:
-            result = of_kind(map_online(log, estimator, self.estimator, observers), self.map, self.settings)
-            differ = [] if known is None else known.differences(result, estimator)
-            told = {} if known is None else known.summary(estimator, differ)
-            write_result(self.out, result, summarize(result, log, hints) | told)
-        if self.save is not None and isinstance(estimator, FixedLagMapper):
-            estimator.save(self.save)
-        report(result, log)
-        written = [str(path) for path in (self.out, self.save_view, self.animate) if path is not None]
-        say(f"written to {', '.join(written)}")
-        crossed = crossings_told(crossings_of(result))
-        wrong = [f"not a map of the drive: {crossed}"] if crossed else []
-        say(*(one.line for one in differ))
-        if known is not None and known.found_at(estimator) is None:
-            wrong.append(f"the vehicle was not found on {self.on}: this is the map of its own road")
-        end_untrusted(wrong)
-
-    def _viewing(self) -> Any:
-        """Return the module of viewers and films if one is asked for; importing matplotlib is slow."""
-        asked = self.view or self.save_view is not None or self.animate is not None
-        return import_module("pathspace_graph.eval.view.recording") if asked else None
-
-    def _check_snapshots(self) -> None:
-        """Raise a SettingsError where a snapshot is asked for that cannot be, before anything is mapped."""
-        for name in ("save", "resume"):
-            if getattr(self, name) is not None and self.estimator != DEFAULT_ONLINE:
-                raise SettingsError(
-                    f"--{name}: expected --estimator {DEFAULT_ONLINE}, found {self.estimator}"
-                )
-        if self.resume is not None and self.settings != MapperSettings():
-            expected = "expected no settings, since the saved mapper has its own"
-            raise SettingsError(f"--resume: {expected}, found some")
-        if self.save is not None:
-            check_file_target(self.save)
-
-    def _begin(self, log: Log) -> tuple[Log, OnlineEstimator]:
-        """Return a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
-        if self.resume is None:
-            return log, estimators.make_online(self.estimator, self.settings, log)
-        mapper = FixedLagMapper.restore(self.resume)
-        times = mapper.road.smoother.times
-        cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])
-        if not cycles:
-            expected = f"expected cycles after {times[-1]:g} s, where {self.resume} ends"
-            raise InputError(self.log, f"{expected}, found none")
-        return replace(log, cycles=cycles), mapper
-
-    def _known(self) -> KnownTrack | None:
-        """Return the known map that is asked for; SettingsError where options contradict each other."""
-        if self.on is None:
-            for option, is_given in (("start", self.start is not None), ("keep-map", self.keep_map)):
-                if is_given:
-                    raise SettingsError(f"--{option}: expected --on MAP as well, found none")
-            return None
-        if self.estimator != DEFAULT_ONLINE:
-            raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {self.estimator}")
-        if self.resume is not None:
-            raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
-        if not 0.0 < self.map_sigma < np.inf:
-            raise SettingsError(f"--map-sigma: expected a positive number, found {self.map_sigma:g}")
-        return read_known_map(self.on, self.map_sigma, self.settings)
-
-    def _begin_on(self, known: KnownTrack, log: Log) -> tuple[Log, FixedLagMapper]:
-        """Return a mapper on a known map, and the log without its truth, which is in another frame."""
-        settings = estimators.settings_of(self.settings, log)
-        start = known.start if self.start is None else np.array(self.start)
-        mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=self.keep_map)
-        return replace(log, truth=None), mapper
+def online_command(options: Online) -> Outcome:
+    check_online_options(options)
+    known = known_track(options)
+    if options.plot is not None:
+        plotting().check_picture(options.plot)
+    viewing = viewers(options)
+    if viewing is not None:
+        viewing.check_watchers(options)
+    log, hints = read_plausible_log(options.log, options.settings.limits)
+    tell(hints)
+    log, estimator = begin(options, log) if known is None else begin_on(options, known, log)
+    with nullcontext([]) if viewing is None else viewing.watchers(options, log) as observers:
+        mapped = map_online(log, estimator, options.estimator, observers)
+        result = of_kind(mapped, options.map, options.settings)
+        differ = [] if known is None else known.differences(result, estimator)
+        summarized = summarize(result, log, hints)
+        summarized |= {} if known is None else known.summary(estimator, differ)
+        write_result(options.out, result, summarized)
+    if options.save is not None and isinstance(estimator, FixedLagMapper):
+        estimator.save(options.save)
+    if options.plot is not None:
+        plotting().plot_command(Plot(map=options.out, out=options.plot, log=None if known else options.log))
+    report(result, log)
+    say(*(one.line for one in differ))
+    crossed = crossings_told(crossings_of(result))
+    wrong = [f"not a map of the drive: {crossed}"] if crossed else []
+    if known is not None and known.found_at(estimator) is None:
+        wrong.append(f"the vehicle was not found on {options.on}: this is the map of its own road")
+    files = (options.out, options.save, options.plot, options.save_view, options.animate)
+    return Outcome([file for file in files if file is not None], summarized, wrong)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Batch:
-    """Optimize whole logs at once, and write the map, the trajectory, the cycles and a summary.
+def plotting() -> Any:
+    """Return the module that draws maps; importing matplotlib is slow."""
+    return import_module("pathspace_graph.commands.plot")
 
-    Several logs of one track give one map, in the frame of the first, and a trajectory for each. A drive that
-    does not fit the map of the others is left out, and the exit code is 3.
-    """
 
-    log: Positional[tuple[Path, ...]]
-    """Folder of the log, or folders of several drives of one track."""
-    out: Path
-    """Folder for the map; an earlier map there is kept as a numbered backup."""
-    estimator: str = DEFAULT_BATCH
-    """Name of the batch estimator."""
-    map: MapKind = "boundaries"
-    """Kind of map: two boundaries, or one centre line with a width."""
-    start: Start | None = None
-    """Where the optimization begins; by default as `batch.start` says."""
-    settings: Annotated[MapperSettings, arg(name="")] = field(default_factory=MapperSettings)
-    """Settings of the estimator."""
+def viewers(options: Online) -> Any:
+    """Return the module of viewers and films if one is asked for, which draws as well."""
+    asked = options.view or options.save_view is not None or options.animate is not None
+    return import_module("pathspace_graph.eval.view.recording") if asked else None
 
-    def run(self) -> None:
-        estimators.check_batch(self.estimator)
-        if self.start == "odometry" and self.estimator != DEFAULT_BATCH:
-            raise SettingsError(f"--start: expected online for {self.estimator}, found {self.start}")
-        if not self.log:
-            raise SettingsError("LOG: expected the folder of a log, found none")
-        check_target(self.out, MAP_FILE)
-        if len(self.log) > 1:
-            self._run_together()
-            return
-        log, hints = read_plausible_log(self.log[0], self.settings.limits)
-        tell(hints)
-        with progress("optimizing") as advance:
-            estimator = estimators.make_batch(self.estimator, self.settings, log)
-            options = (self.start, advance) if isinstance(estimator, BatchMapper) else ()
-            result: BatchRun = of_kind(estimator.solve(log, *options), self.map, self.settings)
-        write_result(self.out, result, summarize_batch(result, log, hints))
-        report(result, log)
-        say(f"written to {self.out}")
-        end_untrusted(untrusted(result))
 
-    def _run_together(self) -> None:
-        """Map several drives at once."""
-        if self.estimator != DEFAULT_BATCH:
-            expected = f"--estimator: expected {DEFAULT_BATCH} for several logs"
-            raise SettingsError(f"{expected}, found {self.estimator}")
-        logs, hints = dict[str, Log](), dict[str, list[Hint]]()
-        for name, folder in unique_names(self.log).items():
-            logs[name], hints[name] = read_plausible_log(folder, self.settings.limits)
-            tell(hints[name], of=name)
-        with progress("optimizing") as advance:
-            joint = solve_together(logs, self._mapper, self.settings, self.start, advance)
-        name, result = next(iter(joint.drives.items()))
-        result = of_kind(result, self.map, self.settings)
-        summary = summarize_batch(result, logs[name], hints[name]) | summary_of_drives(joint, logs)
-        write_result(self.out, result, summary, joint.drives)
-        report(result, logs[name])
-        say(*drive_lines(joint), f"written to {self.out}")
-        left_out = [f"{name} is left out: {why}" for name, why in joint.left_out.items()]
-        end_untrusted([*left_out, *untrusted(result)])
+def check_online_options(options: Online) -> None:
+    """Raise an error where options contradict each other, before anything is mapped."""
+    estimators.check_online(options.estimator)
+    check_target(options.out, MAP_FILE)
+    for name in ("save", "resume"):
+        if getattr(options, name) is not None and options.estimator != DEFAULT_ONLINE:
+            raise SettingsError(f"--{name}: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
+    if options.resume is not None and options.settings != MapperSettings():
+        expected = "expected no settings, since the saved mapper has its own"
+        raise SettingsError(f"--resume: {expected}, found some")
+    if options.save is not None:
+        check_file_target(options.save)
 
-    def _mapper(self, settings: MapperSettings, log: Log) -> BatchMapper:
-        estimator = estimators.make_batch(DEFAULT_BATCH, settings, log)
-        assert isinstance(estimator, BatchMapper)
-        return estimator
+
+def begin(options: Online, log: Log) -> tuple[Log, OnlineEstimator]:
+    """Return a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
+    if options.resume is None:
+        return log, estimators.make_online(options.estimator, options.settings, log)
+    mapper = FixedLagMapper.restore(options.resume)
+    times = mapper.road.smoother.times
+    cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])
+    if not cycles:
+        expected = f"expected cycles after {times[-1]:g} s, where {options.resume} ends"
+        raise InputError(options.log, f"{expected}, found none")
+    return replace(log, cycles=cycles), mapper
+
+
+def known_track(options: Online) -> KnownTrack | None:
+    """Return the known map that is asked for; SettingsError where options contradict each other."""
+    if options.on is None:
+        for option, is_given in (("start", options.start is not None), ("keep-map", options.keep_map)):
+            if is_given:
+                raise SettingsError(f"--{option}: expected --on MAP as well, found none")
+        return None
+    if options.estimator != DEFAULT_ONLINE:
+        raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
+    if options.resume is not None:
+        raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
+    if not 0.0 < options.map_sigma < np.inf:
+        raise SettingsError(f"--map-sigma: expected a positive number, found {options.map_sigma:g}")
+    return read_known_map(options.on, options.map_sigma, options.settings)
+
+
+def begin_on(options: Online, known: KnownTrack, log: Log) -> tuple[Log, FixedLagMapper]:
+    """Return a mapper on a known map, and the log without its truth, which is in another frame."""
+    settings = estimators.settings_of(options.settings, log)
+    start = known.start if options.start is None else np.array(options.start)
+    mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=options.keep_map)
+    return replace(log, truth=None), mapper
+
+
+def batch_command(options: Batch) -> Outcome:
+    estimators.check_batch(options.estimator)
+    if options.start == "odometry" and options.estimator != DEFAULT_BATCH:
+        raise SettingsError(f"--start: expected online for {options.estimator}, found {options.start}")
+    check_target(options.out, MAP_FILE)
+    if len(options.log) > 1:
+        return batch_of_several(options)
+    log, hints = read_plausible_log(options.log[0], options.settings.limits)
+    tell(hints)
+    with progress("optimizing") as advance:
+        estimator = estimators.make_batch(options.estimator, options.settings, log)
+        more = (options.start, advance) if isinstance(estimator, BatchMapper) else ()
+        result: BatchRun = of_kind(estimator.solve(log, *more), options.map, options.settings)
+    summarized = summarize_batch(result, log, hints)
+    write_result(options.out, result, summarized)
+    report(result, log)
+    return Outcome([options.out], summarized, untrusted(result))
+
+
+def batch_of_several(options: Batch) -> Outcome:
+    """Map several drives of one track at once."""
+    if options.estimator != DEFAULT_BATCH:
+        expected = f"--estimator: expected {DEFAULT_BATCH} for several logs"
+        raise SettingsError(f"{expected}, found {options.estimator}")
+    logs, hints = dict[str, Log](), dict[str, list[Hint]]()
+    for name, folder in unique_names(options.log).items():
+        logs[name], hints[name] = read_plausible_log(folder, options.settings.limits)
+        tell(hints[name], of=name)
+    with progress("optimizing") as advance:
+        joint = solve_together(logs, spline_batch, options.settings, options.start, advance)
+    name, result = next(iter(joint.drives.items()))
+    result = of_kind(result, options.map, options.settings)
+    summarized = summarize_batch(result, logs[name], hints[name]) | summary_of_drives(joint, logs)
+    write_result(options.out, result, summarized, joint.drives)
+    report(result, logs[name])
+    say(*drive_lines(joint))
+    left_out = [f"{name} is left out: {why}" for name, why in joint.left_out.items()]
+    return Outcome([options.out], summarized, [*left_out, *untrusted(result)])
+
+
+def spline_batch(settings: MapperSettings, log: Log) -> BatchMapper:
+    estimator = estimators.make_batch(DEFAULT_BATCH, settings, log)
+    assert isinstance(estimator, BatchMapper)
+    return estimator
 
 
 def untrusted(result: BatchRun) -> list[str]:
@@ -296,13 +250,6 @@ def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
         return result
     laps = tuple((lap, line_if_any(track)) for lap, track in result.lap_maps)
     return replace(result, map=last, lap_maps=laps, snapshots=tuple(map(line_if_any, result.snapshots)))
-
-
-def end_untrusted(wrong: Sequence[str]) -> None:
-    """Print as errors what is wrong with a result that is written, and end with an exit code; or go on."""
-    if wrong:
-        note(*wrong)
-        raise SystemExit(NOT_TRUSTED)
 
 
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +18,6 @@ from pathspace_graph.run import OnlineEstimator
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import EVENTS
 from pathspace_graph.sim.track_files import read_track
-
-MAP_SIGMA: Final = 0.15  # standard deviation of the cones of a track file (m)
 
 
 @dataclass(frozen=True, eq=False)

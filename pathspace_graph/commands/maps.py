@@ -14,23 +14,27 @@ from pathspace_graph.eval.metrics.alignment import MapsApart, maps_apart
 from pathspace_graph.io.files import atomic_folder, check_target, write_json
 from pathspace_graph.io.map import read_map
 
+from .outcome import Outcome
+
 APART_FILE: Final = "apart.json"  # by which the folder is recognized
 PICTURE: Final = "apart.png"
 STATISTICS: Final = ("mean", "rms", "p95", "max")
 
 
-def compare_maps(first: Path, second: Path, out: Path) -> None:
+def compare_maps(first: Path, second: Path, out: Path) -> Outcome:
     """Lay the first map on the second, print how far they are apart, and write it with a picture."""
     check_target(out, APART_FILE)
     tracks = read_map(first), read_map(second)
     apart = maps_apart(*tracks)
+    content = {"maps": [str(first), str(second)], **apart.to_json()}
     with atomic_folder(out, APART_FILE) as folder:
-        write_json(folder / APART_FILE, {"maps": [str(first), str(second)], **apart.to_json()})
+        write_json(folder / APART_FILE, content)
         save_plot(plot_apart(*tracks, apart), folder / PICTURE)
     output().print(apart_table(apart))
     x, y, turn = apart.motion.tolist()
     where = f"({x:.3f}, {y:.3f}) m, turned by {np.rad2deg(turn):.3f}°"
-    say(f"the frame of {first} is at {where} in that of {second}", f"written to {out}")
+    say(f"the frame of {first} is at {where} in that of {second}")
+    return Outcome([out], content)
 
 
 def apart_table(apart: MapsApart) -> Table:

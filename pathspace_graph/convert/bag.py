@@ -17,7 +17,7 @@ from pathspace_graph.io.parsing import read_text
 
 from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_of, twist_of, yaw_rate_of
 from .recording import Recording, check_clock, rate, twists_between
-from .settings import LabelRule
+from .settings import BagOptions, LabelRule
 
 INSTALL: Final = "pip install 'pathspace-graph[ros]'"  # command that installs the package that reads bags
 SUPPORTED: Final = {  # what a message must hold, by the option of its topic
@@ -42,30 +42,6 @@ STATIC: Final = "/tf_static"  # topic of the transforms between frames that are 
 BODIES: Final = ("base_link", "base_footprint")  # frames of a vehicle whose odometry names none
 LEVEL: Final = 0.98  # least cosine of a level sensor's z axis and the vehicle's
 LATE: Final = 0.1  # median time (s) of receipt after or before the stamps that is worth a word
-
-
-@dataclass(frozen=True)
-class BagOptions:
-    """Which messages of a bag are taken, and how."""
-
-    odometry: str | None = None
-    """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives
-    the yaw rate), or with a pose. For CSV a file in the folder, by default odometry.csv."""
-    detections: str | None = None
-    """Topic of the detections in a bag: a point cloud with a field for the label, an array of markers (blue
-    is left, yellow is right), any message with lists of cones or polylines, or a LaserScan. For CSV a file in
-    the folder, by default detections.csv."""
-    imu: str | None = None
-    """Topic of the yaw rate, sensor_msgs/Imu, whose z axis points up."""
-    wheelbase: float | None = None
-    """Wheelbase (m), by which speed and steering angle give the yaw rate."""
-    definition: tuple[str, ...] = ()
-    """Files of messages that the bag does not define itself, as PACKAGE/msg/NAME=FILE or as a path that ends
-    in PACKAGE/msg/NAME.msg."""
-    from_poses: bool = False
-    """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
-    received: bool = False
-    """Take the times at which messages were received as stamps, also where they have one of their own."""
 
 
 class Samples(NamedTuple):

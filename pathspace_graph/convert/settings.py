@@ -32,6 +32,30 @@ MIN_SATURATION: Final = 0.3  # least saturation of a colour that is not grey
 
 
 @dataclass(frozen=True)
+class BagOptions:
+    """Which messages of a bag are taken, and how."""
+
+    odometry: str | None = None
+    """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives
+    the yaw rate), or with a pose. For CSV a file in the folder, by default odometry.csv."""
+    detections: str | None = None
+    """Topic of the detections in a bag: a point cloud with a field for the label, an array of markers (blue
+    is left, yellow is right), any message with lists of cones or polylines, or a LaserScan. For CSV a file in
+    the folder, by default detections.csv."""
+    imu: str | None = None
+    """Topic of the yaw rate, sensor_msgs/Imu, whose z axis points up."""
+    wheelbase: float | None = None
+    """Wheelbase (m), by which speed and steering angle give the yaw rate."""
+    definition: tuple[str, ...] = ()
+    """Files of messages that the bag does not define itself, as PACKAGE/msg/NAME=FILE or as a path that ends
+    in PACKAGE/msg/NAME.msg."""
+    from_poses: bool = False
+    """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
+    received: bool = False
+    """Take the times at which messages were received as stamps, also where they have one of their own."""
+
+
+@dataclass(frozen=True)
 class NoiseSettings:
     """Noise of a record that does not state it."""
 

@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from pathspace_graph.errors import InputError
+from pathspace_graph.errors import MAX_INTEGER, InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 
 T = TypeVar("T")
@@ -31,7 +31,6 @@ MAX_FILE_BYTES: Final = 2**30
 MAX_HEADER_BYTES: Final = 2**22  # also of a study
 MAX_TRACK_BYTES: Final = 2**23
 MAX_DEPTH: Final = 32  # of lists and tables in each other
-MAX_INTEGER: Final = 2**63 - 1
 MAX_VARIANTS: Final = 10_000  # of a study's grid
 
 MAX_STAMP: Final = 1e10  # s: 300 years; stamps in milliseconds or nanoseconds are beyond it

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.cli import BROKEN_PIPE, main, parse_command
-from pathspace_graph.commands import options
-from pathspace_graph.commands.options import ESSENTIAL
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import write_json
 from pathspace_graph.io.overrides import leaves, override
+from pathspace_graph.options import help as help_texts
+from pathspace_graph.options.help import ESSENTIAL
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 
 SCREEN = 50
@@ -48,15 +48,15 @@ def test_the_short_help_has_the_essential_settings_and_the_long_one_has_all(
 ) -> None:
     assert set(ESSENTIAL) <= set(leaves(MapperSettings()))
     short, whole = help_of("online", "--help", capsys), help_of("online", "--help-all", capsys)
-    assert "--lag 3.0" in short
+    assert "--lag 3 " in short
     for name in leaves(MapperSettings()):
         option = name.replace("_", "-").split(".")[-1]
         assert option in whole, name
         assert (f"--{name.replace('_', '-')} " in short or name == "calibration.sensor") == (
             name in ESSENTIAL
         )
-    assert "--settings FILE" in short
-    assert "--settings FILE" in whole
+    assert "--settings PATH" in short
+    assert "--settings PATH" in whole
 
 
 def test_a_flag_in_the_short_help_is_the_one_that_changes_something(
@@ -143,9 +143,9 @@ def test_a_bad_summary_is_one_line_too(
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--settings"], "--settings: expected one file, found none"),
-        (["--settings", "--lag", "3"], "--settings: expected one file, found none"),
-        (["--settings", "a.toml", "--settings", "b.toml"], "--settings: expected one file, found two"),
+        (["--settings"], "--settings: expected a path, found none"),
+        (["--settings", "--lag", "3"], "--settings: expected a path, found none"),
+        (["--settings", "a.toml", "--settings", "b.toml"], "--settings: expected it once, found it twice"),
         (["--settings", "none.toml"], "none.toml: expected a file of settings, found none"),
     ],
 )
@@ -227,7 +227,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It has closed the pipe before all was printed."""
-    monkeypatch.setattr(options, "completion", lambda *_: 100_000 * "x")
+    monkeypatch.setattr(help_texts, "completion", lambda *_: 100_000 * "x")
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as out:

@@ -11,7 +11,7 @@ import pytest
 from pathspace_graph import cli
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.benchmark.lanes import CONES, LAPS, READINGS
-from pathspace_graph.eval.benchmark.roads import ScalingSettings, make_drives
+from pathspace_graph.eval.benchmark.roads import make_drives
 from pathspace_graph.eval.benchmark.scaling import (
     MARKER,
     measure_scaling,
@@ -19,6 +19,7 @@ from pathspace_graph.eval.benchmark.scaling import (
     stops,
     write_scaling,
 )
+from pathspace_graph.settings.evaluation import ScalingSettings
 
 from .timing import SMALL
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from pathspace_graph.eval.benchmark.measurement import Measurement
-from pathspace_graph.eval.benchmark.roads import ScalingSettings
 from pathspace_graph.io.results import CycleRecord
+from pathspace_graph.settings.evaluation import ScalingSettings
 
 SMALL = ScalingSettings(
     cones_min=20.0,

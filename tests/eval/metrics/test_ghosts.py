@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.metrics.accuracy import GhostSettings, ghosts
+from pathspace_graph.eval.metrics.accuracy import ghosts
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.settings.evaluation import GhostSettings
 
 from .straight_maps import landmarks, line, row, truth
 

@@ -1,0 +1,86 @@
+"""`simulate`, `convert` and `verify`: where logs come from, and whether files are as they were written."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from pathspace_graph.convert.settings import BagOptions, Frames, NoiseSettings, Window
+from pathspace_graph.sim.simulate import PRESETS, SimulationSettings, preset
+from pathspace_graph.sim.track_generator import TrackGeneratorSettings
+
+from .parse import INLINE, PLACE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Drive a track and write the log of it, with truth; a seed gives the same log to the byte."""
+
+    out: Path
+    """Folder for the log; an earlier log there is kept as a numbered backup."""
+    track: Path | None = None
+    """Track file: PacSim or fssim YAML, EUFS or TUM CSV."""
+    generate: int | None = None
+    """Seed of a generated Formula Student track, in place of a track file."""
+    event: Literal["skidpad", "acceleration"] | None = None
+    """Event that is driven instead of either, on the track that the rules describe."""
+    seed: int = 0
+    """Seed of the drive's wander and of all noise."""
+    sensor: Literal["plain", "camera", "line"] = "plain"
+    """Preset of `--sensor.*`, `--line.*` and `--faults.sensor.*`, each of which can still be set: cones with
+    white noise, a camera's cones, or points of a line."""
+    odometry: Literal["plain", "ins"] = "plain"
+    """Preset of `--odometry.*` and `--vehicle.rate`, each of which can still be set."""
+    settings: SimulationSettings = field(default_factory=SimulationSettings, metadata=INLINE)
+    """Settings of the drive."""
+    generator: TrackGeneratorSettings = field(default_factory=TrackGeneratorSettings)
+    """Rules of a generated track."""
+
+    @classmethod
+    def base(cls, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of the presets, before any other option is set."""
+        return {"settings": preset({group: given[group] for group in PRESETS if group in given})}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert:
+    """Write a ROS bag, CSV files or JSON lines as a log, and say what was left out.
+
+    A log is in order of time and in the vehicle frame. A folder of several records becomes a folder of logs.
+    """
+
+    source: Path = field(metadata=PLACE)
+    """Bag (a file, or a folder with metadata.yaml), folder of CSV files, file of JSON lines, or a folder of
+    several of these."""
+    out: Path
+    """Folder of the log; an earlier log there is kept as a numbered backup."""
+    kind: Literal["bag", "csv", "jsonl"] = field(default="bag", metadata={"name": "from"})
+    """Kind of the record."""
+    topics: BagOptions = field(default_factory=BagOptions, metadata=INLINE)
+    """Messages of a bag."""
+    label_field: str | None = None
+    """Field of the label of a detection in a bag; `none` means that there are no labels."""
+    labels: tuple[str, ...] = ()
+    """Values of the labels: left=0 right=1 is the default. Words are read as well, blue_cone as left and
+    yellow as right; anything else is unknown."""
+    columns: tuple[str, ...] = ()
+    """Columns of the CSV files: t=stamp vx=speed vy=v wz=yaw_rate of the odometry, t, x, y (or range and
+    bearing), label, xx, xy and yy of the detections. A minus changes the sign (wz=-yaw_rate). Where both
+    files name t in another way, detections.t=time is of one of them."""
+    units: tuple[str, ...] = ()
+    """Units of the CSV files: length=mm angle=deg time=ns, also speed=km/h and yaw_rate=deg/s, which
+    otherwise follow length and angle. Without them it is m, rad and s."""
+    frames: Frames = field(default_factory=Frames, metadata=INLINE)
+    """Frames of the record."""
+    window: Window = field(default_factory=Window, metadata=INLINE)
+    """Part of the record that counts."""
+    noise: NoiseSettings = field(default_factory=NoiseSettings, metadata=INLINE)
+    """Noise that the record does not state."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Check every file of a folder against its manifest, which each command writes beside its files."""
+
+    folder: Path = field(metadata=PLACE)
+    """Folder of a log, a map, or the result of another command, with its subfolders."""

@@ -1,0 +1,144 @@
+"""`demo`, `online`, `batch`, `plot` and `export`: maps of logs, and what is made of them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
+from pathspace_graph.settings.mapper import MapperSettings, Start
+from pathspace_graph.settings.output import FilmSettings, RecordingSettings, SpeedSettings
+
+from .parse import INLINE, PLACE
+
+MapKind = Literal["boundaries", "centerline"]
+Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimation:
+    """Options of every command that estimates."""
+
+    file: Path | None = field(default=None, metadata={"name": "settings"})
+    """TOML file of settings, or the summary.json of a run; options on the command line override it."""
+    settings: MapperSettings = field(default_factory=MapperSettings, metadata=INLINE)
+
+    @classmethod
+    def base(cls, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of the file, before any other option is set."""
+        if "settings" not in given:
+            return {}
+        overrides = import_module("pathspace_graph.io.overrides")  # the help need not wait for NumPy
+        return {"settings": overrides.read_settings(given["settings"], MapperSettings())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Estimation):
+    """Simulate a track and map it online: the paper's table beside the landmark graph's, and a picture."""
+
+    out: Path = Path("pathspace-demo")
+    """Folder for log, map and picture; an earlier demo there is kept as a numbered backup."""
+    seed: int = 8
+    """Seed of the track and of all noise; by default one whose first lap is typical."""
+    laps: int = 5
+    """Laps that the vehicle drives."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Online(Estimation):
+    """Map a log online, cycle by cycle, and write the map, the trajectory, the cycles and a summary."""
+
+    log: Path = field(metadata=PLACE)
+    """Folder of the log."""
+    out: Path
+    """Folder for the map; an earlier map there is kept as a numbered backup."""
+    estimator: str = field(default=ONLINE_NAMES[0], metadata={"words": ONLINE_NAMES})
+    """Name of the online estimator."""
+    map: MapKind = "boundaries"
+    """Kind of map: two boundaries, or one centre line with a width."""
+    on: Path | None = None
+    """Known map on which the vehicle drives: a map's folder, a track file, `skidpad` or `acceleration`."""
+    start: tuple[float, float, float] | None = None
+    """Pose X Y HEADING (m, m, rad) on the known map near which the drive begins; by default anywhere."""
+    keep_map: bool = False
+    """Hold the known map as it is, and only localize."""
+    map_sigma: float = 0.15
+    """Standard deviation of the cones of a track file, m."""
+    save: Path | None = None
+    """File to which the mapper is saved at the end, for `--resume`; only `fixed-lag` can be saved."""
+    resume: Path | None = None
+    """File of a saved mapper, which goes on with its settings, and with cycles after its newest."""
+    plot: Path | None = None
+    """File for a picture of the map (.png, .pdf or .svg); an earlier one is kept as a numbered backup."""
+    view: bool = False
+    """Show the run in the window of the live viewer rerun while it goes on."""
+    save_view: Path | None = None
+    """File (.rrd) for what the viewer shows; an earlier one is kept as a numbered backup."""
+    animate: Path | None = None
+    """File for a film (.gif, or .mp4 if ffmpeg is installed); an earlier one is kept as a numbered backup."""
+    recording: RecordingSettings = field(default_factory=RecordingSettings)
+    film: FilmSettings = field(default_factory=FilmSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch(Estimation):
+    """Optimize whole logs at once, and write the map, the trajectory, the cycles and a summary.
+
+    Several logs of one track give one map, in the frame of the first, and a trajectory for each. A drive that
+    does not fit the map of the others is left out, and the exit code is 3.
+    """
+
+    log: tuple[Path, ...] = field(metadata=PLACE)
+    """Folder of the log, or folders of several drives of one track."""
+    out: Path
+    """Folder for the map; an earlier map there is kept as a numbered backup."""
+    estimator: str = field(default=BATCH_NAMES[0], metadata={"words": BATCH_NAMES})
+    """Name of the batch estimator."""
+    map: MapKind = "boundaries"
+    """Kind of map: two boundaries, or one centre line with a width."""
+    start: Start | None = None
+    """Where the optimization begins; by default as `batch.start` says."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot:
+    """Draw a map: both boundaries with their 2-sigma band, control points, trajectory and any truth."""
+
+    map: Path = field(metadata=PLACE)
+    """Folder of the map."""
+    out: Path
+    """File for the picture (.png, .pdf or .svg); an earlier one is kept as a numbered backup."""
+    log: Path | None = None
+    """Folder of the log whose truth is drawn as well."""
+    band_scale: float = 1.0
+    """Factor by which the band is drawn wider than it is, which the legend says."""
+    title: str | None = None
+    """Title of the picture."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a map in a format that planners and other tools read."""
+
+    map: Path = field(metadata=PLACE)
+    """Folder of the map. With `tum` it may also be a log, whose true path is written."""
+    format: Format = field(metadata={"name": "as"})
+    """Format of the file: the centre line with widths as TUM raceline CSV (`centerline`), the trajectory in
+    the TUM format (`tum`), boundaries and centre line as GeoJSON (`geojson`), both boundaries as CSV with the
+    columns x, y and label (`points`), both boundaries with lanelets as OSM XML (`lanelet2`), or the centre
+    line with the speed that friction and curvature allow as CSV (`profile`)."""
+    out: Path
+    """File for the result, or standard output (`-`); an earlier file is kept as a numbered backup."""
+    step: float = 1.0
+    """Distance of the points along a curve (m)."""
+    origin: tuple[float, float, float] | None = None
+    """Latitude and longitude of the map's origin (degrees, WGS84), and heading of its x axis, which is the
+    way that the vehicle faced at the start (degrees, clockwise from north). `geojson` and `lanelet2` need
+    them."""
+    speed: SpeedSettings = field(default_factory=SpeedSettings)
+    """Vehicle of a `profile`."""
+    start_speed: float | None = None
+    """Speed at which the `profile` of an open track begins (m/s), by default what its curvature allows."""
+    stop: bool = False
+    """End the `profile` of an open track at a standstill."""
