@@ -17,7 +17,7 @@ import pytest
 from threadpoolctl import threadpool_info
 
 import pathspace_graph
-from pathspace_graph.cli import main
+from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.io.log import Detections, Log, Odometry, write_log
 from pathspace_graph.labels import LEFT, RIGHT
 
@@ -99,6 +99,13 @@ def modules_after(code: str) -> set[str]:
 def test_the_command_line_starts_without_the_heavy_libraries() -> None:
     loaded = modules_after("from pathspace_graph.cli import main; main(['--help'])")
     assert not loaded & {"numpy", "scipy", "gtsam", "matplotlib", "tyro", "rich"}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_waits_for_no_heavy_library(command: str) -> None:
+    loaded = modules_after(f"from pathspace_graph.cli import main; main(['{command}', '--help'])")
+    assert not loaded & {"gtsam", "matplotlib", "pandas", "rich", "joblib", "scipy.linalg", "scipy.spatial"}
+    assert ("numpy" in loaded) == (command in ("simulate", "convert", "verify"))
 
 
 def test_the_version_names_gtsam_and_the_kernels(capsys: pytest.CaptureFixture[str]) -> None:

@@ -81,7 +81,7 @@ class Option:
         if self.choices:
             return f"one of {', '.join(sorted(self.choices))}"
         word, _ = KINDS[_item(self.kind)]
-        return f"a {word}" if self.count in (1, MANY) else f"{self.count} {word}s"
+        return f"a {word}" if self.count in (0, 1, MANY) else f"{self.count} {word}s"
 
     @property
     def takes(self) -> str:

@@ -140,6 +140,20 @@ def test_a_map_keeps_the_formats_contract(log_folder: Path, map_folder: Path) ->
         assert np.shape(boundary["covariance"]) == (2 * boundary["size"], 2 * boundary["size"])
 
 
+def test_the_result_is_printed_as_json_and_drawn(
+    log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out, picture = beginning_of(log_folder, tmp_path / "log"), tmp_path / "map", tmp_path / "map.png"
+    assert main(["online", str(log), "--out", str(out), "--plot", str(picture), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["written"] == [str(out), str(picture)]
+    assert printed["wrong"] == []
+    assert printed["settings"] == json.loads((out / "summary.json").read_text())["settings"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main(["export", str(out), "--as", "points", "--out", "-"]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == "x,y,label", "only the file is on standard output"
+
+
 def test_a_row_for_every_cycle(log_folder: Path, map_folder: Path) -> None:
     log = read_log(log_folder)
     rows = (map_folder / "cycles.csv").read_text().splitlines()
@@ -335,6 +349,20 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
             ["online", "LOG", "--out", "MAP", "--max_poses=x"],
             "--max-poses: expected a whole number, found 'x' (see",
         ),
+        (["help", "onlin"], "found 'onlin', the nearest is 'online'"),
+        (["online", "LOG", "MAP", "--out", "X"], "online: expected one LOG, found 'LOG MAP' (see"),
+        (["online", "LOG", "--out", "MAP", "-o", "X"], "online: expected a known option, found '-o'"),
+        (
+            ["online", "LOG", "--out", "M", "--lag", "2", "--lag", "3"],
+            "--lag: expected it once, found it twice",
+        ),
+        (["online", "LOG", "--out", "MAP", "--keep-map=yes"], "--keep-map: expected a flag without a value"),
+        (["online", "LOG", "--out", "MAP", "--plot", "map.doc"], "map.doc: expected a file name that ends"),
+        (["simulate", "LOG", "--generate", "1"], "simulate: expected options only, found 'LOG' (see"),
+        (
+            ["simulate", "--generate", "9" * 20, "--out", "LOG"],
+            "--generate: expected whole numbers up to 9223",
+        ),
         (["online", "LOG", "--out"], "graph: --out: expected a path, found none (see"),
         (
             ["online", "LOG", "--out", "MAP", "--noise", "x"],
@@ -439,6 +467,17 @@ def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[s
     shown = capsys.readouterr().out
     assert "--out" in shown or command == "verify"
     assert "usage" in shown
+
+
+@pytest.mark.parametrize("words", [[], ["help"], ["--help"], ["-h"]])
+def test_the_overview_has_every_command(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in shown if line.startswith("  ") and line.split()[0] in COMMANDS] == [
+        *COMMANDS
+    ]
+    assert main(["help", "verify"]) == 0
+    assert capsys.readouterr().out.startswith("usage: pathspace-graph verify FOLDER [OPTIONS]")
 
 
 def test_help_explains_the_options_that_commands_share(capsys: pytest.CaptureFixture[str]) -> None:

@@ -59,7 +59,7 @@ def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("logs", "options", "why"),
     [
-        ([], [], "LOG: expected the folder of a log, found none"),
+        ([], [], "batch: expected LOG, found none"),
         (
             ["a", "b"],
             ["--estimator", "landmark-batch"],

@@ -213,6 +213,9 @@ def test_the_shell_completes_commands_and_options(capsys: pytest.CaptureFixture[
     assert completed("convert", "--fro") == ["--from", "--from-poses"]
     assert completed("convert", "--sigma-b") == ["--sigma-bearing"]
     assert completed("verify", "--spline") == []
+    assert completed("online", "LOG", "--estimator", "ck") == ["ckf"]
+    assert completed("export", "MAP", "--as", "la") == ["lanelet2"]
+    assert completed("ablate", "degr") == ["degree"]
 
 
 def test_an_option_that_is_called_otherwise_than_its_field_is_shown_so(
