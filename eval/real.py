@@ -1,4 +1,4 @@
-"""Logs of a real car without truth, mapped in three ways and held against each other (docs/real.md)."""
+"""Logs of a real car without truth, mapped in three ways and compared with each other (docs/real.md)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ ERRORS: Final = {  # errors of the sensor in the table, with titles and units
 
 @dataclass(frozen=True, eq=False)
 class RealDrive:
-    """A log, its runs, and what they are held against."""
+    """A log, its runs, and their references."""
 
     name: str
     log: Log
@@ -69,23 +69,12 @@ def map_real_log(folder: Path, out: Path) -> RealDrive:
     return RealDrive(folder.name, log, runs, cycles[-1].pose, end)
 
 
-def ends_table(drives: Sequence[RealDrive]) -> View:
-    """Return how far each last pose is off, and dead reckoning's, and how many loops are closed."""
-    rows = []
-    for drive in drives:
-        poses = [*(run.trajectory[-1] for run in drive.runs.values()), drive.dead_reckoned]
-        rows.append((drive.name, Figure.row((drive.off(pose)[0] for pose in poses), 2)))
-    closed = [sum(drive.runs[name].map.closed for drive in drives) for name in RUNS]
-    counts = (*Figure.row(closed, 0), Figure(None))
-    header = ("last pose off by [m]", *RUNS, "dead reckoning")
-    return header, (*rows, (f"loops closed, of {len(drives)}", counts))
-
-
 def runs_table(drives: Sequence[RealDrive]) -> View:
     """Return a row for each run."""
     header = (
-        *("log, run", "closed [%]", "end off by [m]", "turned by [°]", "dead reckoning's [m]", "[°]"),
-        *("crossings", "own", "degraded [%]", "lost [%]", "update [ms]"),
+        *("log, run", "closed [%]", "end off by [m]", "turned by [°]"),
+        *("dead reckoning off by [m]", "dead reckoning turned by [°]", "crossings", "own crossings"),
+        *("degraded [%]", "lost [%]", "update [ms]"),
     )
     rows = []
     for drive in drives:
@@ -132,8 +121,8 @@ def joint_table(drives: Sequence[RealDrive]) -> View:
 def measured_table(drives: Sequence[RealDrive]) -> View:
     """Return what was measured on each drive, and over all of them the mean with its interval."""
     header = (
-        *("log", "vx [m/s]", "vy [m/s]", "wz [rad/s]", "along at 10 m [m]", "across"),
-        *("stays along [%]", "across [%]", *(title for title, _ in ERRORS.values())),
+        *("log", "vx [m/s]", "vy [m/s]", "wz [rad/s]", "along at 10 m [m]", "across at 10 m [m]"),
+        *("stays along [%]", "stays across [%]", *(title for title, _ in ERRORS.values())),
     )
     units, places = [unit for _, unit in ERRORS.values()], [SENSOR.index(name) for name in ERRORS]
     rows, errors, at = [], [], np.array([10.0])
@@ -146,7 +135,7 @@ def measured_table(drives: Sequence[RealDrive]) -> View:
         errors.append(found.sensor[places] * units)
         halves = 1.96 * found.sensor_sigma[places] * units
         pairs = zip(errors[-1].tolist(), halves.tolist(), strict=True)
-        found_errors = (Figure(round(v, 6), round(h, 6), 1) for v, h in pairs)
+        found_errors = (Figure(v, h, 1) for v, h in pairs)
         rows.append((drive.name, (*Figure.row(values, 4, 4, 4, 2, 2, 0, 0), *found_errors)))
     if len(errors) > 1:
         means = (Figure.of(column, 1) for column in np.transpose(errors))

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from functools import cache, partial
 from importlib import import_module
-from itertools import takewhile
+from itertools import chain, takewhile
 from operator import attrgetter
 from pathlib import Path
 from types import CodeType, FrameType
@@ -316,6 +316,73 @@ def test_the_architecture_page_has_the_rooms_and_what_they_may_import() -> None:
             assert imports.startswith("some of") or ARROWS[room] == allowed, room
         above += row
     assert set(above) == set(ARROWS) - LEAVES - {"cli", "__main__"}
+
+
+# --- figures ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def hooks(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The hook that shows figures on the pages of the site."""
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    return import_module("hooks")
+
+
+def test_every_table_is_on_a_page_and_says_what_made_it(hooks: Any) -> None:
+    pages = "".join(map(text_of, PAGES))
+    for file in hooks.FIGURES.iterdir():
+        assert f"](figures/{file.name})\n" in pages, file.name
+        for row in hooks.read(file.name):
+            assert row["commit"] and row["machine"] and re.fullmatch(r"20\d\d-\d\d-\d\d", row["date"])
+            assert row["command"].startswith("pathspace-graph report") and "--quick" not in row["command"]
+
+
+def test_a_line_that_links_figures_becomes_their_table(
+    hooks: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hooks, "FIGURES", tmp_path)
+    rows = ("a,x,1.0,0.1,abc,m,d", "a,y,,,abc,m,d", "b,x,2.0,,abc,m,d", "b,y,3,,abc,m,d")
+    (tmp_path / "one.csv").write_text("\n".join(["of,column,value,half_width,commit,machine,date", *rows]))
+    page = hooks.on_page_markdown("[all](figures/)\n\n[One](figures/one.csv)\n\nsee [it](figures/one.csv)\n")
+    assert page.splitlines() == [
+        "*Measured d at abc (machine: m).*",
+        "",
+        "| of | x | y |",
+        "| :--- | ---: | ---: |",
+        "| a | 1.0 ± 0.1 |  |",
+        "| b | 2.0 | 3 |",
+        "",
+        "*[One](figures/one.csv)*",
+        "",
+        "see [it](figures/one.csv)",
+    ]
+
+
+def test_the_figures_of_the_readme_are_those_of_the_files(hooks: Any) -> None:
+    """Figures with an interval, in their order, and the ranges over five real drives."""
+
+    def row_of(file: str, label: str) -> dict[str, str]:
+        rows = hooks.read(f"{file}.csv")
+        return {row["column"]: hooks.figure(row) for row in rows if next(iter(row.values())) == label}
+
+    ours, theirs = (row_of("accuracy_estimators", name) for name in ("fixed-lag", "landmark-fixed-lag"))
+    compared = ("rmse [m]", "missed [%]", "size", "trajectory error (ATE) [m]")
+    pairs = [(ours[name], theirs[name]) for name in compared]
+    for row in (
+        row_of("accuracy_laps", "1"),
+        row_of("accuracy_metrics", "curve distance, mapped to truth [m]"),
+    ):
+        pairs.append((row["fixed-lag"], row["landmark-fixed-lag"]))
+    isam2 = row_of("speed", "mean update relative to iSAM2 with known data association")["measured"]
+    known = row_of("known", "drawn, another drive's (24 drives)")
+    readme = text_of(ROOT / "README.md")
+    quoted = re.findall(r"[\d.]+ ± [\d.]+", readme)
+    assert quoted == [isam2, known["pose error [m]"], *chain.from_iterable(pairs)]
+    assert known["found [%]"] == "100 ± 0"
+    runs = [row_of("real_runs", f"a{number}, online") for number in range(9, 14)]
+    for name in ("end off by [m]", "dead reckoning off by [m]"):
+        found = sorted((run[name] for run in runs), key=float)
+        assert f"{found[0]} to {found[-1]} m" in readme.replace("\n", " ")
 
 
 # --- formats ---------------------------------------------------------------------------------------------

@@ -181,16 +181,25 @@ def straight_log() -> Log:
     return Log(Odometry(t, twist), tuple(cycles), np.array([0.1, 0.1, 0.01]))
 
 
-def test_the_example_of_the_page_on_python_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("page", "log", "printed"),
+    [("README.md", "pathspace-demo/log", ["False"]), ("docs/python.md", "log", [str(LEFT), str(RIGHT)])],
+)
+def test_the_first_example_of_a_page_runs(
+    page: str,
+    log: str,
+    printed: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    example, _ = blocks("python", (ROOT / "docs" / "python.md").read_text())
+    example = blocks("python", (ROOT / page).read_text())[0]
     assert len(example.strip().splitlines()) <= 12
-    write_log(straight_log(), tmp_path / "log")
+    (tmp_path / log).parent.mkdir(exist_ok=True)
+    write_log(straight_log(), tmp_path / log)
     monkeypatch.chdir(tmp_path)
-    exec(compile(example, "python.md", "exec"), {})
-    printed = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in printed] == [str(LEFT), str(RIGHT)]
+    exec(compile(example, page, "exec"), {})
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == printed
 
 
 def test_the_readme_sets_up_with_one_command_each() -> None:

@@ -161,14 +161,6 @@ def _machine() -> dict[str, str]:
     return {"host": platform.node(), "processor": processor, "blas": " ".join(sorted(filter(None, blas)))}
 
 
-def sources_digest() -> str:
-    """Return the digest of the sources of our own estimators and of the simulator, not of the metrics."""
-    own = [name for name in registry.known_estimators() if registry.module_of(name).startswith(f"{HOUSE}.")]
-    sources = {module: digest for name in own for module, digest in code_of(name).items()}
-    estimating = {m: d for m, d in sources.items() if m.startswith(HOUSE) and ".eval." not in m}
-    return sha256(repr(sorted(estimating.items())).encode()).hexdigest()[:16]
-
-
 @cache
 def commit_of(folder: Path | None) -> str:
     """Return the short hash of the commit that is checked out, with `+` where something differs from it.

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -18,15 +17,13 @@ from pathspace_graph.eval.benchmark.scaling import measure_scaling
 from pathspace_graph.eval.experiment.cells import of_other_code
 from pathspace_graph.eval.experiment.drives import log_folders
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
-from pathspace_graph.eval.experiment.provenance import commit_of
 from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
-from pathspace_graph.eval.report import FILE, Plan, measure_figures, read_figures, render_pages, to_json
-from pathspace_graph.io.files import check_target, write_json, write_manifest, write_text
+from pathspace_graph.eval.report import Plan, write_report
+from pathspace_graph.io.files import check_target, write_manifest
 from pathspace_graph.settings.mapper import MapperSettings
 
-FIGURES: Final = Path("docs") / FILE  # file of the figures, from the root of the project
 CELLS_FAILED: Final = 3  # exit code of a study that is written, but some of whose cells failed
 
 
@@ -155,49 +152,31 @@ class Scale:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Measure the figures of the pages, or what remains of them, and write them and the pages' tables.
+    """Measure the figures of the pages, or what remains of them, and write each table as a tidy CSV.
 
-    The experiments are `accuracy`, `skidpad`, `camera`, `faults`, `hard`, `endurance`, `centerline`, the
-    ablations `gauge`, `robust`, `density`, `lag`, `relinearize`, `degree` and `covariance`, and `hints`,
-    `known`, `joint`, `speed`, `scale` and, with logs, `real`. Each study keeps its runs in a folder of its
-    own, from which a second call goes on.
+    The experiments are `accuracy`, `skidpad`, `camera`, `faults`, `hard`, `lines`, `endurance`, `centerline`,
+    the ablations `stations`, `gauge`, `robust`, `density`, `lag`, `relinearize`, `degree` and `covariance`,
+    and `hints`, `known`, `joint`, `speed`, `scale` and, with logs, `real`. Each row of a table says by which
+    command, at which commit, on which machine and when it was measured.
     """
 
     out: Path
-    """Folder for the runs and for `figures.json`; a report that was begun there is continued."""
+    """Folder for the tables and the runs; a report that was begun there is continued."""
     jobs: int = -1
     """Number of processes at a time, -1 for one on each core."""
     only: tuple[str, ...] = ()
-    """Names of the experiments to run, or `pages` for none; the other figures stay as they are."""
+    """Names of the experiments to run."""
     tracks: tuple[Path, ...] = ()
     """Track files, or folders of them, that `accuracy` drives beside the generated tracks."""
     real: tuple[Path, ...] = ()
     """Folders of logs of a real car, which are mapped as well."""
-    pages: Path | None = None
-    """Root of the project whose `docs/figures.json` and pages are written."""
     quick: bool = False
-    """Drive little, to see that everything works; it goes with no pages."""
+    """Drive little, to see that everything works."""
 
     def run(self) -> None:
         check_jobs(self.jobs)
-        if self.quick and self.pages is not None:
-            raise SettingsError("--pages: expected none with --quick, whose figures mean little")
-        known = read_figures(self.pages / FIGURES) if self.pages and (self.pages / FIGURES).exists() else {}
         drives: dict[str, Any] = {"tracks": self.tracks, "real": self.real, "quick": self.quick}
-        command = "pathspace-graph report" + " --tracks TRACKS" * bool(self.tracks)
-        command += " --real LOGS" * bool(self.real)
-        about = {"command": command, "commit": commit_of(self.pages), "date": date.today().isoformat()}
         with progress("runs", lines=LINES) as advance:
-            plan = Plan(jobs=self.jobs, on_cell=advance, **drives)
-            tables = measure_figures(plan, self.out, self.only, about, known)
-        self.out.mkdir(parents=True, exist_ok=True)
-        written = [self.out / FILE]
-        write_json(written[0], to_json(tables))
-        if self.pages is not None:
-            pages = render_pages(self.pages, tables)
-            write_json(self.pages / FIGURES, to_json(tables))
-            for page, text in pages.items():
-                write_text(page, text)
-            written += [self.pages / FIGURES, *pages]
-        say(*(f"{name}\n{table.markdown(table.sources)}".rstrip("\n") for name, table in tables.items()))
-        say(f"\nwritten to {', '.join(map(str, written))}")
+            written = [*write_report(Plan(jobs=self.jobs, on_cell=advance, **drives), self.out, self.only)]
+        for file, table in written:
+            say(f"{file}\n{table.text()}\n")

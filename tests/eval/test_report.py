@@ -1,7 +1,8 @@
-"""The figures of the pages: as data, as tables, and as the pages show them."""
+"""The report: figures, the tables of each experiment, and the files that it writes."""
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,59 +11,27 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.errors import InputError
 from pathspace_graph.eval import report
 from pathspace_graph.eval.experiment.faults import at_strength, suite
-from pathspace_graph.eval.experiment.study import Baseline, Study
-from pathspace_graph.eval.report import (
-    COMPARED,
-    PAGES,
-    README,
-    MeasuredTable,
-    read_figures,
-    render,
-    render_pages,
-    sources_digest,
-    to_json,
-)
+from pathspace_graph.eval.experiment.study import Study
+from pathspace_graph.eval.report import CAMERA, tidy
 from pathspace_graph.eval.views import (
     Figure,
+    View,
     camera_table,
-    difference_table,
     faults_table,
-    lap_columns,
     laps_table,
-    lines_table,
     metrics_table,
+    rmse_table,
+    runs_table,
     skidpad_table,
     study_table,
     tracks_table,
 )
-from pathspace_graph.io.files import write_json
-
-ROOT = Path(__file__).parents[2]
-FIGURES = ROOT / "docs" / "figures.json"
-TABLE = MeasuredTable(
-    command="pathspace-graph report",
-    commit="abc1234",
-    date="2026-11-24",
-    sources="old",
-    header=("mean", "lap 1"),
-    rows=(("rmse [m]", (Figure(0.5, 0.1),)), ("reach", (Figure(None),))),
-)
-
-
-def test_a_figure_is_a_mean_with_its_interval_of_the_known_values() -> None:
-    """Of 1, 2, 3 the sample's deviation is 1, and Student's t of 2 degrees is 4.303."""
-    figure = Figure.of(np.array([1.0, np.nan, 2.0, 3.0]), 1, 100.0)
-    assert figure.value == pytest.approx(200.0)
-    assert figure.half == pytest.approx(100.0 * 4.302653 / np.sqrt(3.0), rel=1e-6)
-    assert figure.text == "200.0 ± 248.4"
-    assert Figure.of(np.array([2.0])).text == "2.000"
-    assert Figure.of(np.array([np.nan])).text == ""
 
 
 def frame(estimator: str, laps: int, rmse: float) -> pd.DataFrame:
+    """Two drives of a track, whose rmse falls with the number of the lap."""
     rows = [
         {"track": "t", "seed": seed, "noise": "n", "estimator": estimator, "variant": "v", "failure": ""}
         | {"lap": lap, "rmse": rmse / lap, "missed": 0.01, "reach_median": 10.0, "ate": float(lap)}
@@ -72,30 +41,49 @@ def frame(estimator: str, laps: int, rmse: float) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_the_table_of_accuracy_has_the_laps_and_the_batch() -> None:
-    both = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 3, 0.3)], ignore_index=True)
-    header, rows = lap_columns(both, (1, 2, 3), README)
-    assert header == ("mean over 2 drives, at the end of", "lap 1", "lap 2", "lap 3", "batch")
-    label, figures = rows[0]
-    assert label == "rmse [m]"
-    assert [figure.value for figure in figures] == pytest.approx([0.6, 0.3, 0.2, 0.1])
-    assert rows[1][1][0].text.startswith("1.0")  # in percent
+BOTH = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 3, 0.3)], ignore_index=True)
 
 
-def test_the_tables_of_the_results_have_tracks_laps_and_metrics() -> None:
-    both = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 1, 0.3)], ignore_index=True)
-    both = pd.concat([both, both.assign(track="other", rmse=2.0 * both["rmse"])], ignore_index=True)
-    header, rows = tracks_table(both)
-    assert header[1:4] == ("rmse, lap 1 [m]", "rmse, last lap [m]", "rmse, batch [m]")
-    assert [label for label, _ in rows] == ["t", "other"]
-    assert [figure.value for figure in rows[1][1][:3]] == pytest.approx([1.2, 0.4, 0.6])
-    assert rows[0][1][0].half is None
-    header, rows = laps_table(both)
-    assert header == ("rmse after lap [m]", "`fixed-lag`")
-    assert [rows[lap][1][0].value for lap in range(3)] == pytest.approx([0.9, 0.45, 0.3])
-    header, rows = metrics_table(both, COMPARED)
-    assert header == ("last lap", "`fixed-lag`", "`spline`")
-    assert [label for label, _ in rows][:1] == ["missed at 2 m [%]"]
+def values(view: View, row: int) -> list[float | None]:
+    return [figure.value for figure in view[1][row][1]]
+
+
+def labels(view: View) -> list[str]:
+    return [label for label, _ in view[1]]
+
+
+def test_a_figure_is_a_mean_with_its_interval_of_the_known_values() -> None:
+    """Of 1, 2, 3 the sample's deviation is 1, and Student's t of 2 degrees is 4.303."""
+    figure = Figure.of(np.array([1.0, np.nan, 2.0, 3.0]), 1, 100.0)
+    assert figure.value == pytest.approx(200.0)
+    assert figure.half == pytest.approx(100.0 * 4.302653 / np.sqrt(3.0), rel=1e-6)
+    assert str(figure) == "200.0 ± 248.4"
+    assert str(Figure.of(np.array([2.0]))) == "2.000"
+    assert str(Figure.of(np.array([np.nan]))) == ""
+
+
+def test_the_table_of_laps_has_the_online_map_and_the_batch() -> None:
+    view = laps_table(BOTH, (1, 2, 3, 3), ("rmse", "missed"))
+    assert view[0] == ("metric", "lap 1", "lap 2", "lap 3", "batch")
+    assert labels(view) == ["rmse [m]", "missed [%]"]
+    assert values(view, 0) == pytest.approx([0.6, 0.3, 0.2, 0.1])
+    assert values(view, 1) == pytest.approx([1.0] * 4)  # in percent
+
+
+def test_the_tables_of_accuracy_have_tracks_laps_and_metrics() -> None:
+    two = pd.concat([BOTH, BOTH.assign(track="other", rmse=2.0 * BOTH["rmse"])], ignore_index=True)
+    view = tracks_table(two)
+    assert view[0][1:4] == ("rmse, lap 1 [m]", "rmse, last lap [m]", "rmse, batch [m]")
+    assert labels(view) == ["t", "other"]
+    assert values(view, 1)[:3] == pytest.approx([1.2, 0.4, 0.2])
+    assert view[1][0][1][0].half is None
+    view = rmse_table(two)
+    assert view[0] == ("rmse after lap [m]", "fixed-lag", "spline")
+    assert [values(view, lap)[0] for lap in range(3)] == pytest.approx([0.9, 0.45, 0.3])
+    view = metrics_table(two, ("rmse", "missed_2m"))
+    assert view[0] == ("metric", "fixed-lag", "spline")
+    assert values(view, 0) == pytest.approx([0.3, 0.15])
+    assert values(view, 1) == [None, None]
 
 
 def test_a_study_s_table_has_paired_differences_from_its_baseline() -> None:
@@ -104,139 +92,80 @@ def test_a_study_s_table_has_paired_differences_from_its_baseline() -> None:
     study = Study(tracks=(0,), seeds=(0, 1), grids=({"lag": [1.0]},), metrics=metrics)
     runs = frame("fixed-lag", 1, 0.3).assign(noise="nominal", variant="default", ms_mean=1.0)
     worse = runs.assign(variant="lag=1", rmse=runs["rmse"] + 0.1 * (1 + runs["seed"]))
-    header, rows = study_table(study, pd.concat([runs, worse], ignore_index=True))
-    assert header == ("variant", "rmse [m]", "difference", "p", "missed [%]")
-    assert [label for label, _ in rows] == ["default", "lag=1"]
-    assert [figure.value for figure in rows[0][1][:3]] == [0.3, None, None]
-    assert rows[1][1][1].text == "0.150 ± 0.635"
-    assert rows[1][1][2].value == pytest.approx(0.2048, abs=1e-3)
-
-
-def test_two_estimators_are_compared_by_pairs_in_each_metric() -> None:
-    base = Baseline(estimator="fixed-lag")
-    study = Study(tracks=(0,), seeds=(0, 1), estimators=("fixed-lag", "ckf"), baseline=base)
-    both = pd.concat([frame("fixed-lag", 1, 0.3), frame("ckf", 1, 0.5)], ignore_index=True)
-    both = both.assign(noise="nominal", variant="default")
-    header, rows = difference_table(study, both, "ckf", ("rmse", "ate"))
-    assert header == ("lap 1", "`fixed-lag`", "`ckf`", "difference")
-    assert [figure.value for figure in rows[0][1]] == pytest.approx([0.3, 0.5, 0.2])
-    assert rows[1][1][2].value == 0.0
+    view = study_table(study, pd.concat([runs, worse], ignore_index=True))
+    assert view[0] == ("variant", "rmse [m]", "difference", "p", "missed [%]")
+    assert labels(view) == ["default", "lag=1"]
+    assert values(view, 0)[:3] == [0.3, None, None]
+    assert str(view[1][1][1][1]) == "0.150 ± 0.635"
+    assert values(view, 1)[2] == pytest.approx(0.2048, abs=1e-3)
 
 
 def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
-    _, rows = skidpad_table(frame("fixed-lag", 2, 0.6))
-    assert rows[0][1][0].value == pytest.approx(np.sqrt((1.0 + 4.0) / 2.0))
+    assert values(skidpad_table(frame("fixed-lag", 2, 0.6)), 0)[0] == pytest.approx(
+        np.sqrt((1.0 + 4.0) / 2.0)
+    )
 
 
-def test_the_table_of_the_camera_has_each_estimator_and_the_landmarks_that_are_told_all() -> None:
-    parts = [
-        frame(estimator, 2, rmse).assign(nees=1.5, l=0.2, reported_degraded=0.25, map_scale_nees=0.8)
-        for estimator, rmse in (("fixed-lag", 0.6), ("spline", 0.4))
-    ]
-    header, rows = camera_table(pd.concat(parts, ignore_index=True))
-    assert header[:3] == ("estimator", "rmse [m]", "rmse without turn and scale [m]")
-    assert [label for label, _ in rows] == ["`fixed-lag`", "`spline`", "landmarks, given all"]
-    assert [figures[0].value for _, figures in rows] == pytest.approx([0.3, 0.2, 0.2])
-    assert rows[0][1][-1].value == pytest.approx(25.0) and rows[2][1][-1].value is None
-    assert all(len(figures) == len(header) - 1 for _, figures in rows)
+def test_the_table_of_the_camera_ends_with_the_limit_of_landmarks() -> None:
+    more = {"nees": 1.5, "l": 0.2, "reported_degraded": 0.25, "map_scale_nees": 0.8}
+    view = camera_table(BOTH.assign(**more), CAMERA)
+    assert view[0][:3] == ("estimator", "rmse [m]", "rmse without turn and scale [m]")
+    assert labels(view) == ["fixed-lag", "spline", "landmarks, given all"]
+    assert [values(view, row)[0] for row in range(3)] == pytest.approx([0.2, 0.1, 0.2])
+    assert values(view, 0)[-1] == pytest.approx(25.0) and values(view, 2)[-1] is None
 
 
-def test_the_table_of_lines_has_each_estimator_at_each_spacing() -> None:
-    parts = [
-        frame(estimator, 2, rmse).assign(noise=noise, nees=1.5)
-        for noise in ("1 m", "4 m")
-        for estimator, rmse in (("fixed-lag", 0.6), ("spline", 0.4))
-    ]
-    header, rows = lines_table(pd.concat([*parts, parts[0].assign(estimator="landmark-fixed-lag")]))
-    assert header[:2] == ("points, estimator", "rmse [m]")
-    assert [label for label, _ in rows] == [
-        "1 m, `fixed-lag`",
-        "1 m, `spline`",
-        "4 m, `fixed-lag`",
-        "4 m, `spline`",
-        "1 m, `landmark-fixed-lag`",
-    ]
-    assert [figures[0].value for _, figures in rows] == pytest.approx([0.3, 0.2, 0.3, 0.2, 0.3])
+def test_a_table_of_runs_has_a_row_for_each_noise_and_estimator() -> None:
+    noises = pd.concat([BOTH.assign(noise=noise) for noise in ("1 m", "4 m")], ignore_index=True)
+    view = runs_table(noises, ("noise", "estimator"), ("rmse", "nees"))
+    assert view[0] == ("noise, estimator", "rmse [m]", "NEES per degree of freedom")
+    assert labels(view) == ["1 m, fixed-lag", "1 m, spline", "4 m, fixed-lag", "4 m, spline"]
+    assert values(view, 3) == [pytest.approx(0.1), None]
 
 
 def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength() -> None:
     study = at_strength(suite(), 0.5)
-    assert list(study.noise)[:2] == ["clean", "latency of detections: 50 ms"]
-    late = list(study.noise)[1]
+    late = "latency of detections: 50 ms"
     runs = [
         frame("fixed-lag", 2, rmse).assign(
-            noise=noise, size=50.0, closed_at_end=True, lost_at_end=False, notices=said
+            noise=noise, size=50.0, closed_at_end=True, lost_at_end=False, notices=said, error_max=2.0
         )
         for noise, rmse, said in (("clean", 0.2, ""), (late, 0.3, "late"))
     ]
     pair = replace(study, noise={noise: study.noise[noise] for noise in ("clean", late)})
-    header, rows = faults_table(pair, pd.concat(runs, ignore_index=True).assign(error_max=2.0))
-    assert [label for label, _ in rows] == ["clean", late]
-    assert [figures[0].text for _, figures in rows] == ["1.00", "1.50"]
-    assert rows[1][1][header.index("reported [%]") - 1].text == "100"
-    assert all(len(figures) == len(header) - 1 for _, figures in rows)
+    view = faults_table(pair, pd.concat(runs, ignore_index=True))
+    assert labels(view) == ["clean", late]
+    assert [str(figures[0]) for _, figures in view[1]] == ["1.00", "1.50"]
+    assert values(view, 1)[view[0].index("reported [%]") - 1] == 100.0
 
 
-def test_figures_come_back_from_their_file(tmp_path: Path) -> None:
-    write_json(tmp_path / "figures.json", to_json({"one": TABLE}))
-    assert read_figures(tmp_path / "figures.json") == {"one": TABLE}
-    write_json(tmp_path / "other.json", {"format": "pathspace-figures/0"})
-    with pytest.raises(InputError, match=r"other\.json: expected pathspace-figures/1"):
-        read_figures(tmp_path / "other.json")
+def test_a_tidy_table_has_a_row_for_each_figure() -> None:
+    view = (("metric", "lap 1", "batch"), (("rmse [m]", (Figure(0.5, 0.1, 2), Figure(None))),))
+    assert tidy(view, {"commit": "abc1234"}).to_dict("records") == [
+        {"metric": "rmse [m]", "column": "lap 1", "value": "0.50", "half_width": "0.10", "commit": "abc1234"},
+        {"metric": "rmse [m]", "column": "batch", "value": "", "half_width": "", "commit": "abc1234"},
+    ]
 
 
-def test_a_page_has_its_tables_between_the_markers_and_says_how_old_they_are() -> None:
-    page = "before\n<!-- report: one -->\nanything\n<!-- end report -->\nafter\n"
-    now = render(Path("page.md"), page, {"one": TABLE}, "old")
-    assert now.startswith("before\n<!-- report: one -->\n\n| mean")
-    assert now.endswith("|\n\n<!-- end report -->\nafter\n") and "0.500 ± 0.100" in now
-    later = render(Path("page.md"), page, {"one": TABLE}, "new")
-    assert "*Measured at commit abc1234, 2026-11-24; the estimators have changed since.*" in later
-    assert render(Path("page.md"), later, {"one": TABLE}, "old") == now
-    with pytest.raises(InputError, match=r"page\.md: expected a table of the report, found one"):
-        render(Path("page.md"), page, {}, "old")
-    new = render(Path("page.md"), page.replace("one", "skidpad"), {}, "old")
-    assert "-->\n\n*Not measured yet.*\n\n<!--" in new
-
-
-def test_the_pages_show_the_committed_figures() -> None:
-    """`report --only pages --pages .` writes them anew after a change of the estimators."""
-    if not FIGURES.exists():
-        pytest.skip("there are no pages beside an installed package")
-    tables = read_figures(FIGURES)
-    assert set(tables) <= {name for names in PAGES.values() for name in names}
-    for page, names in PAGES.items():
-        for name in names:
-            assert f"<!-- report: {name} -->" in (ROOT / page).read_text(), f"{page}: no {name}"
-    for page, text in render_pages(ROOT, tables).items():
-        assert page.read_text() == text, f"{page} does not show the figures of {FIGURES.name}"
-
-
-def test_the_digest_is_that_of_the_sources() -> None:
-    assert len(sources_digest()) == 16
-    assert sources_digest() == sources_digest()
-
-
-def test_a_quick_report_goes_with_no_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", "--out", str(tmp_path / "r"), "--quick", "--pages", str(tmp_path)]) == 2
-    assert "--pages: expected none with --quick" in capsys.readouterr().err
+def test_an_unknown_experiment_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", "--out", str(tmp_path), "--only", "skidpadd"]) == 2
+    assert "the nearest is 'skidpad'" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_a_report_writes_its_figures_and_the_pages_and_is_resumed(
+def test_a_report_writes_what_it_measured_and_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the online estimator alone."""
     monkeypatch.setattr(report, "ESTIMATORS", ("fixed-lag",))
-    (tmp_path / "docs").mkdir()
-    for page in PAGES:
-        (tmp_path / page).write_text("<!-- report: skidpad -->\n<!-- end report -->\n")
-    run = ["report", "--out", str(tmp_path / "r"), "--only", "skidpad", "--jobs", "1", "--quick"]
+    run = ["report", "--out", str(tmp_path), "--only", "skidpad", "--jobs", "1", "--quick"]
     assert main(run) == 0
-    found = read_figures(tmp_path / "r" / "figures.json")["skidpad"]
-    assert [label for label, _ in found.rows] == ["`fixed-lag`"]
-    assert found.sources == sources_digest()
-    assert all(figure.value is not None and figure.value < 1.0 for figure in found.rows[0][1])
-    cells = {file: file.stat().st_mtime_ns for file in (tmp_path / "r").rglob("cells/*")}
+    with (tmp_path / "skidpad.csv").open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    assert [row["column"] for row in rows] == ["trajectory error (ATE) [m]", "rmse [m]", "missed [%]"]
+    assert all(row["estimator"] == "fixed-lag" and float(row["value"]) < 1.0 for row in rows)
+    assert {row["command"] for row in rows} == {"pathspace-graph report --only skidpad --quick"}
+    assert all(row["date"] and row["machine"] for row in rows)
+    cells = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("cells/*")}
     assert main(run) == 0
-    assert {file: file.stat().st_mtime_ns for file in (tmp_path / "r").rglob("cells/*")} == cells
+    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("cells/*")} == cells

@@ -1,0 +1,48 @@
+"""A hook of mkdocs that shows the figures of `docs/figures`, which `pathspace-graph report` measures.
+
+A line that is only a link to a table (`figures/NAME.csv`) becomes that table, with the link as its caption.
+One to the folder itself becomes a line with the commits, machines and dates of all tables.
+"""
+
+import csv
+import re
+from pathlib import Path
+
+FIGURES = Path(__file__).parent / "figures"
+LINK = re.compile(r"^\[.*\]\(figures/(.*)\)$", flags=re.MULTILINE)
+
+Rows = list[dict[str, str]]  # figures of a file, by the names of its columns
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Return the text of a page with its tables."""
+    return LINK.sub(lambda link: f"{table(read(link[1]))}\n\n*{link[0]}*" if link[1] else made(), markdown)
+
+
+def read(name: str) -> Rows:
+    with (FIGURES / name).open(encoding="utf-8", newline="") as lines:
+        return list(csv.DictReader(lines))
+
+
+def table(rows: Rows) -> str:
+    """Return the table of a file in Markdown, with its rows and columns in the order of the file."""
+    title = next(iter(rows[0]))
+    columns = [*dict.fromkeys(row["column"] for row in rows)]
+    lines = [[title, *columns], [":---", *["---:"] * len(columns)]]
+    for label in dict.fromkeys(row[title] for row in rows):
+        cells = {row["column"]: figure(row) for row in rows if row[title] == label}
+        lines.append([label, *(cells[column] for column in columns)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def figure(row: dict[str, str]) -> str:
+    return " ± ".join(filter(None, (row["value"], row["half_width"])))
+
+
+def made() -> str:
+    """Return a line with the commits and dates at which all tables were measured, by machine."""
+    machines = dict[str, set[str]]()
+    for row in (row for file in FIGURES.glob("*.csv") for row in read(file.name)):
+        machines.setdefault(row["machine"], set()).add(f"{row['date']} at {row['commit']}")
+    each = (f"{', '.join(sorted(times))} (machine: {name})" for name, times in sorted(machines.items()))
+    return f"*Measured {'; '.join(each)}.*"
