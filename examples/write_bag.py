@@ -1,6 +1,6 @@
 """Write a log as a ROS 2 bag, as a car would record it: odometry, and a point cloud of cones with labels.
 
-It needs no ROS, but the package `rosbags`, which comes with `pip install 'pathspace-graph[ros]'`. Whoever
+It needs no ROS, but the package `rosbags`, which comes with `pip install -e '.[ros]'`. Whoever
 has no bag yet can try `pathspace-graph convert` with it.
 
     python examples/write_bag.py LOG BAG

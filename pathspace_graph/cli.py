@@ -17,6 +17,10 @@ PROGRAM: Final = "pathspace-graph"
 DONE, BAD_INPUT, NOT_SOLVED, INTERRUPTED, BROKEN_PIPE, TERMINATED = 0, 2, 3, 130, 141, 143  # exit codes
 # options of every command, each with its level of `console.Verbosity`
 LEVELS: Final = {"-q": "QUIET", "--quiet": "QUIET", "-v": "VERBOSE", "--verbose": "VERBOSE"}
+EXTRAS: Final = {  # packages that the core does without, and the extra that has them
+    **dict.fromkeys(("pandas", "tabulate", "matplotlib", "PIL"), "eval"),
+    "distributed": "cluster",
+}
 COMMANDS: Final = {  # module of `commands`, dataclass of the options in it, and line of the overview
     "demo": ("compare", "Demo", "maps a generated track online, and shows a table, a map and its picture"),
     "simulate": ("simulate", "Simulate", "writes the log of a simulated drive, with truth"),
@@ -46,6 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _run([word for word in given if word not in LEVELS], level)
     except PathspaceError as error:
         return _refuse(str(error), level, NOT_SOLVED if isinstance(error, SolveError) else BAD_INPUT)
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        install = f"pip install -e '.[{EXTRAS[error.name]}]'"
+        return _refuse(f"expected the package {error.name} ({install}), found none", level)
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
